@@ -1,0 +1,109 @@
+"""The command line: finds the command, and turns every failure into one line and an exit status."""
+
+import argparse
+import logging
+import sys
+import traceback
+
+from mpi4py import MPI
+
+from msmpetsc import __version__
+from msmpetsc.cli import fetch, render, run
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
+
+COMMANDS = (run, render, fetch)
+OUR_SHORT = ("-o", "-h")
+STATUS_BUG, STATUS_INTERRUPTED = 1, 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns 0, 2 for bad input, 3 for a step that failed (collective)."""
+    comm = MPI.COMM_WORLD
+    _speak_on_root(comm)
+    try:
+        ours, petsc = split_petsc_options(sys.argv[1:] if arguments is None else arguments)
+        args = _parser().parse_args(ours)
+        if petsc and not args.takes_petsc_options:
+            raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
+        args.petsc_options = petsc
+        return args.run(args)
+    except MsmpetscError as error:
+        if comm.rank == 0:
+            print(f"msmpetsc: error: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        return _stop_all_ranks(comm, STATUS_INTERRUPTED, "interrupted")
+    except Exception:
+        return _stop_all_ranks(comm, STATUS_BUG, traceback.format_exc())
+
+
+def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Ours, and PETSc's: those of one dash, each with the value that follows it, as PETSc itself reads them."""
+    ours, petsc = [], []
+    rest = iter(range(len(arguments)))
+    for at in rest:
+        word = arguments[at]
+        if not _is_petsc_option(word):
+            ours.append(word)
+            continue
+        petsc.append(word)
+        following = arguments[at + 1] if at + 1 < len(arguments) else "-"
+        if not following.startswith("--") and not _is_petsc_option(following) and following not in OUR_SHORT:
+            if not following.endswith(".toml"):
+                petsc.append(following)
+                next(rest)
+    return ours, petsc
+
+
+def _is_petsc_option(word: str) -> bool:
+    return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
+
+
+class _Parser(argparse.ArgumentParser):
+    """Speaks on rank 0 only, and names the nearest option for one it does not know."""
+
+    def error(self, message: str) -> None:
+        raise InputError(message)
+
+    def print_help(self, file=None) -> None:
+        if MPI.COMM_WORLD.rank == 0:
+            super().print_help(file)
+
+    def parse_args(self, arguments: list[str]) -> argparse.Namespace:
+        args, unknown = self.parse_known_args(arguments)
+        if unknown:
+            valid = [option for parser in (self, args.parser) for option in parser._option_string_actions]
+            raise InputError(f"{args.command}: unknown argument {unknown[0]}{did_you_mean(unknown[0], valid)}")
+        return args
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="msmpetsc", description=__import__("msmpetsc").__doc__)
+    parser.add_argument("--version", action="version", version=f"msmpetsc {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in COMMANDS:
+        command.add_parser(commands)
+        sub = commands.choices[command.__name__.rpartition(".")[2]]
+        sub.set_defaults(run=command.run, parser=sub, takes_petsc_options=command is run)
+    return parser
+
+
+def _speak_on_root(comm: MPI.Comm) -> None:
+    log.handlers = [logging.StreamHandler(sys.stderr)]
+    log.handlers[0].setFormatter(logging.Formatter("msmpetsc: %(levelname)s: %(message)s"))
+    logging.addLevelName(logging.WARNING, "warning")
+    logging.addLevelName(logging.INFO, "note")
+    log.setLevel(logging.INFO if comm.rank == 0 else logging.CRITICAL)
+
+
+def _stop_all_ranks(comm: MPI.Comm, status: int, message: str) -> int:
+    """What no rank foresaw: the others may wait for this one for ever, so they are aborted."""
+    print(f"msmpetsc: rank {comm.rank}: {message}", file=sys.stderr, flush=True)
+    if comm.size > 1:
+        comm.Abort(status)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,163 @@
+"""``msmpetsc run``: simulate a scene and write its result file."""
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import petsc4py
+from mpi4py import MPI
+
+from msmpetsc import __version__
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import StepFailed
+from msmpetsc.output.frames import ResultFile
+from msmpetsc.output.progress import Progress
+from msmpetsc.output.xdmf import write_xdmf
+from msmpetsc.scene import Scene, load_scene
+
+if TYPE_CHECKING:  # these import PETSc, which must first be given its options
+    from msmpetsc.model.build import Model
+    from msmpetsc.solve.simulate import Simulation
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "run",
+        help="simulate a scene",
+        description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT.h5", help="default: out/SCENE.h5")
+    parser.add_argument("--preset", metavar="NAME", help="solver preset (see --list-presets)")
+    parser.add_argument("--error", metavar="E", help="relative error at which a step is done")
+    parser.add_argument("--frames", type=int, metavar="N", help="stop after N steps")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
+    parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
+
+
+class ListPresets(argparse.Action):
+    """Prints the presets and leaves."""
+
+    def __init__(self, option_strings: list[str], dest: str, help: str):
+        super().__init__(option_strings, dest, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_) -> None:
+        from msmpetsc.solve.presets import PRESETS
+
+        for name, preset in PRESETS.items():
+            print(f"{name:10} {preset.about}")
+        parser.exit()
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate; returns the exit status (collective)."""
+    petsc4py.init(["msmpetsc", *args.petsc_options])
+    comm = MPI.COMM_WORLD
+    from msmpetsc.model.build import build_model
+    from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
+
+    scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
+    path = args.output or Path("out") / f"{args.scene.stem}.h5"
+    try:
+        with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
+            model = build_model(comm, scene)
+            describe(comm, model)
+            with Simulation(comm, scene, model) as simulation:
+                simulation.refuse_unused_options()
+                write_model(comm, file, model)
+                write_frames(comm, file, simulation)
+                simulation.refuse_unused_options(at_end=True)
+    except StepFailed:
+        on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
+        raise
+    on_root(comm, lambda: write_xdmf(path))
+    return 0
+
+
+def read_scene(args: argparse.Namespace) -> Scene:
+    """The scene with what the command line changes; --set comes last and wins."""
+    from msmpetsc.solve.presets import PRESETS
+
+    changes = []
+    if args.preset is not None:
+        changes.append(f"solver.preset={json.dumps(args.preset)}")
+    if args.error is not None:
+        changes.append(f"solver.error={args.error}")
+    changes += args.set
+    scene = load_scene(args.scene, changes, PRESETS)
+    if args.frames is not None:
+        scene = load_scene(args.scene, [*changes, f"time.duration={args.frames * scene.time.step!r}"], PRESETS)
+    return scene
+
+
+def attributes(comm: MPI.Comm, scene: Scene) -> dict:
+    """What the file says of the run that made it."""
+    from petsc4py import PETSc
+
+    given = PETSc.Options().getAll()
+    return {
+        "msmpetsc_version": __version__,
+        "petsc_version": ".".join(map(str, PETSc.Sys.getVersion())),
+        "petsc_options": " ".join(f"-{name} {value}".strip() for name, value in given.items()),
+        "ranks": comm.size,
+        "command": shlex.join(["msmpetsc", *sys.argv[1:]]),
+        "scene": scene.text,
+    }
+
+
+def describe(comm: MPI.Comm, model: "Model") -> None:
+    """One line on the lattice."""
+    lattice = model.lattice
+    cells, springs = comm.allreduce(len(lattice.cells)), comm.allreduce(lattice.springs_owned)
+    log.info(
+        "%d cells of %.4g m, %d nodes, %d springs on %d rank%s",
+        cells, lattice.cell_size, lattice.table.total, springs, comm.size, "s" * (comm.size > 1),
+    )  # fmt: skip
+
+
+def write_model(comm: MPI.Comm, file: ResultFile, model: "Model") -> None:
+    """The parts of the file that do not change with time (collective)."""
+    lattice, owned = model.lattice, model.lattice.owned
+    springs = slice(lattice.springs_owned)
+    numbers = lattice.global_numbers
+    file.write("lattice/nodes", lattice.nodes[:owned])
+    file.write("lattice/cells", lattice.cells)
+    file.write("lattice/cell_kind", lattice.cell_kind)
+    file.write("lattice/springs", numbers[lattice.springs[springs]])
+    file.write("lattice/rest_length", lattice.rest_length[springs])
+    file.write("lattice/stiffness", lattice.stiffness[springs])
+    file.write("lattice/mass", lattice.mass)
+    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
+    surface, embedding = model.surface, model.embedding
+    if embedding is None:
+        return
+    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
+    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
+    offset = comm.exscan(len(embedding.indices)) or 0
+    indptr = embedding.indptr[1:] + offset
+    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
+    file.write("embedding/indices", embedding.indices)
+    file.write("embedding/weights", embedding.weights)
+
+
+def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
+    """Run, and store each frame when it is done; those before a failure stay (collective)."""
+    lattice, embedding = simulation.model.lattice, simulation.model.embedding
+    owned = slice(lattice.owned)
+    file.start_frames(simulation.steps + 1, lattice.owned, embedding.points if embedding else None)
+    progress = Progress(simulation.steps, enabled=comm.rank == 0)
+    try:
+        for frame in simulation.frames():
+            file.append(frame)
+            state = simulation.state
+            file.write_checkpoint(frame.index, state.q[owned], state.q_previous[owned])
+            progress.update(frame)
+    finally:
+        progress.close()

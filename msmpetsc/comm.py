@@ -1,0 +1,136 @@
+"""Ranks: what one rank reads all know, what fails on one fails on all, rows travel to their owners."""
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.errors import MsmpetscError
+
+log = logging.getLogger("msmpetsc")  # the command line lets rank 0 alone speak
+
+T = TypeVar("T")
+
+
+@contextmanager
+def together(comm: MPI.Comm) -> Iterator[None]:
+    """Raise on all ranks the first rank's MsmpetscError, if any rank has one (collective).
+
+    Nothing collective may stand in the block: a rank that fails leaves it early.
+    """
+    error = None
+    try:
+        yield
+    except MsmpetscError as raised:
+        error = raised
+    for found in comm.allgather(error):
+        if found is not None:
+            raise found
+
+
+def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
+    """Call ``function`` on rank 0 only; its error is everyone's. Returns its value there, None elsewhere."""
+    value = None
+    with together(comm):
+        if comm.rank == 0:
+            value = function()
+    return value
+
+
+class Route:
+    """Rows go to the ranks named for them (Alltoallv), and answers come back in the rows' own order.
+
+    destination : (n,) rank of each row
+    """
+
+    def __init__(self, comm: MPI.Comm, destination: np.ndarray):
+        self.comm = comm
+        self.order = np.argsort(destination, kind="stable")
+        self.sent = np.bincount(destination, minlength=comm.size).astype(np.int64)
+        self.received = np.empty_like(self.sent)
+        comm.Alltoall(self.sent, self.received)
+
+    def send(self, rows: np.ndarray) -> np.ndarray:
+        """The rows that all ranks sent here, by sending rank and then in their order there."""
+        return self._alltoall(np.asarray(rows)[self.order], self.sent, self.received)
+
+    def answer(self, rows: np.ndarray) -> np.ndarray:
+        """``rows`` belong to what ``send`` returned; gives each sender the ones for its own rows."""
+        back = self._alltoall(np.asarray(rows), self.received, self.sent)
+        answers = np.empty_like(back)
+        answers[self.order] = back
+        return answers
+
+    def _alltoall(self, rows: np.ndarray, out_counts: np.ndarray, in_counts: np.ndarray) -> np.ndarray:
+        rows = np.ascontiguousarray(rows)
+        result = np.empty((int(in_counts.sum()), *rows.shape[1:]), rows.dtype)
+        row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
+        try:
+            self.comm.Alltoallv([rows, out_counts, starts(out_counts), row], [result, in_counts, starts(in_counts), row])
+        finally:
+            row.Free()
+        return result
+
+
+def starts(counts: np.ndarray) -> np.ndarray:
+    """Where each part begins when parts of these sizes follow each other."""
+    return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int64)
+
+
+class SortedKeys:
+    """Distinct int64 keys in ascending order over all ranks; a key's place is its global index.
+
+    So the numbering does not depend on the number of ranks, and each rank owns one contiguous
+    range of it. Collective to build and to ask.
+
+    keys  : (n_local,) this rank's share, ascending
+    first : global index of ``keys[0]``
+    total : number of keys on all ranks
+    """
+
+    SAMPLES = 128  # a rank: keeps the shares within some percent of each other
+
+    def __init__(self, comm: MPI.Comm, keys: np.ndarray):
+        self.comm = comm
+        keys = np.unique(np.asarray(keys, np.int64))
+        self.splitters = self._split(keys)
+        route = Route(comm, self.owner(keys))
+        self.keys = np.unique(route.send(keys))
+        counts = np.array(comm.allgather(len(self.keys)), np.int64)
+        self.first_of_rank = starts(counts)
+        self.first = int(self.first_of_rank[comm.rank])
+        self.total = int(counts.sum())
+
+    def _split(self, keys: np.ndarray) -> np.ndarray:
+        """Sample sort: the keys at equal steps of a regular sample, (size - 1,)."""
+        size = self.comm.size
+        step = max(1, self.comm.allreduce(len(keys)) // (size * self.SAMPLES))
+        sample = np.sort(np.concatenate(self.comm.allgather(keys[step // 2 :: step])))
+        if size == 1 or len(sample) == 0:
+            return np.zeros(size - 1, np.int64)
+        return sample[np.arange(1, size) * len(sample) // size]
+
+    def owner(self, keys: np.ndarray) -> np.ndarray:
+        """Rank that holds each key, or would hold it."""
+        return np.searchsorted(self.splitters, keys, side="right")
+
+    def owner_of_index(self, index: np.ndarray) -> np.ndarray:
+        """Rank that holds each global index."""
+        last_start = np.append(self.first_of_rank[1:], self.total)
+        return np.searchsorted(last_start, index, side="right")
+
+    def find(self, keys: np.ndarray) -> np.ndarray:
+        """Global index of each key, -1 where there is none (any shape; collective)."""
+        wanted, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
+        route = Route(self.comm, self.owner(wanted))
+        place = route.answer(self._place(route.send(wanted)))
+        return place[inverse].reshape(np.shape(keys))
+
+    def _place(self, keys: np.ndarray) -> np.ndarray:
+        if len(self.keys) == 0:
+            return np.full(len(keys), -1, np.int64)
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[at] == keys, self.first + at, -1)

@@ -1,0 +1,141 @@
+"""Boundary cells: the grid cells that a triangle touches (paper section 4.1).
+
+Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns its
+low faces, so a face of the body that lies in a grid plane marks one layer of cells, not two.
+"""
+
+import numba
+import numpy as np
+
+SLACK = 1e-12  # of a coordinate: above the rounding of an interpolated one, below anything that matters
+
+
+def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Every cell that a triangle touches: exact up to rounding, and conservative within it.
+
+    corners   : (f, 3, 3) triangles in cell units
+    low, high : (3,) int, cells outside low..high-1 are left out
+    returns   : (c, 3) int64, one row a touched (triangle, cell) pair, so cells repeat
+    """
+    return _touched(corners, low.astype(np.int64), high.astype(np.int64))
+
+
+def sampled_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Cells of the paper's sample points v3 + (i/n)(v1 - v3) + (j/n)(v2 - v3), n = ceil(longest side).
+
+    Misses cells that a triangle only grazes. Arguments and result as in ``touched_cells``.
+    """
+    return _sampled(corners, low.astype(np.int64), high.astype(np.int64))
+
+
+@numba.njit(cache=True)
+def _grown(rows, used):
+    if used < len(rows):
+        return rows
+    larger = np.empty((2 * len(rows), 3), np.int64)
+    larger[:used] = rows
+    return larger
+
+
+@numba.njit(cache=True)
+def _clip(polygon, n, axis, plane, side, out):
+    """Sutherland-Hodgman: the part of the polygon with side * (x[axis] - plane) >= 0. Returns its size."""
+    m = 0
+    for a in range(n):
+        p, q = polygon[a], polygon[(a + 1) % n]
+        dp, dq = side * (p[axis] - plane), side * (q[axis] - plane)
+        if dp >= 0:
+            out[m] = p
+            m += 1
+        if (dp > 0 and dq < 0) or (dp < 0 and dq > 0):
+            s = dp / (dp - dq)
+            for c in range(3):
+                # p + s (q - p) and not a weighted sum: equal coordinates stay exactly equal
+                out[m, c] = p[c] + s * (q[c] - p[c])
+            out[m, axis] = plane
+            m += 1
+    return m
+
+
+@numba.njit(cache=True)
+def _slab(polygon, n, axis, index, work, out):
+    """The part of the polygon between the planes ``index`` and ``index + 1`` of an axis."""
+    m = _clip(polygon, n, axis, float(index), 1.0, work)
+    return _clip(work, m, axis, float(index + 1), -1.0, out)
+
+
+@numba.njit(cache=True)
+def _index_range(polygon, n, axis, low, high, slack):
+    """First and last cell index that the polygon reaches along an axis.
+
+    Slack widens a range whose ends may have been interpolated; a range of one value is exact.
+    """
+    smallest, largest = polygon[0, axis], polygon[0, axis]
+    for a in range(1, n):
+        smallest = min(smallest, polygon[a, axis])
+        largest = max(largest, polygon[a, axis])
+    if slack and largest > smallest:
+        smallest -= SLACK * (1.0 + abs(smallest))
+        largest += SLACK * (1.0 + abs(largest))
+    return max(int(np.floor(smallest)), low), min(int(np.floor(largest)), high - 1)
+
+
+@numba.njit(cache=True)
+def _in_one_cell(triangle):
+    for c in range(3):
+        index = np.floor(triangle[0, c])
+        if np.floor(triangle[1, c]) != index or np.floor(triangle[2, c]) != index:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def _touched(corners, low, high):
+    cells = np.empty((4 * len(corners) + 16, 3), np.int64)
+    used = 0
+    work = np.empty((12, 3))
+    across = np.empty((12, 3))
+    along = np.empty((12, 3))
+    for f in range(len(corners)):
+        i0, i1 = _index_range(corners[f], 3, 0, low[0], high[0], False)
+        if i0 == i1 and _in_one_cell(corners[f]):
+            cells = _grown(cells, used)
+            for c in range(3):
+                cells[used, c] = int(np.floor(corners[f, 0, c]))
+            used += 1
+            continue
+        for i in range(i0, i1 + 1):
+            n = _slab(corners[f], 3, 0, i, work, across)
+            if n == 0:
+                continue
+            j0, j1 = _index_range(across, n, 1, low[1], high[1], i1 > i0)
+            for j in range(j0, j1 + 1):
+                m = _slab(across, n, 1, j, work, along)
+                if m == 0:
+                    continue
+                k0, k1 = _index_range(along, m, 2, low[2], high[2], i1 > i0 or j1 > j0)
+                for k in range(k0, k1 + 1):
+                    cells = _grown(cells, used)
+                    cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
+                    used += 1
+    return cells[:used]
+
+
+@numba.njit(cache=True)
+def _sampled(corners, low, high):
+    cells = np.empty((4 * len(corners) + 16, 3), np.int64)
+    used = 0
+    for f in range(len(corners)):
+        v1, v2, v3 = corners[f, 0], corners[f, 1], corners[f, 2]
+        longest = max(np.sum((v1 - v2) ** 2), np.sum((v2 - v3) ** 2), np.sum((v3 - v1) ** 2)) ** 0.5
+        n = max(1, int(np.ceil(longest)))
+        for i in range(n + 1):
+            for j in range(n + 1 - i):
+                point = v3 + (i / n) * (v1 - v3) + (j / n) * (v2 - v3)
+                cells = _grown(cells, used)
+                inside = True
+                for c in range(3):
+                    cells[used, c] = int(np.floor(point[c]))
+                    inside &= low[c] <= cells[used, c] < high[c]
+                used += inside
+    return cells[:used]

@@ -1,0 +1,159 @@
+"""A surface filled with uniform grid cells, the cages (paper section 4.1).
+
+Rank 0 holds the surface; each rank finds the cells of one slab of the grid, then the cells are
+spread over the ranks in Morton order. The three kinds of cell are external (not kept), boundary
+and interior; the last two are the valid ones.
+"""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import Route, SortedKeys
+from msmpetsc.errors import InputError
+from msmpetsc.geometry import morton
+from msmpetsc.geometry.boundary import sampled_cells, touched_cells
+from msmpetsc.geometry.grid import Grid
+from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
+from msmpetsc.geometry.surface import Surface, SurfaceReport
+
+BOUNDARY, INTERIOR = 1, 2
+CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
+MARK = {"exact": touched_cells, "sample": sampled_cells}
+
+
+@dataclass(frozen=True)
+class Body:
+    """What all ranks know of a surface, and on rank 0 the surface itself.
+
+    bounds : (2, 3) bounding box [m]
+    """
+
+    comm: MPI.Comm
+    surface: Surface | None
+    report: SurfaceReport
+    bounds: np.ndarray
+
+
+@dataclass(frozen=True)
+class Cages:
+    """Valid cells of a body, each rank's share in Morton order.
+
+    table : keys of the cells (geometry.morton)
+    kind  : (n_local,) uint8, BOUNDARY or INTERIOR
+    """
+
+    grid: Grid
+    table: SortedKeys
+    kind: np.ndarray
+
+    @property
+    def ijk(self) -> np.ndarray:
+        """(n_local, 3) grid index of this rank's cells."""
+        return morton.decode(self.table.keys)
+
+
+def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000) -> Cages:
+    """The valid cells of side ``cell_size`` [m] (collective).
+
+    method : "exact", or "sample" for the paper's sample points
+    raises : InputError if there would be more than ``max_cells``
+    """
+    grid = Grid.covering(body.bounds, cell_size)
+    boundary, gaps = slab_cells(body, grid, method, max_cells)
+    interior = cells_of_gaps(gaps)
+    ijk = np.concatenate([boundary, interior])[:, np.argsort(_axes(body))]
+    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(boundary), len(interior)])
+    keys = morton.encode(ijk)
+    table = SortedKeys(body.comm, keys)
+    route = Route(body.comm, table.owner(keys))
+    order = np.argsort(route.send(keys))
+    return Cages(grid, table, route.send(kind)[order])
+
+
+def count_cells(comm: MPI.Comm, boundary: np.ndarray, gaps: np.ndarray) -> int:
+    """Number of valid cells on all ranks."""
+    return comm.allreduce(len(boundary) + int((gaps[:, 3] - gaps[:, 2] + 1).sum()))
+
+
+def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled: the longest comes first."""
+    axes = _axes(body)
+    slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
+    least = max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
+    _refuse_above(max_cells, least, grid)
+    corners = _slab_triangles(body, grid, axes)
+    boundary = _mark(body.comm, corners, grid.shape[axes], slab, method)
+    if body.report.closed:
+        gaps = enclosed_gaps(body.comm, boundary, slab)
+    else:
+        gaps = _gaps_by_winding(body, grid, axes, slab, boundary)
+    _refuse_above(max_cells, count_cells(body.comm, boundary, gaps), grid)
+    return boundary, gaps
+
+
+def _axes(body: Body) -> np.ndarray:
+    return np.roll([0, 1, 2], -int(np.argmax(body.bounds[1] - body.bounds[0])))
+
+
+def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
+    if cells > max_cells:
+        raise InputError(
+            f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, above cages.max_cells = {max_cells}"
+        )
+
+
+def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
+    """Triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
+    corners = np.empty((0, 3, 3))
+    if body.surface is not None:
+        corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
+    planes = np.floor(corners[:, :, 0]).astype(np.int64)
+    first, last = (
+        Slab.owner(edge, body.comm.size, int(grid.shape[axes[0]])) for edge in (planes.min(axis=1), planes.max(axis=1))
+    )
+    copies = last - first + 1
+    rank = np.repeat(first, copies) + np.arange(copies.sum()) - np.repeat(np.cumsum(copies) - copies, copies)
+    return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
+
+
+def _mark(comm: MPI.Comm, corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
+    """Distinct boundary cells (b, 3) of the slab in lexicographic order.
+
+    The paper's samples of a triangle may lie in another slab than its rank's, but then the
+    triangle was sent there too.
+    """
+    low, high = np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
+    keys = [np.empty(0, np.int64)]
+    for start in range(0, len(corners), CHUNK):
+        cells = MARK[method](corners[start : start + CHUNK], low, high)
+        keys.append(np.unique(cells @ PACK))
+    packed = np.unique(np.concatenate(keys))
+    return np.stack([packed // PACK[0], packed // PACK[1] % morton.LIMIT, packed % morton.LIMIT], axis=1)
+
+
+PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
+
+
+def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
+    """Interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size
+    (Jacobson et al. 2013). Time follows the bounding box here, memory does not.
+
+    An open surface has no slabs of its own meaning: every rank needs all of it.
+    """
+    surface = body.comm.bcast(body.surface)
+    shape = grid.shape[axes]
+    marked = boundary @ PACK
+    first, last = slab.first * shape[1] * shape[2], slab.last * shape[1] * shape[2]
+    gaps = [np.empty((0, 4), np.int64)]
+    for start in range(first, last, CHUNK):
+        cells = np.stack(np.unravel_index(np.arange(start, min(start + CHUNK, last)), shape), axis=1)
+        cells = cells[~np.isin(cells @ PACK, marked)]
+        centres = np.empty(cells.shape)
+        centres[:, axes] = cells + 0.5
+        winding = igl.fast_winding_number(surface.points, surface.triangles, grid.node_positions(centres))
+        inside = cells[np.abs(winding) > 0.5]
+        gaps.append(inside[:, [0, 1, 2, 2]])  # a gap of one cell each
+    return np.concatenate(gaps)

@@ -1,0 +1,229 @@
+"""Preparing a surface: named steps that mend, reduce, join or place it."""
+
+from collections.abc import Callable, Sequence
+
+import fast_simplification
+import manifold3d
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
+
+# A repair that keeps less than this of the area did not mend the body but lost it: of
+# overlapping parts or double-walled tubes MeshFix keeps a few per cent.
+LEAST_AREA_KEPT = 0.5
+
+
+def prepare(
+    surface: Surface,
+    steps: Sequence[str | dict],
+    size: float | None = None,
+    base: Sequence[float] | None = None,
+) -> Surface:
+    """The surface after the steps, then scaled, then placed.
+
+    steps : each the name of a step, or {name: value} for one that takes a value (see STEPS)
+    size  : longest side of the bounding box [m]; scaled about the origin
+    base  : (3,) where the middle of the bounding box's bottom face stands [m]
+
+    Raises InputError naming the step that failed.
+    """
+    for step in steps:
+        name, value = next(iter(step.items())) if isinstance(step, dict) else (step, None)
+        surface = _apply(surface, name, value)
+    if size is not None:
+        low, high = _bounds(surface)
+        if (high - low).max() == 0:
+            raise InputError("prepare: a mesh without extent cannot be given a size")
+        surface = Surface(surface.points * (size / (high - low).max()), surface.triangles)
+    if base is not None:
+        low, high = _bounds(surface)
+        foot = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+        surface = Surface(surface.points + (np.asarray(base, float) - foot), surface.triangles)
+    return surface
+
+
+def merge(surface: Surface) -> Surface:
+    """Merge points of equal position; drop degenerate triangles and unused points."""
+    return compact(surface.points, merged_triangles(surface))
+
+
+def largest_part(surface: Surface) -> Surface:
+    """Keep the connected part of the largest area."""
+    labels = _part_labels(surface)
+    a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
+    areas = np.bincount(labels, np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return compact(surface.points, surface.triangles[labels == areas.argmax()])
+
+
+def union(surface: Surface) -> Surface:
+    """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
+    surface = merge(surface)
+    labels = _part_labels(surface)
+    parts = [
+        _solid(Surface(surface.points, surface.triangles[labels == part]), part)
+        for part in range(labels.max() + 1)
+    ]
+    mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
+    return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
+
+
+def repair(surface: Surface) -> Surface:
+    """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
+    try:
+        from pymeshfix import MeshFix
+    except ImportError:
+        raise InputError("repair needs pymeshfix: pip install msmpetsc[repair]") from None
+    surface = merge(surface)
+    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix.repair(joincomp=False, remove_smallest_components=False)
+    repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
+    if len(repaired.triangles) == 0:
+        raise InputError("nothing of the surface was left")
+    report, kept = examine(repaired), examine(repaired).area / examine(surface).area
+    if kept < LEAST_AREA_KEPT:
+        raise InputError(
+            f"only {kept:.1%} of the surface's area was left: its parts overlap or have two walls "
+            '(try "largest_part" or "union" before)'
+        )
+    if not report.closed:
+        raise InputError(f"{report.boundary_edges} boundary edges could not be closed")
+    return repaired
+
+
+def simplify(surface: Surface, faces: int) -> Surface:
+    """Reduce to about this many triangles (quadric decimation); a closed surface stays closed."""
+    surface = merge(surface)
+    if faces >= len(surface.triangles):
+        return surface
+    points, triangles = fast_simplification.simplify(
+        surface.points, surface.triangles, target_count=int(faces)
+    )
+    reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
+    if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
+        return repair(reduced)  # collapsing edges can pinch thin places
+    return reduced
+
+
+def orient(surface: Surface) -> Surface:
+    """Wind the triangles consistently, and each connected patch outwards (a cavity's too).
+
+    A patch is what hangs together by edges of exactly two triangles. An open one is turned by
+    the volume of the cone from its own middle.
+    """
+    patch, flipped = _consistent_winding(first_of_equal(surface.points)[surface.triangles])
+    corners = surface.points[surface.triangles]
+    count = np.bincount(patch)
+    middle = [np.bincount(patch, x) / count for x in corners.mean(axis=1).T]
+    a, b, c = (corners - np.stack(middle, axis=1)[patch][:, None]).swapaxes(0, 1)
+    cones = np.einsum("ij,ij->i", a, np.cross(b, c)) * np.where(flipped, -1, 1)
+    flipped ^= (np.bincount(patch, cones) < 0)[patch]
+    triangles = np.where(flipped[:, None], surface.triangles[:, [0, 2, 1]], surface.triangles)
+    return Surface(surface.points, triangles)
+
+
+def rotate(surface: Surface, turn: dict) -> Surface:
+    """Turn about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
+    axis = np.asarray(turn["axis"], float)
+    if not axis.any():
+        raise InputError("the axis has no direction")
+    angle = np.deg2rad(turn["degrees"])
+    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    return Surface(rotation.apply(surface.points), surface.triangles)
+
+
+STEPS: dict[str, Callable[..., Surface]] = {
+    step.__name__: step for step in (merge, largest_part, union, repair, simplify, orient, rotate)
+}
+TAKES_VALUE = ("simplify", "rotate")
+
+
+def _apply(surface: Surface, name: str, value: object) -> Surface:
+    """One step, its failures as InputError with its name."""
+    if name not in STEPS:
+        raise InputError(f"prepare: no step '{name}' (there are: {', '.join(STEPS)})")
+    if (value is not None) != (name in TAKES_VALUE):
+        raise InputError(f"prepare: '{name}' takes {'a' if name in TAKES_VALUE else 'no'} value")
+    try:
+        result = STEPS[name](surface, *([] if value is None else [value]))
+    except InputError as error:
+        raise InputError(f"prepare: '{name}': {error}") from error
+    except Exception as error:  # what the libraries below raise on odd meshes is not documented
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"prepare: '{name}' failed ({reason})") from error
+    if len(result.triangles) == 0 or not np.isfinite(result.points).all():
+        raise InputError(f"prepare: '{name}' left no usable mesh")
+    return result
+
+
+def _bounds(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of the points in use, (3,) each."""
+    points = surface.points[np.unique(surface.triangles)]
+    return points.min(axis=0), points.max(axis=0)
+
+
+def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
+    """The surface of these triangles and only their points, in the order they had."""
+    used, numbers = np.unique(triangles, return_inverse=True)
+    return Surface(points[used], numbers.reshape(-1, 3))
+
+
+def _part_labels(surface: Surface) -> np.ndarray:
+    """(f,) number of the connected part of each triangle; points of equal position connect."""
+    triangles = first_of_equal(surface.points)[surface.triangles]
+    links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
+    n = len(surface.points)
+    _, labels = connected_components(coo_array((np.ones(len(links[0])), links), shape=(n, n)))
+    return np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
+
+
+def _solid(part: Surface, number: int) -> manifold3d.Manifold:
+    """A part as a solid, turned outwards; InputError if it does not bound one."""
+    report = examine(part)
+    part = compact(part.points, part.triangles)
+    triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
+    solid = manifold3d.Manifold(
+        manifold3d.Mesh64(part.points, np.ascontiguousarray(triangles, np.uint64))
+    )
+    if solid.status() != manifold3d.Error.NoError or solid.is_empty():
+        raise InputError(
+            f"part {number} is no closed, consistently wound surface "
+            f"({report.boundary_edges} boundary edges, {report.nonmanifold_edges} with more than "
+            f"two triangles, {report.inconsistent_edges} inconsistent)"
+        )
+    return solid
+
+
+def _two_triangles_an_edge(surface: Surface) -> bool:
+    used, _ = edge_use(merged_triangles(surface))
+    return bool((used == 2).all())
+
+
+def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For each of the (f, 3) merged triangles its patch, and whether to flip it.
+
+    Every triangle stands twice in a graph, as it is and flipped; neighbours are linked in the
+    two ways that agree. A patch then makes two components, each the other one flipped: take
+    the first. If it makes a single one, it has no consistent winding.
+    """
+    f = len(triangles)
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    edge = np.minimum(start, end) * (triangles.max() + 1) + np.maximum(start, end)
+    order = np.argsort(edge, kind="stable")
+    first = np.flatnonzero(np.diff(edge[order], prepend=-1))
+    pairs = first[np.diff(first, append=len(order)) == 2]
+    one, other = order[pairs], order[pairs + 1]
+    against = f * ((start < end)[one] == (start < end)[other])  # same direction: flip one of them
+    one, other = one // 3, other // 3
+    rows = np.concatenate([one, one + f])
+    columns = np.concatenate([other + against, other + f - against])
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * f, 2 * f))
+    _, label = connected_components(graph, directed=False)
+    as_is, flipped = label[:f], label[f:]
+    if (as_is == flipped).any():
+        raise InputError("it has one side only, as a Möbius band: no winding is consistent")
+    patch = np.unique(np.minimum(as_is, flipped), return_inverse=True)[1]
+    return patch, as_is > flipped

@@ -1,0 +1,340 @@
+"""Surface meshes: read from a file, measured, and checked to enclose a volume."""
+
+import gzip
+import json
+import re
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from io import BytesIO, StringIO
+from logging import CRITICAL, getLogger
+from pathlib import Path
+
+import meshio
+import numpy as np
+import trimesh
+
+from msmpetsc.errors import InputError
+
+Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
+
+# Coordinates are often stored in single precision (1.2e-7): thinner than this, relative to its
+# longest side, a body cannot be told from a flat sheet. A plate of 1:1000 lies far above.
+FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh.
+
+    points    : (v, 3) float64 [m]
+    triangles : (f, 3) int64, corners of each triangle as rows of ``points``
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray
+
+
+@dataclass(frozen=True)
+class SurfaceReport:
+    """What a surface is like.
+
+    Edges are counted after merging points of equal position (so the loose triangles of an STL
+    may be closed) and dropping the triangles that this leaves with two equal corners.
+
+    nonmanifold_edges    : edges of more than two triangles
+    inconsistent_edges   : edges whose two triangles run along them in the same direction
+    degenerate_triangles : triangles with two corners at the same position
+    unused_points        : points of no triangle
+    """
+
+    volume: float  # [m^3], signed: negative if wound inwards; of little meaning if open
+    area: float  # [m^2]
+    boundary_edges: int
+    nonmanifold_edges: int
+    inconsistent_edges: int
+    degenerate_triangles: int
+    unused_points: int
+
+    @property
+    def closed(self) -> bool:
+        """Whether no edge belongs to one triangle only."""
+        return self.boundary_edges == 0
+
+
+def read_surface(path: str | Path) -> Surface:
+    """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU or VTK as triangles, in the file's own unit.
+
+    Polygons are cut into triangles, the parts of a GLB are joined, of tetrahedra the outer
+    surface is taken. All but glTF, VTU and VTK may be compressed (``.gz``).
+
+    Raises InputError, one line naming the file, if it holds no usable mesh.
+    """
+    path = Path(path)
+    kind, data = _kind(path), _content(path)
+    try:
+        with _silence():
+            if _claimed_rows(kind, data) > len(data):
+                raise ValueError("its header claims more than the file holds")
+            points, faces = _READERS[kind](path, data)
+            if faces.ndim != 2 or faces.shape[1] != 3:
+                faces = trimesh.geometry.triangulate_quads(faces)
+    except Exception as error:  # on garbage the readers raise whatever comes
+        reason = (str(error).splitlines() or [""])[0][:120] or type(error).__name__
+        raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
+    _check_arrays(path, points, faces)
+    return Surface(
+        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64)
+    )
+
+
+def examine(surface: Surface) -> SurfaceReport:
+    """Measure volume, area and edges of a surface."""
+    corners = surface.points[surface.triangles]  # (f, 3 corners, 3)
+    corners = corners - surface.points[surface.triangles[0, 0]]  # small numbers round less
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    merged = merged_triangles(surface)
+    used, forward = edge_use(merged)
+    return SurfaceReport(
+        volume=float(np.einsum("ij,ij->", corners[:, 0], normals) / 6),
+        area=float(np.linalg.norm(normals, axis=1).sum() / 2),
+        boundary_edges=int((used == 1).sum()),
+        nonmanifold_edges=int((used > 2).sum()),
+        inconsistent_edges=int(((used == 2) & (forward != 1)).sum()),
+        degenerate_triangles=len(surface.triangles) - len(merged),
+        unused_points=len(surface.points) - len(np.unique(surface.triangles)),
+    )
+
+
+def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
+    """Warnings about a surface whose inside is in doubt; none for a clean one.
+
+    Flatness is measured along the principal axes, so that a tilted sheet is seen too. A closed
+    surface is judged by its mean thickness, 2 |volume| / area, relative to its longest side.
+
+    Raises InputError if the surface encloses no volume.
+    """
+    points = surface.points[np.unique(surface.triangles)]
+    sides = np.ptp(points @ np.linalg.svd(np.cov(points.T))[0], axis=0)
+    if sides.min() <= FLAT * sides.max():
+        raise InputError("the mesh encloses no volume: it is flat")
+    if report.closed and 2 * abs(report.volume) <= FLAT * report.area * sides.max():
+        raise InputError(
+            "the mesh encloses no volume: it is folded onto itself, or its parts are wound "
+            'against each other (for the latter: prepare = ["orient"])'
+        )
+    return _warnings(report)
+
+
+def _warnings(report: SurfaceReport) -> list[str]:
+    """One line for each doubtful property of the surface, with its remedy."""
+    found = []
+    if report.boundary_edges:
+        found.append(
+            f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding "
+            'number will decide what is inside; prepare = ["repair"] closes holes'
+        )
+    if report.nonmanifold_edges:
+        found.append(f"{report.nonmanifold_edges} edges have more than two triangles")
+    if report.inconsistent_edges:
+        found.append(
+            f"{report.inconsistent_edges} edges have triangles wound against each other: "
+            'prepare = ["orient"] mends that'
+        )
+    if report.volume < 0:
+        found.append(
+            f"the faces are wound inwards (volume {report.volume:.3g} m^3): "
+            'prepare = ["orient"] turns them'
+        )
+    return found
+
+
+def merged_triangles(surface: Surface) -> np.ndarray:
+    """(g, 3) triangles over merged points: equal positions share the number of the first of
+    them, triangles left with fewer than three corners are dropped."""
+    triangles = first_of_equal(surface.points)[surface.triangles]
+    a, b, c = triangles.T
+    return triangles[(a != b) & (b != c) & (c != a)]
+
+
+def first_of_equal(points: np.ndarray) -> np.ndarray:
+    """(v,) for each point the lowest number of a point of exactly the same position."""
+    order = np.lexsort(points.T)  # stable: equal points stay in the order of their numbers
+    sorted_points = points[order]
+    starts = np.ones(len(points), bool)
+    starts[1:] = (sorted_points[1:] != sorted_points[:-1]).any(axis=1)
+    first = np.empty(len(points), np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return first
+
+
+def edge_use(triangles: np.ndarray) -> Arrays:
+    """For each undirected edge, how many triangles use it, and how many of those run along it
+    from its lower to its higher point number. Both (e,)."""
+    if len(triangles) == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    # one sortable number an edge, its direction in the last bit
+    key = np.sort((low * (triangles.max() + 1) + high) * 2 + (start < end))
+    first = np.flatnonzero(np.diff(key >> 1, prepend=-1))
+    return np.diff(first, append=len(key)), np.add.reduceat(key & 1, first)
+
+
+def _check_arrays(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
+    """Raise InputError unless the arrays make a mesh."""
+    if len(triangles) == 0:
+        raise InputError(f"{path}: holds no triangles")
+    if not np.isfinite(points).all():
+        raise InputError(f"{path}: has coordinates that are NaN or infinite")
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        raise InputError(
+            f"{path}: a triangle names a point outside 0..{len(points) - 1}: "
+            f"{triangles.min() if triangles.min() < 0 else triangles.max()}"
+        )
+
+
+def _kind(path: Path) -> str:
+    """The format by the file's name, '.gz' aside; InputError if it is not one we read."""
+    name = path.name.lower()
+    kind = Path(name.removesuffix(".gz")).suffix.removeprefix(".")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, not a mesh file")
+    if kind not in _READERS:
+        raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
+    if name.endswith(".gz") and kind in _NEED_PATH:
+        raise InputError(f"{path}: {kind.upper()} is not read compressed: gunzip it first")
+    return kind
+
+
+def _content(path: Path) -> bytes:
+    """The file's bytes, decompressed."""
+    try:
+        data = path.read_bytes()
+        data = gzip.decompress(data) if data.startswith(b"\x1f\x8b") else data
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, EOFError, MemoryError, gzip.zlib.error) as error:
+        reason = getattr(error, "strerror", None) or error or "too large for the memory"
+        raise InputError(f"{path}: cannot be read ({reason})") from error
+    if not data:
+        raise InputError(f"{path}: is empty")
+    return data
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what the readers print, log or warn from the terminal; half-read numbers are errors."""
+    log = getLogger("trimesh")
+    level = log.level
+    log.setLevel(CRITICAL)
+    try:
+        with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", message="string or file could not be read")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _claimed_rows(kind: str, data: bytes) -> int:
+    """How many rows (points, faces) the header claims, each of at least a byte: some readers
+    allocate them before they look for them."""
+    if kind == "ply":
+        header = data[: data.find(b"end_header")]
+        return sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", header, re.MULTILINE)))
+    if kind == "vtk":
+        sections = re.findall(rb"^(?:POINTS|CELLS|CELL_TYPES|POLYGONS)\s+(\d+)", data, re.MULTILINE)
+        return sum(map(int, sections))
+    if kind in ("gltf", "glb"):
+        text = data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
+        # an accessor of no buffer view stands for that many zeros
+        accessors = json.loads(text).get("accessors", [])
+        return sum(a["count"] for a in accessors if "bufferView" not in a)
+    return 0
+
+
+def _read_ply(path: Path, data: bytes) -> Arrays:
+    try:
+        mesh = trimesh.exchange.ply.load_ply(BytesIO(data), fix_texture=False, skip_materials=True)
+    except ValueError as error:
+        if "unexpected length" not in str(error):
+            raise
+        return _read_mixed_ply(data)
+    stored = mesh["metadata"]["_ply_raw"]
+    for name in ("vertex", "face"):  # a truncated ASCII file just has fewer rows
+        rows = stored.get(name, {}).get("data", ())
+        rows = next(iter(rows.values())) if isinstance(rows, dict) else rows
+        if len(rows) != stored.get(name, {}).get("length", 0):
+            raise ValueError(f"truncated: {len(rows)} of {stored[name]['length']} {name} rows")
+    faces = mesh.get("faces")
+    return mesh.get("vertices", np.zeros((0, 3))), np.zeros((0, 3)) if faces is None else faces
+
+
+def _read_mixed_ply(data: bytes) -> Arrays:
+    """A binary PLY whose faces differ in their number of corners, which trimesh does not read."""
+    mesh = meshio.ply.read(BytesIO(data))
+    polygons = [face for block in mesh.cells for face in block.data]
+    return mesh.points, trimesh.geometry.triangulate_quads(polygons)
+
+
+def _read_trimesh(path: Path, data: bytes) -> Arrays:
+    kind = _kind(path)
+    source = path if kind in _NEED_PATH else BytesIO(data)  # a glTF names files beside it
+    scene = trimesh.load_scene(
+        source, file_type=kind, process=False, skip_materials=True, maintain_order=True
+    )
+    if not scene.geometry:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    mesh = scene.to_mesh()
+    return mesh.vertices, mesh.faces
+
+
+def _read_meshio(path: Path, data: bytes) -> Arrays:
+    """Outer surface of the tetrahedra, or else triangles and quads, without unused points."""
+    mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
+    cells = mesh.cells_dict
+    if "tetra" in cells:
+        triangles = _outer_triangles(mesh.points, cells["tetra"])
+    else:
+        quads = cells.get("quad", np.zeros((0, 4), np.int64))
+        triangles = np.vstack(
+            [cells.get("triangle", np.zeros((0, 3), np.int64)), quads[:, :3], quads[:, [2, 3, 0]]]
+        )
+    used, triangles = np.unique(triangles, return_inverse=True)
+    return mesh.points[used], triangles.reshape(-1, 3)
+
+
+def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """(f, 3) the faces of one tetrahedron only, wound outwards. tetrahedra: (c, 4)."""
+    a, b, c, d = points[tetrahedra].swapaxes(0, 1)
+    inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0
+    tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
+    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return faces[np.sort(first[count == 1])]
+
+
+def _read_mz3(path: Path, data: bytes) -> Arrays:
+    """The mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
+    magic, content, faces, points, skip = struct.unpack_from("<HHIII", data)
+    if magic != 0x5A4D or content & 3 != 3:  # bits 0 and 1: has triangles, has points
+        raise ValueError("no mz3 header with triangles and points")
+    start = 16 + skip
+    triangles = np.frombuffer(data, "<i4", 3 * faces, start)
+    coordinates = np.frombuffer(data, "<f4", 3 * points, start + triangles.nbytes)
+    return coordinates.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+_READERS = {
+    "ply": _read_ply,
+    "mz3": _read_mz3,
+    "vtu": _read_meshio,
+    "vtk": _read_meshio,
+    **dict.fromkeys(("obj", "stl", "off", "glb", "gltf"), _read_trimesh),
+}
+_NEED_PATH = ("gltf", "vtu", "vtk")

@@ -1,0 +1,94 @@
+"""From a scene to what is simulated: surface, cages, lattice, embedding, loads, obstacles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.cages import Body, Cages, fill
+from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.embedding import Embedding, embed
+from msmpetsc.geometry.prepare import compact, prepare
+from msmpetsc.geometry.registry import load
+from msmpetsc.geometry.surface import Surface, check_encloses, examine
+from msmpetsc.model.contact import Plane
+from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.model.loads import Load, check_not_empty, inside, spread_by_mass
+from msmpetsc.scene import Scene
+
+
+@dataclass(frozen=True)
+class Model:
+    """A scene made ready to step. Arrays hold this rank's share; the surface is on rank 0 only.
+
+    embedding : None where the scene stores no surface
+    loads     : gravity first, where there is any
+    """
+
+    surface: Surface | None
+    lattice: Lattice
+    embedding: Embedding | None
+    loads: list[Load]
+    planes: list[Plane]
+
+
+def build_model(comm: MPI.Comm, scene: Scene) -> Model:
+    """Everything of a scene but its solver (collective). Raises InputError on all ranks."""
+    body = read_body(comm, scene)
+    cages = fill_cages(body, scene)
+    material = scene.material
+    lattice = build_lattice(cages, material.density, material.young_modulus, material.stiffness)
+    lattice = _pin(comm, scene, lattice, body.bounds)
+    embedding = None
+    if scene.output.surface:
+        points = np.empty((0, 3)) if body.surface is None else body.surface.points
+        embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
+    planes = [Plane(np.array(o.point), np.array(o.normal), o.restitution) for o in scene.obstacle]
+    return Model(body.surface, lattice, embedding, _loads(comm, scene, lattice, body.bounds), planes)
+
+
+def read_body(comm: MPI.Comm, scene: Scene) -> Body:
+    """The prepared surface on rank 0, and on all ranks what they need to know of it (collective)."""
+
+    def read() -> tuple[Surface, tuple]:
+        surface = prepare(load(scene.mesh.source, scene.folder), scene.mesh.prepare, scene.mesh.size, scene.mesh.base)
+        report = examine(surface)
+        for warning in check_encloses(surface, report):
+            log.warning("%s: %s", scene.mesh.source, warning)
+        surface = compact(surface.points, surface.triangles)  # a point of no triangle may lie in no cell
+        return surface, (report, np.array([surface.points.min(axis=0), surface.points.max(axis=0)]))
+
+    surface, facts = on_root(comm, read) or (None, None)
+    report, bounds = comm.bcast(facts)
+    return Body(comm, surface, report, bounds)
+
+
+def fill_cages(body: Body, scene: Scene) -> Cages:
+    """The scene's valid cells (collective)."""
+    cages = scene.cages
+    cell_size = cages.cell_size or choose_cell_size(body, cages.count, cages.method, cages.max_cells)
+    return fill(body, cell_size, cages.method, cages.max_cells)
+
+
+def _pin(comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray) -> Lattice:
+    for number, pin in enumerate(scene.pin):
+        where = inside(pin.region, lattice.nodes, bounds)
+        check_not_empty(comm, f"pin.{number}", where[: lattice.owned])
+        lattice = lattice.pin(where)
+    if comm.allreduce(int((~lattice.pinned[: lattice.owned]).sum())) == 0:
+        raise InputError("pin: every node of the lattice is pinned, nothing is left to move")
+    return lattice
+
+
+def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray) -> list[Load]:
+    loads = []
+    if scene.gravity is not None:
+        loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, np.inf))
+    for number, force in enumerate(scene.force):
+        where = inside(force.region, lattice.nodes[: lattice.owned], bounds)
+        check_not_empty(comm, f"force.{number}", where)
+        stop = np.inf if force.stop is None else force.stop
+        loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, stop))
+    return loads

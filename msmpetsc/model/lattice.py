@@ -1,0 +1,162 @@
+"""The lattice of a body: cell corners become masses, pairs of corners within a cell become springs.
+
+Each rank holds the nodes it owns, the ghost nodes that its springs reach, and every spring with an
+end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
+"""
+
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+
+from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry import morton
+from msmpetsc.geometry.cages import Cages
+from msmpetsc.model.material import calibrated_stiffness
+
+# corners of a cell in VTK's hexahedron order, which is also the order in the file
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+# the place in a 3 x 3 x 3 block of nodes of corner b seen from corner a
+DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
+KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """This rank's share. Local node numbers: the ``owned`` nodes first, then the ghosts.
+
+    table       : global node numbers by grid key; ``table.first`` is the first owned one
+    nodes       : (l, 3) rest positions [m]
+    ghosts      : (l - owned,) global numbers of the ghost nodes
+    mass        : (owned,) [kg]
+    cells       : (c, 8) global corner nodes of the cells this rank owns; cell_kind (c,)
+    springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
+                  lower-numbered end first, the others to the rank of their lower-numbered end
+    rest_length : (s,) [m]
+    stiffness   : (s,) [N/m]
+    pinned      : (l,) bool, nodes that do not move
+    """
+
+    table: SortedKeys
+    cell_size: float
+    nodes: np.ndarray
+    ghosts: np.ndarray
+    mass: np.ndarray
+    cells: np.ndarray
+    cell_kind: np.ndarray
+    springs: np.ndarray
+    springs_owned: int
+    rest_length: np.ndarray
+    stiffness: np.ndarray
+    pinned: np.ndarray
+
+    @property
+    def owned(self) -> int:
+        return len(self.mass)
+
+    @property
+    def global_numbers(self) -> np.ndarray:
+        """(l,) global number of each local node."""
+        return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
+
+    def pin(self, where: np.ndarray) -> "Lattice":
+        """This lattice with the nodes ``where`` (l,) bool held fast."""
+        return replace(self, pinned=self.pinned | where)
+
+
+def build_lattice(
+    cages: Cages, density: float, young_modulus: float | None = None, stiffness: float | None = None
+) -> Lattice:
+    """Masses and springs of the valid cells (collective).
+
+    density       : [kg/m^3]; each cell gives an eighth of its mass to each corner
+    young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
+    stiffness     : [N/m] for every spring, as in the paper
+    """
+    h = cages.grid.cell_size
+    corner_keys = morton.encode(cages.ijk[:, None, :] + CORNERS)
+    table = SortedKeys(cages.table.comm, corner_keys.ravel())
+    cells = table.find(corner_keys)
+    ijk, local_cells, octants = _local_cells(cages, table)
+    ghosts = table.find(morton.encode(ijk[len(table.keys) :]))
+    numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
+    springs, owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
+    if stiffness is None:
+        k = calibrated_stiffness(young_modulus, h, kind, sharing)
+    else:
+        k = np.full(len(springs), float(stiffness))
+    return Lattice(
+        table=table,
+        cell_size=h,
+        nodes=cages.grid.node_positions(ijk),
+        ghosts=ghosts,
+        mass=density * h**3 / 8 * octants.sum(axis=1),
+        cells=cells,
+        cell_kind=cages.kind,
+        springs=springs,
+        springs_owned=owned,
+        rest_length=h * np.sqrt(kind),
+        stiffness=k,
+        pinned=np.zeros(len(ijk), bool),
+    )
+
+
+def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The cells around the owned nodes.
+
+    Returns grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
+    which of the 8 cells around each owned node are valid, (owned, 8) bool.
+    """
+    ijk = morton.decode(table.keys)
+    around = morton.encode(ijk[:, None, :] - CORNERS)
+    octants = cages.table.find(around) >= 0
+    cell_keys = np.unique(around[octants])
+    corner_keys = morton.encode(morton.decode(cell_keys)[:, None, :] + CORNERS)
+    ghost_keys = np.setdiff1d(corner_keys, table.keys)
+    keys = np.concatenate([table.keys, ghost_keys])
+    order = np.argsort(keys)
+    local = order[np.searchsorted(keys, corner_keys, sorter=order)]
+    return morton.decode(keys), local, octants
+
+
+@numba.njit(cache=True)
+def _springs(cells, numbers, owned):
+    """Springs between the corners of cells, each once.
+
+    cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned
+    returns : (s, 2) local ends, how many this rank owns, kind (s,), cells sharing each (s,)
+    """
+    neighbour = np.full((owned, 27), -1, np.int32)
+    sharing = np.zeros((owned, 27), np.uint8)
+    for cell in cells:
+        for a in range(8):
+            if cell[a] < owned:
+                for b in range(8):
+                    neighbour[cell[a], DIRECTION[a, b]] = cell[b]
+                    sharing[cell[a], DIRECTION[a, b]] += 1
+    count = 0
+    for node in range(owned):
+        for direction in range(27):
+            other = neighbour[node, direction]
+            count += other >= 0 and direction != 13 and (numbers[other] > numbers[node] or other >= owned)
+    springs = np.empty((count, 2), np.int64)
+    kind = np.empty(count, np.int64)
+    shared = np.empty(count, np.int64)
+    low, high = 0, count  # springs of this rank fill the front, the others the back
+    for node in range(owned):
+        row = neighbour[node]
+        for direction in np.argsort(numbers[row]):
+            other = row[direction]
+            if other < 0 or direction == 13:
+                continue
+            if numbers[other] > numbers[node]:
+                at = low
+                low += 1
+            elif other >= owned:
+                high -= 1
+                at = high
+            else:
+                continue
+            springs[at, 0], springs[at, 1] = node, other
+            kind[at], shared[at] = KIND[direction], sharing[node, direction]
+    return springs, low, kind, shared

@@ -1,0 +1,25 @@
+"""From a material to springs: how stiff the three kinds of spring of a cubic lattice are.
+
+Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
+"""
+
+import numpy as np
+
+EDGE, FACE_DIAGONAL, SPACE_DIAGONAL = 1, 2, 3  # squared length in cells
+
+CELLS_AROUND = np.array([0, 4, 2, 1])  # cells that share a spring of each kind inside a body
+# k1 : k2 : k3 = 40 : 16 : 9 is isotropic up to the sixth moment of the directions; then E = 7/4 k1 / h
+ISOTROPIC = np.array([0, 40, 16, 9]) / 40
+
+
+def calibrated_stiffness(young_modulus: float, cell_size: float, kind: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
+
+    Assembled cell by cell, so a spring on the body's boundary has the weight of the cells it bounds.
+
+    cell_size : h [m]
+    kind      : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
+    cells     : (s,) number of valid cells that share the spring
+    """
+    edge = 4 / 7 * young_modulus * cell_size
+    return edge * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]

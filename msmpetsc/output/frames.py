@@ -1,0 +1,343 @@
+"""The result file (HDF5, format_version 1): written by all ranks through rank 0, safe against a kill.
+
+All metadata is on disk before the first frame and does not change while frames are written: every dataset of
+``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks allocated, nothing buffered.
+A frame is its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is
+finite (`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
+
+``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``. The older slot is written,
+with its step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
+"""
+
+import math
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from msmpetsc.comm import together
+from msmpetsc.errors import InputError
+from msmpetsc.model.frame import Frame
+
+FORMAT, FORMAT_VERSION = "msmpetsc", 1
+PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
+CHUNK_BYTES = 64 * 2**20
+STATIC_UNITS = {
+    "lattice/nodes": "m",
+    "lattice/rest_length": "m",
+    "lattice/stiffness": "N/m",
+    "lattice/mass": "kg",
+    "surface/points": "m",
+}
+# The numbers of a frame, named as in Frame and in /frames: dtype, shape, unit.
+SERIES = {
+    "time": ("f8", (), "s"),
+    "step_error": ("f8", (), "1"),
+    "iterations": ("i8", (), "1"),
+    "ksp_its": ("i8", (), "1"),
+    "kinetic": ("f8", (), "J"),
+    "elastic": ("f8", (), "J"),
+    "potential": ("f8", (), "J"),
+    "momentum": ("f8", (3,), "kg m/s"),
+    "wall_time": ("f8", (), "s"),
+}
+
+
+class ResultFile:
+    """The result file of one run. Every rank of `comm` calls every method; errors are raised on all together.
+
+    The file has a temporary name until `start_frames`; closed before that, it is dropped, and an old file of its
+    name stays. What cannot be written (full disk, no permission) raises InputError.
+    """
+
+    def __init__(self, path: str | Path, comm, attributes: dict, overwrite: bool = False):
+        """comm: an mpi4py communicator. attributes: see design.md; format and format_version are added here."""
+        self.path = Path(path)
+        self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
+        self._comm = comm
+        self._overwrite = overwrite
+        self._file: h5py.File | None = None  # open on rank 0 only
+        self._planned = self._finished = 0
+        with self._together():
+            if comm.rank == 0:
+                self._create(attributes)
+
+    def __enter__(self) -> "ResultFile":
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        if kind is None:
+            self.close()
+        else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
+            with suppress(InputError), _plain_errors(self.path):
+                self._finish()
+
+    def write(self, name: str, rows: np.ndarray) -> None:
+        """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes"."""
+        rows = np.asarray(rows)
+        counts, shapes, dtypes = zip(*self._comm.allgather((len(rows), rows.shape[1:], rows.dtype)))
+        if len(set(shapes)) > 1:
+            raise ValueError(f"{name}: the ranks' rows differ in shape: {set(shapes)}")
+        dtype = np.result_type(*dtypes)
+        with self._together():
+            if self._file is not None:
+                dataset = self._file.create_dataset(name, (sum(counts), *shapes[0]), dtype)
+                dataset.attrs["unit"] = STATIC_UNITS.get(name, "1")
+        self._collect(rows, dtype, counts, name)
+
+    def start_frames(
+        self, count: int, nodes: int, surface_points: int | None = None, surface_dtype: str = "f4"
+    ) -> None:
+        """Plan `count` frames, frame 0 included, of this rank's `nodes` and `surface_points` (None: not stored)."""
+        self._nodes, self._points = zip(*self._comm.allgather((nodes, surface_points)))
+        self._surface_dtype = surface_dtype
+        with self._together():
+            if self._file is not None:
+                self._plan(count)
+        self._planned = count
+
+    def append(self, frame: Frame) -> None:
+        """Store the next frame; once this returns, no kill can lose it."""
+        self._check(frame)
+        here = self._finished
+        self._collect(frame.position, "f8", self._nodes, "frames/position", here)
+        if self._points[0] is not None:
+            self._collect(frame.surface, self._surface_dtype, self._points, "frames/surface", here)
+        with self._together():
+            if self._file is not None:
+                frames = self._file["frames"]
+                for name in SERIES.keys() - {"time"}:
+                    frames[name][here] = getattr(frame, name)
+                self._file.flush()
+                frames["time"][here] = frame.time  # from here on the frame is there
+                self._file.flush()
+        self._finished += 1
+
+    def write_checkpoint(self, step: int, q: np.ndarray, q_previous: np.ndarray) -> None:
+        """Store q_n and q_(n-1), this rank's rows (n_local, 3) [m], as the state after `step` steps."""
+        self._check_rows("q", q, self._nodes)
+        self._check_rows("q_previous", q_previous, self._nodes)
+        slot = None
+        with self._together():
+            if self._file is not None:
+                slot = int(np.argmin(self._file["checkpoint/step"]))
+                self._file["checkpoint/step"][slot] = -1
+                self._file.flush()
+        self._collect(q, "f8", self._nodes, "checkpoint/q", slot)
+        self._collect(q_previous, "f8", self._nodes, "checkpoint/q_previous", slot)
+        with self._together():
+            if self._file is not None:
+                self._file.flush()
+                self._file["checkpoint/step"][slot] = step
+                self._file.flush()
+
+    def close(self) -> None:
+        """Trim the frames to the finished ones and close; a second call does nothing."""
+        with self._together():
+            self._finish()
+
+    # On rank 0 alone
+
+    def _create(self, attributes: dict) -> None:
+        self._refuse_to_replace()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._file = _open_new(self._part)
+            self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
+        except Exception:
+            self._part.unlink(missing_ok=True)
+            raise
+
+    def _refuse_to_replace(self) -> None:
+        if self.path.is_dir():
+            raise InputError(f"{self.path} is a folder, not a file")
+        if self.path.exists() and not self._overwrite:
+            raise InputError(f"{self.path} exists: --overwrite replaces it")
+
+    def _plan(self, count: int) -> None:
+        datasets = _layout(count, sum(self._nodes), self._points, self._surface_dtype)
+        planned = sum(math.prod(shape) * np.dtype(dtype).itemsize for _, shape, _, dtype, _ in datasets)
+        _refuse_small_disk(self.path, planned)
+        for name in ("frames", "checkpoint"):
+            self._file.create_group(name)
+        for dataset in datasets:
+            _plan_dataset(self._file, *dataset)
+        self._file["frames/time"][...] = np.nan
+        self._file["checkpoint/step"][...] = -1
+        self._file.flush()
+        self._refuse_to_replace()
+        os.replace(self._part, self.path)
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        self._part.unlink(missing_ok=True)  # still there only if no frames were started
+        with file:
+            if self._finished < self._planned:
+                for dataset in file["frames"].values():
+                    dataset.resize(self._finished, axis=0)
+
+    # What the ranks do together
+
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        """What one rank cannot do in the block, all raise after it."""
+        with together(self._comm), _plain_errors(self.path):
+            yield
+
+    def _check(self, frame: Frame) -> None:
+        if self._finished >= self._planned:
+            raise ValueError(f"frame {self._finished} was not planned: {self._planned} frames were")
+        if not np.isfinite(frame.time):
+            raise ValueError(f"frame {self._finished} has time {frame.time}")
+        self._check_rows("position", frame.position, self._nodes)
+        if self._points[0] is not None:
+            self._check_rows("surface", frame.surface, self._points)
+
+    def _check_rows(self, name: str, rows: np.ndarray | None, counts: Sequence[int]) -> None:
+        planned = (counts[self._comm.rank], 3)
+        if np.shape(rows) != planned:
+            raise ValueError(f"{name} has shape {np.shape(rows)} on rank {self._comm.rank}, planned were {planned}")
+
+    def _collect(self, rows: np.ndarray, dtype, counts: Sequence[int], name: str, index: int | None = None) -> None:
+        """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
+        rows = np.ascontiguousarray(rows, dtype)
+
+        def store(start: int, piece: np.ndarray) -> None:
+            part = slice(start, start + len(piece))
+            self._file[name][part if index is None else (index, part)] = piece
+
+        with self._together():
+            if self._comm.rank > 0:
+                for part in _pieces(rows, len(rows)):
+                    self._comm.Send(rows[part], dest=0)
+            else:
+                _receive(self._comm, rows, counts, store)
+
+
+def _receive(comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int, np.ndarray], None]) -> None:
+    """Hand store(start, piece) this rank's rows, then the pieces that the other ranks send."""
+    start, failure = 0, None
+    for rank, count in enumerate(counts):
+        for part in _pieces(rows, count):
+            piece = rows[part]
+            if rank > 0:
+                piece = np.empty((part.stop - part.start, *rows.shape[1:]), rows.dtype)
+                comm.Recv(piece, source=rank)
+            try:
+                if failure is None and len(piece):
+                    store(start + part.start, piece)
+            except OSError as error:
+                failure = error  # the others still send: hear them out
+        start += count
+    if failure is not None:
+        raise failure
+
+
+def _pieces(rows: np.ndarray, count: int) -> Iterator[slice]:
+    """Parts of `count` rows like these, of at most PIECE_BYTES each."""
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    most = max(1, PIECE_BYTES // row_bytes)
+    return (slice(start, min(start + most, count)) for start in range(0, count, most))
+
+
+def _open_new(path: Path) -> h5py.File:
+    """An empty file, of a kind that a kill cannot spoil.
+
+    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
+    cache: nothing waits to be written. No lock: a running result may be looked at.
+    """
+    return h5py.File(path, "w", libver="earliest", rdcc_nbytes=0, locking=False)
+
+
+def _layout(count: int, nodes: int, points: Sequence[int | None], surface_dtype: str) -> list[tuple]:
+    """Name, shape, chunks, dtype and unit of each dataset that is written frame by frame, in this order."""
+
+    def positions(name: str, times: int, rows: int, dtype: str) -> tuple:
+        most = CHUNK_BYTES // (3 * np.dtype(dtype).itemsize)
+        return name, (times, rows, 3), (1, min(max(1, rows), most), 3), dtype, "m"
+
+    numbers = [
+        (f"frames/{name}", (count, *shape), (count, *shape), dtype, unit)
+        for name, (dtype, shape, unit) in SERIES.items()
+    ]
+    surface = [] if points[0] is None else [positions("frames/surface", count, sum(points), surface_dtype)]
+    # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
+    # file before noting its new length; killed in between, it could not be opened.)
+    return [
+        *numbers,
+        positions("frames/position", count, nodes, "f8"),
+        *surface,
+        ("checkpoint/step", (2,), (2,), "i8", "1"),
+        positions("checkpoint/q", 2, nodes, "f8"),
+        positions("checkpoint/q_previous", 2, nodes, "f8"),
+    ]
+
+
+def _plan_dataset(file: h5py.File, name: str, shape: tuple, chunks: tuple, dtype: str, unit: str) -> None:
+    """A dataset that can shrink, with all its place in the file set aside now and nothing written there.
+
+    Through h5py's lower layer: its create_dataset insists on filling datasets that can change their size.
+    """
+    dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    dcpl.set_chunk(chunks)
+    dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    if name == "frames/time":
+        dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
+    space, kind = h5py.h5s.create_simple(shape, shape), h5py.h5t.py_create(np.dtype(dtype))
+    h5py.h5d.create(file.id, name.encode(), kind, space, dcpl)
+    file[name].attrs["unit"] = unit
+
+
+def _refuse_small_disk(path: Path, planned: int) -> None:
+    """Better now than hours later. planned: [byte]."""
+    free = shutil.disk_usage(path.parent).free
+    if planned > free:
+        raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
+
+
+@contextmanager
+def _plain_errors(path: Path) -> Iterator[None]:
+    """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError) as error:
+        told = re.search(r"error message = '([^']*)'", str(error))
+        if not told and not isinstance(error, OSError):
+            raise
+        raise InputError(f"{path} cannot be written: {told[1] if told else error.strerror or error}") from error
+
+
+def open_result(path: str | Path) -> h5py.File:
+    """Open a result file to read it; InputError if it is none."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    if not h5py.is_hdf5(path):
+        raise InputError(f"{path} is not an HDF5 file")
+    file = h5py.File(path, "r", locking=False)
+    told = file.attrs.get("format"), file.attrs.get("format_version")
+    if told != (FORMAT, FORMAT_VERSION) or "frames" not in file:
+        file.close()
+        raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
+    return file
+
+
+def finished(file: h5py.File) -> int:
+    """The number of finished frames: those whose time is finite."""
+    return int(np.isfinite(file["frames/time"][:]).sum())
+
+
+def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """The newest checkpoint, or None: step index, q_n and q_(n-1) of these rows of nodes (n,3) [m]."""
+    checkpoint = file["checkpoint"]
+    slot = int(np.argmax(checkpoint["step"]))
+    step = int(checkpoint["step"][slot])
+    return None if step < 0 else (step, checkpoint["q"][slot, rows], checkpoint["q_previous"][slot, rows])

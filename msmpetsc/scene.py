@@ -1,0 +1,375 @@
+"""Scene file (TOML) -> frozen, validated Scene. What a key means and its unit stand in its description."""
+
+import math
+import tomllib
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
+
+import tomli_w
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene_errors import as_given, one_of_problems, problem_lines, restated, rule, unknown_name
+
+
+def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise rule("must not be the zero vector")
+    return vector
+
+
+def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    longest = max(map(abs, _nonzero(vector)))
+    scaled = [x / longest for x in vector]  # or the squares of very large or small components leave the range
+    length = math.hypot(*scaled)
+    return tuple(x / length for x in scaled)
+
+
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
+T = TypeVar("T")
+ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples
+Vector = Annotated[tuple[float, float, float], Strict(False)]
+Direction = Annotated[Vector, AfterValidator(_nonzero)]
+UnitVector = Annotated[Vector, AfterValidator(_unit)]
+
+
+class Table(BaseModel):
+    """A table of the scene file; ``one_of`` names the keys of which exactly one must be given."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    one_of: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        """Add what pydantic does not check, and lose none of what it does."""
+        known = list(cls.model_fields)
+        problems: list[InitErrorDetails] = one_of_problems(data, cls.one_of, known)
+        try:
+            table = handler(data)
+        except ValidationError as error:
+            problems += restated(error, known)
+        if problems:
+            raise ValidationError.from_exception_data(cls.__name__, problems)
+        return table
+
+
+class Rotate(Table):
+    """A turn about the origin."""
+
+    axis: Direction = Field(description="axis of the turn, of any length but zero [-]")
+    degrees: float = Field(description="angle, right-handed about the axis [degrees]")
+
+
+class StepTable(Table):
+    """A step of mesh preparation that needs a value."""
+
+    one_of = ("simplify", "rotate")
+    simplify: int | None = Field(None, ge=4, lt=2**63, description="triangles to keep [-]")
+    rotate: Rotate | None = Field(None, description="turn the surface")
+
+
+StepName = Literal["merge", "largest_part", "union", "repair", "orient"]
+
+
+def _step(value: Any) -> str | dict[str, Any]:
+    """A step name, or a table of one key, checked and plain."""
+    if isinstance(value, dict):
+        return StepTable.model_validate(value).model_dump(exclude_none=True)
+    if not isinstance(value, str):
+        raise rule("must be a step name or a table such as { simplify = 5000 }")
+    if value in StepTable.one_of:
+        raise rule(f"needs a value: {{ {value} = ... }}")
+    if value not in get_args(StepName):
+        raise unknown_name(get_args(StepName))
+    return value
+
+
+Step = Annotated[str | dict[str, Any], BeforeValidator(_step)]
+
+
+class Mesh(Table):
+    """The closed surface."""
+
+    source: str = Field(min_length=1, description="registry name, or path beside this file")
+    prepare: ListOf[Step] = Field(
+        (),
+        description="steps in this order: merge, largest_part, union, repair, orient, "
+        "{ simplify = triangles [-] }, { rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",
+    )
+    size: Positive | None = Field(None, description="longest side of the bounding box [m]; as in the file if absent")
+    base: Vector | None = Field(None, description="where the middle of the bounding box's bottom face stands [m]")
+
+
+class Cages(Table):
+    """The grid cells that fill the surface, and how the surface follows them."""
+
+    one_of = ("count", "cell_size")
+    count: Count | None = Field(None, description="number of valid cells aimed at [-]")
+    cell_size: Positive | None = Field(None, description="edge of a cell [m]")
+    method: Literal["exact", "sample"] = Field("exact", description="triangle-box test, or the paper's sample points")
+    embedding: Literal["affine", "cages", "mvc"] = Field("affine", description="how the surface follows the nodes")
+    smoothing: float = Field(1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]')
+    max_cells: Count = Field(5_000_000, description="refuse a lattice of more cells than this [-]")
+
+    @field_validator("smoothing")
+    @classmethod
+    def _has_a_use(cls, smoothing: float, info: ValidationInfo) -> float:
+        if info.data.get("embedding", "cages") != "cages":
+            raise rule('is for embedding = "cages" only', "embedding")
+        return smoothing
+
+
+class Material(Table):
+    """What the lattice is made of."""
+
+    one_of = ("young_modulus", "stiffness")
+    young_modulus: Positive | None = Field(None, description="Young's modulus; Poisson's ratio is 1/4 [Pa]")
+    stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
+    density: Positive = Field(description="mass density [kg/m^3]")
+
+
+class Time(Table):
+    """Simulated time."""
+
+    step: Positive = Field(description="time step [s]")
+    duration: Positive = Field(description="simulated time [s]")
+
+    @field_validator("duration")
+    @classmethod
+    def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
+        step = info.data.get("step", duration)
+        if not math.isfinite(duration / step):
+            raise rule(f"holds too many steps of {step:g} s", "step")
+        if round(duration / step) < 1:
+            raise rule(f"must hold at least one step of {step:g} s", "step")
+        return duration
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps."""
+        return round(self.duration / self.step)
+
+
+class Gravity(Table):
+    """A uniform field."""
+
+    acceleration: Vector = Field(description="[m/s^2]")
+
+
+class Obstacle(Table):
+    """What nodes bounce off."""
+
+    shape: Literal["plane"] = Field(description="kind of obstacle")
+    point: Vector = Field(description="a point of the plane [m]")
+    normal: UnitVector = Field(description="towards the free side, normalised on reading [-]")
+    response: Literal["reflect"] = Field("reflect", description="what happens on touching")
+    restitution: float = Field(1.0, ge=0, le=1, description="normal speed after over before the impact [-]")
+
+
+class Sphere(Table):
+    """A ball."""
+
+    center: Vector = Field(description="[m], or [-] if relative")
+    radius: Positive = Field(description="[m], or in longest sides of the rest bounding box [-] if relative")
+
+
+class HalfSpace(Table):
+    """All that lies on one side of a plane."""
+
+    point: Vector = Field(description="a point of the plane [m], or [-] if relative")
+    normal: UnitVector = Field(description="towards the side that is meant, normalised on reading [-]")
+
+
+class Region(Table):
+    """A part of space at rest; the nodes in it are meant."""
+
+    one_of = ("box", "sphere", "half_space")
+    box: Annotated[tuple[Vector, Vector], Strict(False)] | None = Field(
+        None, description="two corners, each coordinate of the first the lower [m], or [-] if relative"
+    )
+    sphere: Sphere | None = Field(None, description="a ball [m], or [-] if relative")
+    half_space: HalfSpace | None = Field(None, description="one side of a plane [m], or [-] if relative")
+    relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
+
+    @field_validator("box")
+    @classmethod
+    def _has_a_volume(cls, box: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+        if not all(low < high for low, high in zip(*box, strict=True)):
+            raise rule("must have each coordinate of the first corner below that of the second")
+        return box
+
+
+class Pin(Table):
+    """Nodes that stay where they are."""
+
+    region: Region = Field(description="the nodes held")
+
+
+class Force(Table):
+    """A force on a part of the body."""
+
+    region: Region = Field(description="the nodes pulled")
+    total: Vector = Field(description="sum over the nodes, spread by mass [N]")
+    start: float = Field(0.0, description="acts from this time [s]")
+    stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
+
+    @field_validator("stop")
+    @classmethod
+    def _after_start(cls, stop: float, info: ValidationInfo) -> float:
+        start = info.data.get("start")
+        if start is not None and stop <= start:
+            raise rule(f"must be > start = {start:g}", "start")
+        return stop
+
+
+class Solver(Table):
+    """How a step is solved."""
+
+    preset: str = Field("anderson", min_length=1, description="named set of PETSc options")
+    error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
+    max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
+
+    @field_validator("preset")
+    @classmethod
+    def _is_known(cls, preset: str, info: ValidationInfo) -> str:
+        presets = (info.context or {}).get("presets")
+        if presets is not None and preset not in presets:
+            raise unknown_name(presets)
+        return preset
+
+
+class Output(Table):
+    """What is stored beside the lattice."""
+
+    surface: bool = Field(True, description="store the surface of every frame")
+
+
+class SceneFile(Table):
+    """What may stand in a scene file; ``SceneFile.model_json_schema()`` is its schema."""
+
+    title: str = Field("", description="for the reader")
+    mesh: Mesh = Field(description="the closed surface")
+    cages: Cages = Field(description="the cells that fill it")
+    material: Material = Field(description="what it is made of")
+    time: Time = Field(description="time step and duration")
+    gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
+    obstacle: ListOf[Obstacle] = Field((), description="what nodes bounce off")
+    pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
+    force: ListOf[Force] = Field((), description="forces on parts of the body")
+    solver: Solver = Field(Solver(), description="how a step is solved")
+    output: Output = Field(Output(), description="what is stored")
+
+
+class Scene(SceneFile):
+    """A scene file as read: its tables, its TOML text as run, and the folder its paths start from."""
+
+    text: str = Field("", description="the TOML text, overrides included")
+    folder: Path = Field(Path(), description="folder of the file")
+
+
+def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None) -> Scene:
+    """Read and check a scene file.
+
+    overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
+        number; they replace or insert before anything is checked.
+    presets: the known names of solver presets; any name will do if None.
+
+    Raises InputError naming every problem of the file, one a line.
+    """
+    path, overrides = Path(path), list(overrides)
+    file_text = _read(path)
+    data = _parse(path, file_text)
+    keys = {_override(data, override): override for override in overrides}
+    try:
+        checked = SceneFile.model_validate(data, context={"presets": presets})
+    except ValidationError as error:
+        raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
+    return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such scene file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, not a scene file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start})") from None
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        last = text.rstrip().count("\n") + 1
+        problem = str(error).replace("at end of document", f"at the end, line {last}")
+        raise InputError(f"{path}: is not TOML: {problem}") from None
+    except RecursionError:
+        raise InputError(f"{path}: is nested too deeply") from None
+    except ValueError:  # all that tomllib leaves to int(): Python's limit on digits
+        raise InputError(f"{path}: has an integer of too many digits") from None
+
+
+def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
+    """Carry out one "key.path=value" in ``data``; returns the key path."""
+    try:
+        name, equals, raw = override.partition("=")
+        path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
+        if not equals or not raw.strip() or "" in path:
+            raise InputError("must read key.path=value")
+        value = _override_value(raw.strip())
+        holder: Any = data
+        for key, following in zip(path, path[1:], strict=False):
+            empty = [] if isinstance(following, int) else {}
+            holder = _put(holder, key, empty, replace=False)
+        _put(holder, path[-1], value, replace=True)
+    except InputError as error:
+        raise InputError(f"--set {as_given(override)}: {error}") from None
+    return path
+
+
+def _override_value(raw: str) -> Any:
+    try:
+        parsed = tomllib.loads(f"value = {raw}")
+    except (ValueError, RecursionError):
+        if raw[0] in "\"'[{" or "\n" in raw:
+            raise InputError("the value is not TOML") from None
+        return raw
+    if set(parsed) != {"value"}:
+        raise InputError("must hold a single value")
+    return parsed["value"]
+
+
+def _put(holder: Any, key: str | int, value: Any, replace: bool) -> Any:
+    """Put ``value`` at ``key`` of a table or list (where absent, or ``replace``); returns what is there then."""
+    if isinstance(holder, dict):
+        key = str(key)
+        if replace or key not in holder:
+            holder[key] = value
+    elif not isinstance(holder, list):
+        raise InputError(f"{key!r} has no place in {as_given(holder)}, which is no table or list")
+    elif not isinstance(key, int) or key > len(holder):
+        raise InputError(f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}")
+    elif key == len(holder):
+        holder.append(value)
+    elif replace:
+        holder[key] = value
+    return holder[key]

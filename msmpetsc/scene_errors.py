@@ -1,0 +1,185 @@
+"""Problems of a scene file in plain words: key path, what is wrong, the value, the nearest valid name, the line."""
+
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+KeyPath = tuple[str | int, ...]
+
+SEARCHED_LINES = 300  # finding a line parses every prefix of the file: quadratic, 0.2 s for so many
+
+WORDS = {  # pydantic's error types: {gt} and the like are its own figures
+    "missing": "required, but missing",
+    "finite_number": "must be a finite number, got {got}",
+    "float_type": "must be a number, got {got}",
+    "int_type": "must be a whole number, got {got}",
+    "string_type": "must be a string, got {got}",
+    "string_too_short": "must not be empty",
+    "bool_type": "must be true or false, got {got}",
+    "tuple_type": "must be a list, got {got}",
+    "model_type": "must be a table, got {got}",
+    "too_few": "must have {length} items, got {got}",
+    "too_long": "must have {max_length} items, got {got}",
+    "greater_than": "must be > {gt}, got {got}",
+    "greater_than_equal": "must be >= {ge}, got {got}",
+    "less_than": "must be < {lt}, got {got}",
+    "less_than_equal": "must be <= {le}, got {got}",
+    "rule": "{words}, got {got}",
+    "one_of": "must give exactly one of {names}; has {given}",
+}
+
+
+def rule(words: str, *others: str) -> PydanticCustomError:
+    """A broken rule in plain words; ``others`` are the keys beside this one that it looks at."""
+    return PydanticCustomError("rule", "rule", {"words": words, "others": others})
+
+
+def unknown_name(valid: Iterable[str]) -> PydanticCustomError:
+    """A name that is none of ``valid``."""
+    return PydanticCustomError("unknown_name", "unknown name", {"valid": list(valid)})
+
+
+def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list[InitErrorDetails]:
+    """The problem, if any, that not exactly one of ``names`` is a key of ``data``."""
+    if not names or not isinstance(data, dict):
+        return []
+    given = [name for name in names if name in data]
+    misspelt = not given and any(key not in known for key in data)  # reported as unknown: one mistake, one line
+    if len(given) == 1 or misspelt:
+        return []
+    context = {"names": ", ".join(names), "given": " and ".join(given) or "none", "inner": given}
+    return [InitErrorDetails(type=PydanticCustomError("one_of", "one of", context), loc=(), input=data)]
+
+
+def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]:
+    """The problems of one table, to be raised again together with others.
+
+    known: the table's keys. An unknown key gets them to choose the nearest from, and a missing key that
+    an unknown one nearly spells is left out. A list that is too short is one problem, not one an item.
+    """
+    found = error.errors(include_url=False)
+    unknown = [e["loc"][0] for e in found if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
+    meant = {_nearest(key, known) for key in unknown}
+    problems: dict[Any, InitErrorDetails] = {}
+    for number, e in enumerate(found):
+        kind, loc, context, identity = e["type"], e["loc"], dict(e.get("ctx", {})), number
+        if kind == "extra_forbidden" and len(loc) == 1:
+            context["valid"] = known
+        elif kind == "missing" and isinstance(loc[-1], int):
+            kind, identity, context = "too_few", loc[:-1], {"length": loc[-1] + 1}
+            loc = loc[:-1]
+        elif kind == "missing" and len(loc) == 1 and loc[0] in meant:
+            continue
+        custom = PydanticCustomError(kind, "{kind}", context)
+        problems[identity] = InitErrorDetails(type=custom, loc=loc, input=e["input"])
+    return list(problems.values())
+
+
+def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]) -> list[str]:
+    """One line for each problem: file, key, what is wrong, and the line in ``text`` or the override at fault."""
+    prefixes = _prefixes(text)
+    lines = []
+    for e in error.errors(include_url=False):
+        culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
+        number = _line(e["loc"], prefixes)
+        where = f" (--set {as_given(culprit)})" if culprit else f" (line {number})" if number else ""
+        lines.append(f"{path}: {_key(e['loc'])}: {_words(e)}{where}")
+    return lines
+
+
+def as_given(value: Any) -> str:
+    """``value`` on one line, shortened; an override as it was typed."""
+    if isinstance(value, str):
+        shown = " ".join(value.split())
+    elif isinstance(value, float):
+        shown = repr(value)
+    else:
+        try:
+            shown = json.dumps(value, ensure_ascii=False, default=str)
+        except (ValueError, RecursionError):
+            return "a value too long to show"
+    return shown if len(shown) <= 60 else shown[:57] + "..."
+
+
+def _got(value: Any) -> str:
+    return as_given(value) if not isinstance(value, str) else json.dumps(as_given(value), ensure_ascii=False)
+
+
+def _key(loc: KeyPath) -> str:
+    """The key path as --set takes it; keys that are not bare stand in quotes."""
+    return ".".join(key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, loc))
+
+
+def _words(e: ErrorDetails) -> str:
+    kind, context = e["type"], e.get("ctx", {})
+    if kind == "extra_forbidden":
+        return f"unknown key, {_suggestion(e['loc'][-1], context['valid'])}"
+    if kind == "unknown_name":
+        return f"unknown value {_got(e['input'])}, {_suggestion(e['input'], context['valid'])}"
+    if kind == "literal_error":
+        valid = re.findall(r"'([^']*)'", context["expected"])
+        return f"unknown value {_got(e['input'])}, {_suggestion(e['input'], valid)}"
+    figures = {name: f"{x:g}" if isinstance(x, float) else x for name, x in context.items()}
+    return WORDS.get(kind, "is not valid, got {got}").format(got=_got(e["input"]), **figures)
+
+
+def _nearest(word: Any, valid: list[str]) -> str | None:
+    return next(iter(difflib.get_close_matches(str(word).lower()[:100], valid, n=1)), None)
+
+
+def _suggestion(word: Any, valid: list[str]) -> str:
+    nearest = _nearest(word, valid)
+    return f"did you mean {nearest!r}?" if nearest else f"valid: {', '.join(valid)}"
+
+
+def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
+    """Whether an override of ``keys`` has a part in the problem: it set the key, a part of it, or its table."""
+    loc, context = e["loc"], e.get("ctx", {})
+    if e["type"] == "one_of":
+        suspects = [(*loc, name) for name in context["inner"]]
+    else:
+        suspects = [loc, *((*loc[:-1], name) for name in context.get("others", ()))]
+    return any(all(a == b for a, b in zip(suspect, keys, strict=False)) for suspect in suspects)
+
+
+def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
+    """For each statement of a TOML text: the line it starts on, and what the text holds up to its end.
+
+    A statement ends where the text up to there parses.
+    """
+    lines = text.split("\n")
+    if len(lines) > SEARCHED_LINES:
+        return []
+    found, start = [], 1
+    for end in range(1, len(lines) + 1):
+        try:
+            data = tomllib.loads("\n".join(lines[:end]) + "\n")
+        except tomllib.TOMLDecodeError:
+            continue
+        found.append((start, data))
+        start = end + 1
+    return found
+
+
+def _line(loc: KeyPath, prefixes: list[tuple[int, dict[str, Any]]]) -> int | None:
+    """Line on which the key first stands, or else the innermost table around it that the file has."""
+    depths = [_depth(data, loc) for _, data in prefixes]
+    deepest = max(depths, default=0)
+    return prefixes[depths.index(deepest)][0] if deepest else None
+
+
+def _depth(data: Any, loc: KeyPath) -> int:
+    """How many keys of ``loc`` lead somewhere in ``data``."""
+    for depth, key in enumerate(loc):
+        inside = isinstance(data, dict) and key in data or isinstance(data, list) and key in range(len(data))
+        if not inside:
+            return depth
+        data = data[key]
+    return len(loc)

@@ -1,0 +1,114 @@
+"""What PETSc's solvers see: operators and a preconditioner on vectors of three coordinates.
+
+Each is a Python context over the scalar matrix A, which acts on the m x 3 block that a vector of
+unknowns is: one product or one solve for three right-hand sides.
+"""
+
+import numba
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.model.energy import add_elastic_hessian
+from msmpetsc.solve.unknowns import Unknowns
+
+
+class Block:
+    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of."""
+
+    def __init__(self, matrix: PETSc.Mat):
+        rows, _ = matrix.getSizes()
+        self.mat = PETSc.Mat().createDense((rows, (None, 3)), comm=matrix.comm)
+        self.mat.setUp()
+        self.mat.assemble()
+        self.values = self.mat.getDenseArray().T.reshape(-1)  # a view of PETSc's memory: x, then y, then z
+        self.destroy = self.mat.destroy
+
+
+class ThreeColumns:
+    """A (x) I_3 without forming it."""
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.matrix = matrix
+        self.input = Block(matrix)
+        self.product = matrix.matMult(self.input.mat)
+        self.values = self.product.getDenseArray().T.reshape(-1)
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.input.values[:] = x.array_r
+        self.matrix.matMult(self.input.mat, result=self.product)
+        y.array[:] = self.values
+
+    def destroy(self, _: PETSc.Mat) -> None:
+        self.input.destroy()
+        self.product.destroy()
+
+
+class TrueHessian:
+    """M + t^2 (Hessian of E) at the positions last linearised about, applied spring by spring.
+
+    ``projected`` leaves out the negative curvature of compressed springs (model.energy).
+    """
+
+    def __init__(self, unknowns: Unknowns, time_step: float):
+        self.unknowns, self.t2 = unknowns, time_step**2
+        lattice = unknowns.lattice
+        self.springs = (lattice.springs, lattice.rest_length, lattice.stiffness)
+        self.q = np.empty_like(lattice.nodes)
+        self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
+        self.product = np.empty_like(lattice.nodes)
+        self.projected = False
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.unknowns.to_nodes(x, self.v)
+        self.product[:] = 0
+        add_elastic_hessian(self.q, *self.springs, self.projected, self.v, self.product)
+        lattice, free = self.unknowns.lattice, self.unknowns.free
+        scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
+
+
+@numba.njit(cache=True)
+def scaled_sum(rows, mass, a, t2, b, columns):
+    """M a + t^2 b at the given rows of (l, 3) arrays, written as (3, m) columns."""
+    for i in range(len(rows)):
+        for c in range(3):
+            columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]
+
+
+class ScalarPreconditioner:
+    """Any PETSc preconditioner of the scalar A, applied to the three columns in one call (a PCPYTHON context).
+
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true
+    Hessian is preconditioned with. MUMPS solves for all three right-hand sides at once.
+    """
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.pc = PETSc.PC().create(matrix.comm)
+        self.pc.setOperators(matrix)
+        self.input, self.output = Block(matrix), Block(matrix)
+
+    def setFromOptions(self, _: PETSc.PC) -> None:  # noqa: N802 (PETSc's name)
+        self.pc.setFromOptions()
+
+    def setUp(self, _: PETSc.PC) -> None:  # noqa: N802
+        self.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.input.values[:] = x.array_r
+        self.pc.matApply(self.input.mat, self.output.mat)
+        y.array[:] = self.output.values
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.pc.view(viewer)
+
+    def destroy(self, _: PETSc.PC) -> None:
+        for part in (self.input, self.output, self.pc):
+            part.destroy()
+
+
+def python_matrix(unknowns: Unknowns, context: ThreeColumns | TrueHessian, comm: PETSc.Comm) -> PETSc.Mat:
+    """A MATPYTHON on vectors of unknowns."""
+    size = (3 * unknowns.size, 3 * unknowns.total)
+    matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    matrix.setUp()
+    return matrix

@@ -1,0 +1,104 @@
+"""Presets: a method is a set of PETSc options on the one SNES of solve.step.
+
+Each option is only a default: the user's own option of that name wins. With A constant, Newton's
+method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The bare -ksp_ and -pc_
+options always mean the linear solve with A (or with the true Hessian, for ``newton``).
+"""
+
+from dataclasses import dataclass
+
+from petsc4py import PETSc
+
+from msmpetsc.errors import InputError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Preset:
+    """about: when to use it. options: PETSc's, without the dash.
+
+    true_hessian : the Jacobian is the true Hessian of g, not the constant A
+    start_from_b : CG starts from x = b, as in the paper's Algorithm 1
+    extrapolate  : a step starts from the best of several guesses, not from y as published
+    iterations   : a fixed number of them is the method as published; None iterates to the error target
+    """
+
+    about: str
+    options: dict[str, str]
+    true_hessian: bool = False
+    start_from_b: bool = False
+    extrapolate: bool = True
+    iterations: int | None = None
+
+
+CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
+JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
+NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
+PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
+
+PRESETS = {
+    "anderson": Preset(
+        "Anderson-accelerated local/global steps with loose CG solves: the default",
+        {
+            "snes_type": "anderson",
+            "snes_anderson_m": "5",
+            "snes_npc_side": "left",
+            "snes_max_it": "300",
+            "npc_snes_type": "newtonls",
+            "npc_snes_linesearch_type": "basic",
+            "npc_snes_max_it": "1",
+            "npc_snes_norm_schedule": "none",
+            **JACOBI_CG,
+            "ksp_rtol": "1e-1",
+        },
+    ),
+    "newton": Preset(
+        "Newton's method with the true Hessian and a line search: the reference, and the most accurate",
+        {
+            "snes_type": "newtonls",
+            "snes_linesearch_type": "bt",
+            "snes_max_it": "100",
+            **NO_STOP_BY_SIZE,
+            "snes_max_linear_solve_fail": "100",
+            **JACOBI_CG,
+            "ksp_rtol": "1e-3",
+        },
+        true_hessian=True,
+    ),
+    "fast-msm": Preset(
+        "Liu et al. 2013: ten local/global steps, each one solve with a prefactored Cholesky",
+        {**PLAIN, **CHOLESKY},
+        extrapolate=False,
+        iterations=10,
+    ),
+    "paper": Preset(
+        "Zheng et al.: the same ten steps with plain CG from x = b to a fixed tolerance",
+        {
+            **PLAIN,
+            "ksp_type": "cg",
+            "pc_type": "none",
+            "ksp_norm_type": "unpreconditioned",
+            "ksp_rtol": "1e-6",
+            "ksp_converged_use_initial_residual_norm": "",
+        },
+        start_from_b=True,
+        extrapolate=False,
+        iterations=10,
+    ),
+}
+
+
+def find_preset(name: str) -> Preset:
+    """Raises InputError with the nearest name for an unknown one."""
+    if name not in PRESETS:
+        raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}")
+    return PRESETS[name]
+
+
+def set_defaults(preset: Preset) -> dict[str, str]:
+    """Put the preset's options into PETSc's database where the user has set none; returns all that hold."""
+    database = PETSc.Options()
+    given = database.getAll()
+    for name, value in preset.options.items():
+        if name not in given:
+            database.setValue(name, value or None)
+    return {**preset.options, **given}

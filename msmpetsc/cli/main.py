@@ -38,6 +38,11 @@ def main(arguments: list[str] | None = None) -> int:
         return _stop_all_ranks(comm, STATUS_BUG, traceback.format_exc())
 
 
+def entry_point() -> None:
+    """Entry point of the installed ``msmpetsc``."""
+    sys.exit(main())
+
+
 def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Ours, and PETSc's: those of one dash, each with the value that follows it, as PETSc itself reads them."""
     ours, petsc = [], []
@@ -106,4 +111,4 @@ def _stop_all_ranks(comm: MPI.Comm, status: int, message: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    entry_point()

@@ -38,6 +38,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
     )
+    parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
     parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
 
@@ -77,8 +78,17 @@ def run(args: argparse.Namespace) -> int:
     except StepFailed:
         on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
         raise
-    on_root(comm, lambda: write_xdmf(path))
+    on_root(comm, lambda: finish(path, args.picture))
     return 0
+
+
+def finish(path: Path, picture: bool) -> None:
+    """What stands beside the result file."""
+    write_xdmf(path)
+    if picture:
+        from msmpetsc.output.render import contact_sheet  # loads VTK: a second that other runs need not wait
+
+        contact_sheet(path, path.with_suffix(".png"))
 
 
 def read_scene(args: argparse.Namespace) -> Scene:

@@ -1,0 +1,44 @@
+"""What several test files share: real MPI runs, and a small closed body."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import trimesh
+
+ROOT = Path(__file__).parent.parent
+AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+# As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
+ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+Run = Callable[..., subprocess.CompletedProcess]
+
+
+def run(ranks: int, *arguments: object, timeout: float = 120) -> subprocess.CompletedProcess:
+    """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out."""
+    launcher = ["mpiexec", "--oversubscribe", "-n", str(ranks)]
+    command = [*launcher, sys.executable, *map(str, arguments)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.fixture
+def on_ranks() -> Run:
+    """on_ranks(2, "worker.py", "argument") -> the finished process, whatever its status."""
+    return run
+
+
+@pytest.fixture
+def msmpetsc() -> Run:
+    """msmpetsc(2, "run", "scene.toml") -> the finished command on that many ranks."""
+    return lambda ranks, *arguments, **options: run(ranks, "-m", "msmpetsc.cli.main", *arguments, **options)
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball of 320 triangles and diameter 2, as a PLY file."""
+    path = tmp_path_factory.mktemp("meshes") / "ball.ply"
+    trimesh.creation.icosphere(subdivisions=2, radius=1).export(path)
+    return path

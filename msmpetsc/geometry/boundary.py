@@ -7,7 +7,7 @@ low faces, so a face of the body that lies in a grid plane marks one layer of ce
 import numba
 import numpy as np
 
-SLACK = 1e-12  # of a coordinate: above the rounding of an interpolated one, below anything that matters
+SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolated one, below anything that matters
 
 
 def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -58,25 +58,39 @@ def _clip(polygon, n, axis, plane, side, out):
 
 
 @numba.njit(cache=True)
-def _slab(polygon, n, axis, index, work, out):
-    """The part of the polygon between the planes ``index`` and ``index + 1`` of an axis."""
-    m = _clip(polygon, n, axis, float(index), 1.0, work)
-    return _clip(work, m, axis, float(index + 1), -1.0, out)
+def _slab(polygon, n, axis, index, slack, work, out):
+    """The part of the polygon between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
+    m = _clip(polygon, n, axis, index - slack, 1.0, work)
+    return _clip(work, m, axis, index + 1 + slack, -1.0, out)
 
 
 @numba.njit(cache=True)
-def _index_range(polygon, n, axis, low, high, slack):
-    """First and last cell index that the polygon reaches along an axis.
-
-    Slack widens a range whose ends may have been interpolated; a range of one value is exact.
-    """
+def _extent(polygon, n, axis):
+    """Smallest and largest coordinate along an axis."""
     smallest, largest = polygon[0, axis], polygon[0, axis]
     for a in range(1, n):
         smallest = min(smallest, polygon[a, axis])
         largest = max(largest, polygon[a, axis])
-    if slack and largest > smallest:
-        smallest -= SLACK * (1.0 + abs(smallest))
-        largest += SLACK * (1.0 + abs(largest))
+    return smallest, largest
+
+
+@numba.njit(cache=True)
+def _slack(triangle, axis):
+    """More than the rounding of a coordinate interpolated between corners of the triangle."""
+    smallest, largest = _extent(triangle, 3, axis)
+    return SLACK * (1.0 + max(abs(smallest), abs(largest)))
+
+
+@numba.njit(cache=True)
+def _index_range(triangle, part, n, axis, low, high, slack):
+    """First and last cell index that a part of a triangle reaches along an axis.
+
+    Slack widens the part, whose points may be interpolated, but never past the triangle's own
+    corners: those are exact, so a triangle that ends in a grid plane does not mark the layer behind.
+    """
+    smallest, largest = _extent(part, n, axis)
+    first, last = _extent(triangle, 3, axis)
+    smallest, largest = max(smallest - slack, first), min(largest + slack, last)
     return max(int(np.floor(smallest)), low), min(int(np.floor(largest)), high - 1)
 
 
@@ -90,30 +104,32 @@ def _in_one_cell(triangle):
 
 
 @numba.njit(cache=True)
+def _within(cell, low, high):
+    return np.all((low <= cell) & (cell < high))
+
+
+@numba.njit(cache=True)
 def _touched(corners, low, high):
     cells = np.empty((4 * len(corners) + 16, 3), np.int64)
     used = 0
-    work = np.empty((12, 3))
-    across = np.empty((12, 3))
-    along = np.empty((12, 3))
-    for f in range(len(corners)):
-        i0, i1 = _index_range(corners[f], 3, 0, low[0], high[0], False)
-        if i0 == i1 and _in_one_cell(corners[f]):
+    work, across, along = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
+    for triangle in corners:
+        if _in_one_cell(triangle):
             cells = _grown(cells, used)
             for c in range(3):
-                cells[used, c] = int(np.floor(corners[f, 0, c]))
-            used += 1
+                cells[used, c] = int(np.floor(triangle[0, c]))
+            used += _within(cells[used], low, high)
             continue
+        slack_j, slack_k = _slack(triangle, 1), _slack(triangle, 2)
+        i0, i1 = _index_range(triangle, triangle, 3, 0, low[0], high[0], 0.0)
         for i in range(i0, i1 + 1):
-            n = _slab(corners[f], 3, 0, i, work, across)
-            if n == 0:
-                continue
-            j0, j1 = _index_range(across, n, 1, low[1], high[1], i1 > i0)
+            n = _slab(triangle, 3, 0, i, 0.0, work, across)  # never empty: corners are exact, so is i's range
+            j0, j1 = _index_range(triangle, across, n, 1, low[1], high[1], slack_j)
             for j in range(j0, j1 + 1):
-                m = _slab(across, n, 1, j, work, along)
+                m = _slab(across, n, 1, j, slack_j, work, along)
                 if m == 0:
                     continue
-                k0, k1 = _index_range(along, m, 2, low[2], high[2], i1 > i0 or j1 > j0)
+                k0, k1 = _index_range(triangle, along, m, 2, low[2], high[2], slack_k)
                 for k in range(k0, k1 + 1):
                     cells = _grown(cells, used)
                     cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
@@ -132,6 +148,8 @@ def _sampled(corners, low, high):
         for i in range(n + 1):
             for j in range(n + 1 - i):
                 point = v3 + (i / n) * (v1 - v3) + (j / n) * (v2 - v3)
+                if i == n or j == n:
+                    point = v1 if i == n else v2  # not rounded: a corner's own cell must be marked
                 cells = _grown(cells, used)
                 inside = True
                 for c in range(3):

@@ -48,12 +48,6 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False) -> None:
         raise InputError(message)
 
 
-def forget_unused(ours: set[str]) -> None:
-    """Take the preset's unused options out again, so that -options_left shows the user's own."""
-    for name in set(_left()) & ours:
-        PETSc.Options().delValue(name)
-
-
 def _library() -> ctypes.CDLL:
     return ctypes.CDLL(PETSc.__file__)  # petsc4py's extension; its symbols include those of libpetsc
 

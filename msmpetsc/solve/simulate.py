@@ -12,7 +12,7 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.energy import elastic_energy
 from msmpetsc.model.frame import Frame
 from msmpetsc.scene import Scene
-from msmpetsc.solve.options import forget_unused, refuse_unused
+from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.step import Stepper, StepResult
 from msmpetsc.solve.surface import SurfaceMotion
@@ -61,10 +61,7 @@ class Simulation:
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        ours = set(self.stepper.preset.options)
-        refuse_unused(self.comm, ours, at_end)
-        if at_end:
-            forget_unused(ours)
+        refuse_unused(self.comm, self.stepper.defaults, at_end)
 
     def _load(self, time: float) -> np.ndarray:
         """External force f_ext (owned, 3) [N]."""

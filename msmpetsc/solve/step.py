@@ -14,7 +14,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.model.energy import add_elastic_gradient, elastic_change
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.operators import ScalarPreconditioner, ThreeColumns, TrueHessian, python_matrix, scaled_sum
-from msmpetsc.solve.presets import Preset, set_defaults
+from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -71,14 +71,14 @@ class Stepper:
         self.rounding = self._rounding_of_residual()
 
     def _create_solver(self, time_step: float) -> None:
-        options = set_defaults(self.preset)
+        self.defaults = set_defaults(self.preset)
         self.matrix = assemble(self.comm, self.unknowns, time_step)
         self.hessian = TrueHessian(self.unknowns, time_step) if self.preset.true_hessian else None
         self.operator = python_matrix(self.unknowns, self.hessian or ThreeColumns(self.matrix), self.comm)
         self.x, self.f = self.operator.createVecs()
         self.work = self.f.duplicate()
         self.snes = PETSc.SNES().create(self.comm)
-        inner = self.snes.getNPC() if "npc_snes_type" in options else self.snes
+        inner = self.snes.getNPC() if "npc_snes_type" in PETSc.Options().getAll() else self.snes
         self.ksp = PETSc.KSP().create(self.comm)
         inner.setKSP(self.ksp)
         pc = self.ksp.getPC()
@@ -109,22 +109,27 @@ class Stepper:
         self.q[:] = self.base[:] = q  # pinned nodes stay there
         self._first_guess(q)
         its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
+        self.last_error = self.residual = np.inf
         self.snes.solve(None, self.x)
-        error = self._relative_error(self.x)
         if self.snes.reason < 0:
-            raise StepFailed(self._failure(error))
+            raise StepFailed(self._failure())
+        self.unknowns.to_nodes(self.x, self.q)
         self.corrections = [self.q - self.y, *self.corrections[:1]]
         its = self.inner.getLinearSolveIterations() - its_before  # an NPC goes on counting
-        return StepResult(self.q.copy(), error, self.snes.its, its)
+        return StepResult(self.q.copy(), self.last_error, self.snes.its, its)
 
     def _first_guess(self, q: np.ndarray) -> None:
-        """Put into x the start of least g: y, as published; y and the elastic corrections c = x - y of the
-        last steps extrapolated, which is near in smooth motion; or q_n, which after an impact is not folded
-        over as y may be.
+        """Put the start of least g into x.
+
+        Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
+        y and the elastic corrections c = x - y of the last steps extrapolated, near in smooth motion; and
+        q_n, which after an impact is not folded over as y may be.
         """
         guesses = [self.y]
         if self.preset.extrapolate:
-            guesses.append(q)
+            flight = self.y.copy()
+            flight[: self.lattice.owned] += self.t2 * self.load / self.lattice.mass[:, None]
+            guesses += [flight, q]
             if self.corrections:
                 guesses.append(self.y + 2 * self.corrections[0] - self.corrections[-1])
         values = []
@@ -179,10 +184,6 @@ class Stepper:
         z.aypx(-1.0, x)
         z.axpy(1.0, f)
 
-    def _relative_error(self, x: PETSc.Vec) -> float:
-        self._residual(self.snes, x, self.work)
-        return self._error_of(self.work)
-
     def _error_of(self, f: PETSc.Vec) -> float:
         """|F|_(M^-1) / |x - y|_M at the positions self.q; 0 where F is nothing but rounding."""
         f = f.array_r
@@ -203,16 +204,18 @@ class Stepper:
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         reasons = PETSc.SNES.ConvergedReason
-        error = self._relative_error(snes.getSolution())
+        # with an NPC on the left SNES's own function is not F
+        self._residual(snes, snes.getSolution(), self.work)
+        self.last_error = self._error_of(self.work)
         if not np.isfinite(self.residual):
             return reasons.DIVERGED_FNORM_NAN
-        if error <= (self.error or 0.0):
+        if self.last_error <= (self.error or 0.0):
             return reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
             return reasons.CONVERGED_ITS
         return reasons.ITERATING
 
-    def _failure(self, error: float) -> str:
+    def _failure(self) -> str:
         advice = "a smaller time.step, another preset (newton), or a looser solver.error"
         reason = REASON.get(self.snes.reason, str(self.snes.reason))
         if self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
@@ -221,10 +224,11 @@ class Stepper:
             advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
         return (
             f"did not converge: {reason} after {self.snes.its} iterations, "
-            f"residual |F| = {self.residual:.2e}, relative error {error:.2e}; try {advice}"
+            f"residual |F| = {self.residual:.2e}, relative error {self.last_error:.2e}; try {advice}"
         )
 
     def destroy(self) -> None:
         """Collective, and in the same order on all ranks."""
         for owner in (self.snes, self.inner, self.ksp, self.operator, self.matrix, self.x, self.f, self.work, self.unknowns):
             owner.destroy()
+        forget_defaults(self.defaults)

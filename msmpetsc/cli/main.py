@@ -53,7 +53,7 @@ def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
             ours.append(word)
             continue
         petsc.append(word)
-        following = arguments[at + 1] if at + 1 < len(arguments) else "-"
+        following = arguments[at + 1] if at + 1 < len(arguments) else "--"
         if not following.startswith("--") and not _is_petsc_option(following) and following not in OUR_SHORT:
             if not following.endswith(".toml"):
                 petsc.append(following)

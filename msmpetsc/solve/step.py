@@ -19,6 +19,7 @@ from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
+FULL_STEP_ERROR = 1e-6  # below it g, quadratic in the error, has nothing left to tell
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -107,9 +108,9 @@ class Stepper:
         self.y = 2 * q - q_previous
         self.load = load
         self.q[:] = self.base[:] = q  # pinned nodes stay there
+        self.last_error = self.residual = np.inf
         self._first_guess(q)
         its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
-        self.last_error = self.residual = np.inf
         self.snes.solve(None, self.x)
         if self.snes.reason < 0:
             raise StepFailed(self._failure())
@@ -155,13 +156,18 @@ class Stepper:
         )
 
     def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
-        """g(x) - g(base): a line search compares values, and their difference must keep its digits."""
+        """g(x) - g(base): a line search compares values, and their difference must keep its digits.
+
+        Close to the solution g falls by less than the rounding of x changes it: then any move is called
+        a fall, so that Newton's full step is taken.
+        """
         self.unknowns.to_nodes(x, self.q)
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - self.base[owned]
         inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
         elastic = elastic_change(self.q, self.base, *self.owned_springs) - (moved * self.load).sum()
-        return self.comm.allreduce(inertia + self.t2 * elastic)
+        change, distance = self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()]))
+        return -1.0 if self.last_error < FULL_STEP_ERROR and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: A is constant, only the true Hessian depends on x."""

@@ -1,0 +1,80 @@
+"""What test_cages.py and test_loads_contact.py check on several ranks: cages_worker.py ACTION [arguments]."""
+
+import sys
+
+import numpy as np
+from mpi4py import MPI
+from scipy import ndimage
+
+from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
+from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.model.lattice import build_lattice
+from msmpetsc.model.loads import spread_by_mass
+
+comm = MPI.COMM_WORLD
+
+
+def enclosed(boundary: np.ndarray) -> np.ndarray:
+    """What a dense flood fill from outside does not reach, without the boundary itself (bool grids)."""
+    label, _ = ndimage.label(np.pad(~boundary, 1, constant_values=True))
+    return ((label != label[0, 0, 0]) & (label != 0))[1:-1, 1:-1, 1:-1]
+
+
+def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
+    """Random boundary cells are labyrinths: a third to two thirds of the grid, where both phases percolate."""
+    for shape in shapes:
+        for seed in range(seeds):
+            rng = np.random.default_rng(seed)
+            boundary = rng.random(shape) < rng.uniform(0.3, 0.85)
+            slab = Slab.of(comm.rank, comm.size, shape[0])
+            cells = np.argwhere(boundary)
+            assert (Slab.owner(np.arange(slab.first, slab.last), comm.size, shape[0]) == comm.rank).all()
+            own = cells[(cells[:, 0] >= slab.first) & (cells[:, 0] < slab.last)]
+            found = cells_of_gaps(enclosed_gaps(comm, own, slab))
+            expected = np.argwhere(enclosed(boundary))
+            expected = expected[(expected[:, 0] >= slab.first) & (expected[:, 0] < slab.last)]
+            assert np.array_equal(found, expected), (shape, seed, comm.rank)
+
+
+def body_of(path: str) -> Body:
+    """A body from points and triangles in an .npz file, which only rank 0 holds."""
+    data = np.load(path)
+    surface = Surface(data["points"], data["triangles"])
+    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
+    return Body(comm, surface if comm.rank == 0 else None, examine(surface), bounds)
+
+
+def fill_to_file(mesh: str, cell_size: str, method: str, path: str) -> None:
+    cages = fill(body_of(mesh), float(cell_size), method)
+    assert comm.allreduce(len(cages.kind)) == cages.table.total
+    parts = comm.gather((cages.table.first, cages.ijk, cages.kind))
+    if comm.rank == 0:
+        assert [part[0] for part in parts] == sorted(part[0] for part in parts)
+        np.savez(path, ijk=np.concatenate([p[1] for p in parts]), kind=np.concatenate([p[2] for p in parts]))
+
+
+def check_force() -> None:
+    """A force over part of the lattice of a wedge sums to its total over all ranks."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    surface = Surface(points, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    body = Body(comm, surface if comm.rank == 0 else None, examine(surface), np.array([[0.0] * 3, [1.0] * 3]))
+    lattice = build_lattice(fill(body, 0.1), 1000.0, 1e5)
+    where = lattice.nodes[: lattice.owned, 2] < 0.35
+    force = spread_by_mass(comm, (1.0, -2.0, 30.0), where, lattice.mass)
+    total = comm.allreduce(force.sum(axis=0))
+    assert np.allclose(total, [1, -2, 30], rtol=1e-13), total
+    assert not force[~where].any() and (force[where] != 0).all()
+    per_mass = comm.allgather(force[where] / lattice.mass[where, None])
+    assert np.allclose(np.concatenate(per_mass), per_mass[0][0], rtol=1e-13)
+
+
+if __name__ == "__main__":
+    action, *arguments = sys.argv[1:]
+    if action == "random":
+        check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=40)
+    elif action == "fill":
+        fill_to_file(*arguments)
+    else:
+        check_force()
+    print("passed", flush=True)

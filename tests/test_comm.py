@@ -1,0 +1,14 @@
+"""Rows travel, keys are numbered and errors are shared the same on any number of ranks."""
+
+from pathlib import Path
+
+import pytest
+
+WORKER = Path(__file__).parent / "comm_worker.py"
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4])
+def test_against_plain_arrays(on_ranks, ranks):
+    done = on_ranks(ranks, "-m", "mpi4py", WORKER, timeout=60)  # -m mpi4py: a failure on one rank ends all
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("passed") == ranks

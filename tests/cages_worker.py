@@ -1,6 +1,7 @@
-"""What test_cages.py and test_loads_contact.py check on several ranks: cages_worker.py ACTION [arguments]."""
+"""Run under mpiexec: cages_worker.py FOLDER (of meshes) by test_cages.py, or force by test_loads_contact.py."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +14,7 @@ from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import spread_by_mass
 
 comm = MPI.COMM_WORLD
+FILLED = [("closed", 0.11, "exact"), ("open", 0.11, "exact"), ("sampled", 0.11, "sample"), ("one cell", 2.5, "exact")]
 
 
 def enclosed(boundary: np.ndarray) -> np.ndarray:
@@ -37,7 +39,7 @@ def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
             assert np.array_equal(found, expected), (shape, seed, comm.rank)
 
 
-def body_of(path: str) -> Body:
+def body_of(path: Path) -> Body:
     """A body from points and triangles in an .npz file, which only rank 0 holds."""
     data = np.load(path)
     surface = Surface(data["points"], data["triangles"])
@@ -45,13 +47,15 @@ def body_of(path: str) -> Body:
     return Body(comm, surface if comm.rank == 0 else None, examine(surface), bounds)
 
 
-def fill_to_file(mesh: str, cell_size: str, method: str, path: str) -> None:
-    cages = fill(body_of(mesh), float(cell_size), method)
+def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
+    """Writes all cells in the order of the ranks beside the mesh."""
+    cages = fill(body_of(mesh), cell_size, method)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
     parts = comm.gather((cages.table.first, cages.ijk, cages.kind))
     if comm.rank == 0:
         assert [part[0] for part in parts] == sorted(part[0] for part in parts)
-        np.savez(path, ijk=np.concatenate([p[1] for p in parts]), kind=np.concatenate([p[2] for p in parts]))
+        ijk, kind = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
+        np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind)
 
 
 def check_force() -> None:
@@ -70,11 +74,10 @@ def check_force() -> None:
 
 
 if __name__ == "__main__":
-    action, *arguments = sys.argv[1:]
-    if action == "random":
-        check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=40)
-    elif action == "fill":
-        fill_to_file(*arguments)
-    else:
+    if sys.argv[1:] == ["force"]:
         check_force()
+    else:
+        check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=40)
+        for name, cell_size, method in FILLED:
+            fill_to_file(Path(sys.argv[1], name + ".npz"), cell_size, method)
     print("passed", flush=True)

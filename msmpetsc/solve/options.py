@@ -77,7 +77,9 @@ def _known_names() -> set[str]:
                 solver.destroy()
         PETSc.Mat().create(PETSc.COMM_SELF).setFromOptions()
         database.delValue("help")
-    return set(re.findall(r"(?<=\s-)[a-z]\w+(?=[ :])", text[0])) | set(database.getAll())
+    printed = set(re.findall(r"(?<=\s-)[a-z]\w+(?=[ :])", text[0]))
+    # PETSc prints a help text once, and a preset's NPC may have had it under its own prefix
+    return (printed | {name.removeprefix("npc_") for name in printed}) - set(_left())
 
 
 @contextmanager

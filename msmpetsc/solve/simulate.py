@@ -7,7 +7,7 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.energy import elastic_energy
 from msmpetsc.model.frame import Frame
@@ -39,7 +39,6 @@ class Simulation:
         )
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
-        self.stepper.set_up()
 
     def frames(self) -> Iterator[Frame]:
         """Frame 0, then one frame a step (collective). ``state`` always goes with the last frame.
@@ -108,9 +107,17 @@ class Simulation:
         )
 
     def __enter__(self) -> "Simulation":
+        try:
+            self.stepper.set_up()
+        except InputError:
+            self.destroy()
+            raise
         return self
 
     def __exit__(self, *_) -> None:
+        self.destroy()
+
+    def destroy(self) -> None:
         self.stepper.destroy()
         if self.surface:
             self.surface.destroy()

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.energy import add_elastic_gradient, elastic_change
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.operators import ScalarPreconditioner, ThreeColumns, TrueHessian, python_matrix, scaled_sum
@@ -68,37 +68,55 @@ class Stepper:
         self.load = np.zeros((lattice.owned, 3))
         self.corrections = []  # x - y of the last steps, at most two, the newest first
         self.inverse_mass = np.tile(1 / lattice.mass[self.unknowns.free], 3)
-        self._create_solver(time_step)
-        self.rounding = self._rounding_of_residual()
+        self.owned_objects = [self.unknowns]
+        self.defaults = set_defaults(preset)
+        try:
+            self._create_solver(time_step)
+            self.rounding = self._rounding_of_residual()
+        except PETSc.Error as error:
+            self.destroy()
+            raise InputError(f"PETSc refuses its options: {last_words(error)}") from None
 
     def _create_solver(self, time_step: float) -> None:
-        self.defaults = set_defaults(self.preset)
-        self.matrix = assemble(self.comm, self.unknowns, time_step)
+        self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step))
         self.hessian = TrueHessian(self.unknowns, time_step) if self.preset.true_hessian else None
-        self.operator = python_matrix(self.unknowns, self.hessian or ThreeColumns(self.matrix), self.comm)
-        self.x, self.f = self.operator.createVecs()
-        self.work = self.f.duplicate()
-        self.snes = PETSc.SNES().create(self.comm)
-        inner = self.snes.getNPC() if "npc_snes_type" in PETSc.Options().getAll() else self.snes
-        self.ksp = PETSc.KSP().create(self.comm)
-        inner.setKSP(self.ksp)
+        self.operator = self._keep(
+            python_matrix(self.unknowns, self.hessian or ThreeColumns(self.matrix), self.comm)
+        )
+        self.x, self.f = map(self._keep, self.operator.createVecs())
+        self.work = self._keep(self.f.duplicate())
+        self.ksp = self._keep(PETSc.KSP().create(self.comm))
         pc = self.ksp.getPC()
         pc.setOptionsPrefix("three_columns_")  # leaves the bare -pc_ to the scalar preconditioner
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(ScalarPreconditioner(self.matrix))
+        self.snes = self._keep(PETSc.SNES().create(self.comm))
+        self.inner = self.snes
+        if "npc_snes_type" in PETSc.Options().getAll():
+            self.inner = self._keep(self.snes.getNPC())
+        self.inner.setKSP(self.ksp)
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.operator, self.operator)
         self.snes.setObjective(self._objective)
         self.snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
             self.ksp.setInitialGuessNonzero(True)
-        self.inner = inner
         self.snes.setFromOptions()
 
+    def _keep(self, owned: PETSc.Object) -> PETSc.Object:
+        self.owned_objects.append(owned)
+        return owned
+
     def set_up(self) -> None:
-        """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it."""
-        self.ksp.setOperators(self.operator, self.operator)
-        self.ksp.setUp()
+        """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
+
+        Raises InputError for a preconditioner that this PETSc or matrix does not have.
+        """
+        try:
+            self.ksp.setOperators(self.operator, self.operator)
+            self.ksp.setUp()
+        except PETSc.Error as error:
+            raise InputError(f"PETSc cannot set up the solver: {last_words(error)}") from None
 
     def step(self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray) -> StepResult:
         """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included, and the force load (owned, 3) [N].
@@ -234,7 +252,14 @@ class Stepper:
         )
 
     def destroy(self) -> None:
-        """Collective, and in the same order on all ranks."""
-        for owner in (self.snes, self.inner, self.ksp, self.operator, self.matrix, self.x, self.f, self.work, self.unknowns):
-            owner.destroy()
+        """Collective, and in the same order on all ranks; the garbage collector's would differ."""
+        for owned in reversed(self.owned_objects):
+            owned.destroy()
         forget_defaults(self.defaults)
+
+
+def last_words(error: PETSc.Error) -> str:
+    """What a PETSc error says, without the calls it came through."""
+    lines = str(error).splitlines()
+    said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
+    return said[-1] if said else lines[0]

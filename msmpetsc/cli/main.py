@@ -4,6 +4,7 @@ import argparse
 import logging
 import sys
 import traceback
+from itertools import pairwise
 
 from mpi4py import MPI
 
@@ -46,18 +47,10 @@ def entry_point() -> None:
 def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Ours, and PETSc's: those of one dash, each with the value that follows it, as PETSc itself reads them."""
     ours, petsc = [], []
-    rest = iter(range(len(arguments)))
-    for at in rest:
-        word = arguments[at]
-        if not _is_petsc_option(word):
-            ours.append(word)
-            continue
-        petsc.append(word)
-        following = arguments[at + 1] if at + 1 < len(arguments) else "--"
-        if not following.startswith("--") and not _is_petsc_option(following) and following not in OUR_SHORT:
-            if not following.endswith(".toml"):
-                petsc.append(following)
-                next(rest)
+    for before, word in pairwise(["", *arguments]):
+        ends_it = word.startswith("--") or word in OUR_SHORT or word.endswith(".toml")
+        value = _is_petsc_option(before) and not ends_it
+        (petsc if value or _is_petsc_option(word) else ours).append(word)
     return ours, petsc
 
 
@@ -71,9 +64,9 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> None:
         raise InputError(message)
 
-    def print_help(self, file=None) -> None:
+    def _print_message(self, message: str, file=None) -> None:  # where argparse prints help and version
         if MPI.COMM_WORLD.rank == 0:
-            super().print_help(file)
+            super()._print_message(message, file)
 
     def parse_args(self, arguments: list[str]) -> argparse.Namespace:
         args, unknown = self.parse_known_args(arguments)

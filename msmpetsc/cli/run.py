@@ -1,6 +1,7 @@
 """``msmpetsc run``: simulate a scene and write its result file."""
 
 import argparse
+import atexit
 import json
 import shlex
 import sys
@@ -52,16 +53,17 @@ class ListPresets(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_) -> None:
         from msmpetsc.solve.presets import PRESETS
 
-        for name, preset in PRESETS.items():
-            print(f"{name:10} {preset.about}")
+        if MPI.COMM_WORLD.rank == 0:
+            print("\n".join(f"{name:10} {preset.about}" for name, preset in PRESETS.items()))
         parser.exit()
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
-    petsc4py.init(["msmpetsc", *args.petsc_options])
+    start_petsc(args.petsc_options)
     comm = MPI.COMM_WORLD
     from msmpetsc.model.build import build_model
+    from msmpetsc.solve.options import petsc_refusals
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
 
     scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
@@ -70,16 +72,28 @@ def run(args: argparse.Namespace) -> int:
         with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
             model = build_model(comm, scene)
             describe(comm, model)
-            with Simulation(comm, scene, model) as simulation:
+            with petsc_refusals(), Simulation(comm, scene, model) as simulation:
                 simulation.refuse_unused_options()
                 write_model(comm, file, model)
                 write_frames(comm, file, simulation)
-                simulation.refuse_unused_options(at_end=True)
     except StepFailed:
         on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
         raise
     on_root(comm, lambda: finish(path, args.picture))
+    simulation.refuse_unused_options(at_end=True)
     return 0
+
+
+def start_petsc(options: list[str]) -> None:
+    """Give PETSc its options, and have it end while Python still lives.
+
+    petsc4py ends PETSc after Python is gone. But PETSc keeps what a failed start left behind until its
+    end, and those solvers call Python when they are destroyed.
+    """
+    petsc4py.init(["msmpetsc", *options])
+    from petsc4py import PETSc
+
+    atexit.register(PETSc._finalize)
 
 
 def finish(path: Path, picture: bool) -> None:

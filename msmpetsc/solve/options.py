@@ -17,8 +17,15 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
 
-READ_AT_THE_END = re.compile(r"^(log_|options_|malloc|memory_|objects_|get_total|show_|mpi_|help|version|petsc_)")
+READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view)$")
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
+REFUSALS = {  # PETSc's error codes that an unfit option leads to
+    56,  # SUP: not supported
+    62,  # ARG_WRONG
+    63,  # ARG_OUTOFRANGE
+    86,  # ARG_UNKNOWN_TYPE
+    92,  # MISSING_FACTOR: no factorisation of this kind for this matrix
+}
 TYPES = {
     "snes": (PETSc.SNES, ["newtonls", "newtontr", "anderson", "ngmres", "qn"]),
     "ksp": (PETSc.KSP, ["cg", "pipecg", "minres", "gmres", "preonly"]),
@@ -41,11 +48,28 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False) -> None:
     ]
     message = None
     if comm.rank == 0 and unused:
-        known = _known_names()
+        known = _known_names() - set(unused)
         message = "\n".join(f"-{name}: no part of this run uses this PETSc option{did_you_mean(name, known)}" for name in unused)
     message = comm.bcast(message)
     if message:
         raise InputError(message)
+
+
+@contextmanager
+def petsc_refusals() -> Iterator[None]:
+    """Turn PETSc's errors about what the user asked of it into InputError, on every rank alike.
+
+    Which option it was, PETSc does not say: where its last words quote a value, its options are named.
+    """
+    try:
+        yield
+    except PETSc.Error as error:
+        if error.ierr not in REFUSALS:
+            raise
+        words = re.sub(r"^\[\d+\] ", "", str(error).splitlines()[-1])
+        given = PETSc.Options().getAll().items()
+        meant = [f"-{name} {value}" for name, value in given if value and value in words.split()]
+        raise InputError(": ".join([", ".join(meant) or "PETSc options", words])) from None
 
 
 def _library() -> ctypes.CDLL:
@@ -79,7 +103,7 @@ def _known_names() -> set[str]:
         database.delValue("help")
     printed = set(re.findall(r"(?<=\s-)[a-z]\w+(?=[ :])", text[0]))
     # PETSc prints a help text once, and a preset's NPC may have had it under its own prefix
-    return (printed | {name.removeprefix("npc_") for name in printed}) - set(_left())
+    return printed | {name.removeprefix("npc_") for name in printed}
 
 
 @contextmanager
@@ -87,6 +111,7 @@ def _captured_stdout() -> Iterator[list[str]]:
     """What the C library prints in the block; the text is there after it."""
     text = [""]
     sys.stdout.flush()
+    ctypes.CDLL(None).fflush(None)
     kept = os.dup(1)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 1)

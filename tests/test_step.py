@@ -90,11 +90,9 @@ def test_newton_solves_the_step_to_rounding(reference: list):
         assert np.linalg.norm(residual(lattice, x, q, before)) < 1e-10 * scale
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
-    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k r."""
-    m, k, r = 0.3, 40.0, 1.0
-    lattice = Lattice(
+def one_spring(m: float, k: float, r: float) -> Lattice:
+    """A mass on a spring along z from a pinned end."""
+    return Lattice(
         table=SortedKeys(COMM, np.arange(2)),
         cell_size=r,
         nodes=np.array([[0.0, 0, 0], [0, 0, r]]),
@@ -108,6 +106,13 @@ def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
         stiffness=np.array([k]),
         pinned=np.array([True, False]),
     )
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
+    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k r."""
+    m, k, r = 0.3, 40.0, 1.0
+    lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset(preset), error=1e-7)
     x = before = r + 0.2
     q = q_before = np.array([[0.0, 0, 0], [0, 0, x]])
@@ -228,6 +233,21 @@ def test_a_plain_iteration_is_the_papers_global_step():
     np.add.at(Jd, lattice.springs[:, 1], -lattice.stiffness[:, None] * d)
     b = T**2 * Jd + lattice.mass[:, None] * y + T**2 * weight(lattice)
     np.testing.assert_allclose(x, np.linalg.solve(A, b), atol=1e-12)
+
+
+def test_a_strut_that_buckles_under_its_load():
+    """A spring pressed to half by a load in balance with it: the only force left is across, with negative
+    curvature, and CG goes up. It must come to F = 0 all the same (which may be a saddle)."""
+    m, k, r, length = 0.3, 4000.0, 1.0, 0.5
+    lattice = one_spring(m, k, r)
+    load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
+    q = np.array([[0.0, 0, 0], [1e-3, 0, length]])
+    stepper = Stepper(COMM, lattice, T, replace(find_preset("newton"), extrapolate=False), error=1e-9)
+    x = stepper.step(q, q, load).position[1]
+    stepper.destroy()
+    stretch = np.linalg.norm(x) - r
+    F = m * (x - q[1]) + T**2 * (k * stretch * x / np.linalg.norm(x) - load[1])
+    assert np.linalg.norm(F) < 1e-8 * T**2 * k * r
 
 
 def test_a_body_pressed_to_half_still_gives_a_descent(reference: list):

@@ -128,14 +128,30 @@ class Stepper:
         self.q[:] = self.base[:] = q  # pinned nodes stay there
         self.last_error = self.residual = np.inf
         self._first_guess(q)
-        its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
-        self.snes.solve(None, self.x)
+        iterations, ksp_its = self._solve()
         if self.snes.reason < 0:
             raise StepFailed(self._failure())
         self.unknowns.to_nodes(self.x, self.q)
         self.corrections = [self.q - self.y, *self.corrections[:1]]
-        its = self.inner.getLinearSolveIterations() - its_before  # an NPC goes on counting
-        return StepResult(self.q.copy(), self.last_error, self.snes.its, its)
+        return StepResult(self.q.copy(), self.last_error, iterations, ksp_its)
+
+    def _solve(self) -> tuple[int, int]:
+        """SNES iterations and KSP iterations that took x to the solution.
+
+        Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
+        if its very first direction has negative curvature it climbs, and the line search says so: the
+        projected Hessian takes over.
+        """
+        its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
+        self.snes.solve(None, self.x)
+        # an NPC goes on counting
+        iterations, ksp_its = self.snes.its, self.inner.getLinearSolveIterations() - its_before
+        if self.hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH:
+            self.hessian.projected = True
+            self.snes.solve(None, self.x)
+            self.hessian.projected = False
+            iterations, ksp_its = iterations + self.snes.its, ksp_its + self.inner.getLinearSolveIterations()
+        return iterations, ksp_its
 
     def _first_guess(self, q: np.ndarray) -> None:
         """Put the start of least g into x.
@@ -195,10 +211,6 @@ class Stepper:
             return
         self.unknowns.to_nodes(x, self.base)
         self.hessian.q[:] = self.base
-        self.hessian.q[self.lattice.pinned] = self.q[self.lattice.pinned]
-        # a solve that met negative curvature gives way to the projected Hessian for the rest of the step
-        met = self.ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
-        self.hessian.projected = snes.its > 0 and (self.hessian.projected or met)
         self.operator.assemble()
 
     def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:

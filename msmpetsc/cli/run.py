@@ -1,7 +1,6 @@
 """``msmpetsc run``: simulate a scene and write its result file."""
 
 import argparse
-import atexit
 import json
 import shlex
 import sys
@@ -14,7 +13,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.comm import log, on_root
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.xdmf import write_xdmf
@@ -60,10 +59,9 @@ class ListPresets(argparse.Action):
 
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
-    start_petsc(args.petsc_options)
+    petsc4py.init(["msmpetsc", *args.petsc_options])
     comm = MPI.COMM_WORLD
     from msmpetsc.model.build import build_model
-    from msmpetsc.solve.options import petsc_refusals
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
 
     scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
@@ -72,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
             model = build_model(comm, scene)
             describe(comm, model)
-            with petsc_refusals(), Simulation(comm, scene, model) as simulation:
+            with Simulation(comm, scene, model) as simulation:
                 simulation.refuse_unused_options()
                 write_model(comm, file, model)
                 write_frames(comm, file, simulation)
@@ -82,18 +80,6 @@ def run(args: argparse.Namespace) -> int:
     on_root(comm, lambda: finish(path, args.picture))
     simulation.refuse_unused_options(at_end=True)
     return 0
-
-
-def start_petsc(options: list[str]) -> None:
-    """Give PETSc its options, and have it end while Python still lives.
-
-    petsc4py ends PETSc after Python is gone. But PETSc keeps what a failed start left behind until its
-    end, and those solvers call Python when they are destroyed.
-    """
-    petsc4py.init(["msmpetsc", *options])
-    from petsc4py import PETSc
-
-    atexit.register(PETSc._finalize)
 
 
 def finish(path: Path, picture: bool) -> None:
@@ -117,6 +103,8 @@ def read_scene(args: argparse.Namespace) -> Scene:
     changes += args.set
     scene = load_scene(args.scene, changes, PRESETS)
     if args.frames is not None:
+        if args.frames < 1:
+            raise InputError(f"--frames must be at least 1, not {args.frames}")
         scene = load_scene(args.scene, [*changes, f"time.duration={args.frames * scene.time.step!r}"], PRESETS)
     return scene
 

@@ -19,6 +19,10 @@ from msmpetsc.model.loads import Load, check_not_empty, inside, spread_by_mass
 from msmpetsc.scene import Scene
 
 
+SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
+FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
+
+
 @dataclass(frozen=True)
 class Model:
     """A scene made ready to step. Arrays hold this rank's share; the surface is on rank 0 only.
@@ -54,6 +58,7 @@ def read_body(comm: MPI.Comm, scene: Scene) -> Body:
 
     def read() -> tuple[Surface, tuple]:
         surface = prepare(load(scene.mesh.source, scene.folder), scene.mesh.prepare, scene.mesh.size, scene.mesh.base)
+        _check_in_range(surface)
         report = examine(surface)
         for warning in check_encloses(surface, report):
             log.warning("%s: %s", scene.mesh.source, warning)
@@ -63,6 +68,17 @@ def read_body(comm: MPI.Comm, scene: Scene) -> Body:
     surface, facts = on_root(comm, read) or (None, None)
     report, bounds = comm.bcast(facts)
     return Body(comm, surface, report, bounds)
+
+
+def _check_in_range(surface: Surface) -> None:
+    """Raise InputError for a body whose volume or shape a double cannot hold."""
+    points = surface.points[np.unique(surface.triangles)]
+    side, reach = np.ptp(points, axis=0).max(), np.abs(points).max()
+    if side > 0 and not (SIDES[0] <= side <= SIDES[1] and reach <= FARTHEST * side):
+        raise InputError(
+            f"the mesh is {side:.3g} m long and reaches {reach:.3g} m from the origin: "
+            "too large, too small or too far away to compute with"
+        )
 
 
 def fill_cages(body: Body, scene: Scene) -> Cages:

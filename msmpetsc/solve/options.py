@@ -19,13 +19,6 @@ from msmpetsc.errors import InputError, did_you_mean
 
 READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view)$")
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
-REFUSALS = {  # PETSc's error codes that an unfit option leads to
-    56,  # SUP: not supported
-    62,  # ARG_WRONG
-    63,  # ARG_OUTOFRANGE
-    86,  # ARG_UNKNOWN_TYPE
-    92,  # MISSING_FACTOR: no factorisation of this kind for this matrix
-}
 TYPES = {
     "snes": (PETSc.SNES, ["newtonls", "newtontr", "anderson", "ngmres", "qn"]),
     "ksp": (PETSc.KSP, ["cg", "pipecg", "minres", "gmres", "preonly"]),
@@ -53,23 +46,6 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False) -> None:
     message = comm.bcast(message)
     if message:
         raise InputError(message)
-
-
-@contextmanager
-def petsc_refusals() -> Iterator[None]:
-    """Turn PETSc's errors about what the user asked of it into InputError, on every rank alike.
-
-    Which option it was, PETSc does not say: where its last words quote a value, its options are named.
-    """
-    try:
-        yield
-    except PETSc.Error as error:
-        if error.ierr not in REFUSALS:
-            raise
-        words = re.sub(r"^\[\d+\] ", "", str(error).splitlines()[-1])
-        given = PETSc.Options().getAll().items()
-        meant = [f"-{name} {value}" for name, value in given if value and value in words.split()]
-        raise InputError(": ".join([", ".join(meant) or "PETSc options", words])) from None
 
 
 def _library() -> ctypes.CDLL:

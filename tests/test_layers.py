@@ -1,0 +1,78 @@
+"""Layers import downwards only, and PETSc, argparse and printing stay where they belong."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "msmpetsc"
+LAYERS = [{"errors"}, {"scene", "scene_errors", "comm"}, {"geometry"}, {"model"}, {"solve"}, {"output"}, {"study"}, {"cli"}]
+HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
+ONLY_IN = {"petsc4py": {"solve", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
+NEVER = {("output", "solve")}  # a result can be read and drawn where there is no PETSc
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Dotted names of all imports, those inside functions and of TYPE_CHECKING included."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = "." * node.level + (node.module or "")
+            yield from (f"{start}.{alias.name}" for alias in node.names)
+
+
+def violations(layer: str, source: str) -> list[str]:
+    """What a file of this layer must not do; layer: file or folder name within the package."""
+    tree, found = ast.parse(source), []
+    for name in imported(tree):
+        top, _, rest = name.partition(".")
+        other = rest.partition(".")[0]
+        if not top:
+            found.append(f"relative import {name}")
+        if layer not in ONLY_IN.get(top, {layer}):
+            found.append(f"{top} in {layer}")
+        if top == "msmpetsc" and (HEIGHT.get(other, 0) > HEIGHT[layer] or (layer, other) in NEVER):
+            found.append(f"{layer} imports {other}")
+    if layer != "cli" and any(map(prints_to_stdout, ast.walk(tree))):
+        found.append(f"print in {layer}")
+    return found
+
+
+def prints_to_stdout(node: ast.AST) -> bool:
+    """Writing to a stream that was handed in is allowed: print(..., file=stream)."""
+    is_print = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    return is_print and "file" not in [keyword.arg for keyword in node.keywords]
+
+
+def test_every_file_keeps_to_its_layer():
+    files = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
+    assert len(files) > 30
+    layers = {path: path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files}
+    assert set(layers.values()) <= set(HEIGHT), "a file or folder that design.md does not know"
+    found = {str(path.relative_to(PACKAGE)): violations(layers[path], path.read_text()) for path in files}
+    assert {path: wrong for path, wrong in found.items() if wrong} == {}
+
+
+@pytest.mark.parametrize(
+    ("layer", "source", "expected"),
+    [
+        ("geometry", "from msmpetsc.model.lattice import Lattice", "geometry imports model"),
+        ("scene", "import msmpetsc.geometry.surface", "scene imports geometry"),
+        ("errors", "from msmpetsc import comm", "errors imports comm"),
+        ("output", "def late():\n    from msmpetsc.solve.step import Stepper", "output imports solve"),
+        ("model", "from ..solve import step", "relative import ..solve.step"),
+        ("model", "from petsc4py import PETSc", "petsc4py in model"),
+        ("study", "import petsc4py", "petsc4py in study"),
+        ("solve", "import argparse", "argparse in solve"),
+        ("solve", "def f(x):\n    print(x)", "print in solve"),
+    ],
+)
+def test_a_planted_violation_is_found(layer: str, source: str, expected: str):
+    assert violations(layer, source) == [expected]
+
+
+def test_what_is_allowed_is_not_reported():
+    assert violations("cli", "import argparse\nimport petsc4py\nfrom msmpetsc.solve import step\nprint(1)") == []
+    assert violations("output", "from msmpetsc import __version__\nfrom msmpetsc.model.frame import Frame") == []

@@ -38,7 +38,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return tuple(x / length for x in scaled)
 
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
 Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
 T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples

@@ -188,6 +188,7 @@ MISTAKES = [
     ("density = 1000", "density = true", "material.density: must be a number, got true (line 14)"),
     ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
     ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),
+    ("step = 0.0166667", "step = 1e300", "time.step: must be < 1e+60, got 1e+300 (line 17)"),
     ("duration = 2.0", "duration = 0.001", "time.duration: must hold at least one step of 0.0166667 s, got 0.001"),
     ("duration = 2.0", "duration = nan", "time.duration: must be a finite number, got nan (line 18)"),
     ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration: must have 3 items, got [0, -9.81] (line 21)"),

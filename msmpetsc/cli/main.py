@@ -71,7 +71,7 @@ class _Parser(argparse.ArgumentParser):
     def parse_args(self, arguments: list[str]) -> argparse.Namespace:
         args, unknown = self.parse_known_args(arguments)
         if unknown:
-            valid = [option for parser in (self, args.parser) for option in parser._option_string_actions]
+            valid = list(args.parser._option_string_actions)
             raise InputError(f"{args.command}: unknown argument {unknown[0]}{did_you_mean(unknown[0], valid)}")
         return args
 

@@ -60,6 +60,7 @@ class ListPresets(argparse.Action):
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
     petsc4py.init(["msmpetsc", *args.petsc_options])
+    np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
     comm = MPI.COMM_WORLD
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once

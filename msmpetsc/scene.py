@@ -39,6 +39,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
+MOST_STEPS = 10**9
 Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
 T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples
@@ -153,7 +154,7 @@ class Time(Table):
     @classmethod
     def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
         step = info.data.get("step", duration)
-        if not math.isfinite(duration / step):
+        if duration / step > MOST_STEPS:
             raise rule(f"holds too many steps of {step:g} s", "step")
         if round(duration / step) < 1:
             raise rule(f"must hold at least one step of {step:g} s", "step")

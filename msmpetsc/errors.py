@@ -22,7 +22,12 @@ class StepFailed(MsmpetscError):
     exit_status = 3
 
 
+def nearest(name: str, valid: Iterable[str]) -> str | None:
+    """The valid name nearest to a wrong one; None where none is near."""
+    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
+
+
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """", did you mean 'x'?" with the valid name nearest to a wrong one; empty where none is near."""
-    near = difflib.get_close_matches(name, list(valid), n=1)
-    return f", did you mean {near[0]!r}?" if near else ""
+    """", did you mean 'x'?" with the nearest valid name; empty where none is near."""
+    near = nearest(name, valid)
+    return f", did you mean {near!r}?" if near else ""

@@ -1,6 +1,5 @@
 """Problems of a scene file in plain words: key path, what is wrong, the value, the nearest valid name, the line."""
 
-import difflib
 import json
 import re
 import tomllib
@@ -10,6 +9,8 @@ from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from msmpetsc.errors import nearest
 
 KeyPath = tuple[str | int, ...]
 
@@ -131,12 +132,12 @@ def _words(e: ErrorDetails) -> str:
 
 
 def _nearest(word: Any, valid: list[str]) -> str | None:
-    return next(iter(difflib.get_close_matches(str(word).lower()[:100], valid, n=1)), None)
+    return nearest(str(word).lower()[:100], valid)
 
 
 def _suggestion(word: Any, valid: list[str]) -> str:
-    nearest = _nearest(word, valid)
-    return f"did you mean {nearest!r}?" if nearest else f"valid: {', '.join(valid)}"
+    near = _nearest(word, valid)
+    return f"did you mean {near!r}?" if near else f"valid: {', '.join(valid)}"
 
 
 def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:

@@ -9,14 +9,13 @@ copy was reduced by another decimator: there the same shape has as many, but oth
 
 import os
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pooch
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, nearest
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.surface import Surface, read_surface
 
@@ -176,8 +175,8 @@ def _checked(name: str, path: Path, sha256: str) -> Path:
 
 
 def _nearest(name: str) -> str:
-    close = get_close_matches(name, MODELS, n=1)
-    return f" (did you mean '{close[0]}'?)" if close else ""
+    near = nearest(name, MODELS)
+    return f" (did you mean '{near}'?)" if near else ""
 
 
 def _cache(name: str) -> Path:

@@ -233,7 +233,7 @@ BAD = {  # what is wrong: arguments after the scene, and what the one line must 
     "mesh thin for its cells": (mesh("foil.ply", "cages={cell_size=1e-5}"), ["cages.max_cells"]),
     "mesh of size 0": (sets("mesh.size=0"), ["mesh.size", "> 0"]),
     "mesh of negative size": (sets("mesh.size=-1"), ["mesh.size", "> 0"]),
-    "mesh huge": (sets("mesh.size=1e300"), ["1e+300 m", "too large"]),
+    "mesh huge": (sets("mesh.size=1e300"), ["mesh.size: must be < 1e+60"]),
     "mesh tiny": (sets("mesh.size=1e-300"), ["1e-300 m", "too small"]),
     "mesh far away": (sets("mesh.base=[1e300, 0, 0]"), ["1e+300 m", "too far away"]),
     "cells too many": (sets("cages={cell_size=0.001}"), ["0.001 m", "cages.max_cells = 5000000"]),
@@ -248,7 +248,7 @@ BAD = {  # what is wrong: arguments after the scene, and what the one line must 
     "density negative": (sets("material.density=-1"), ["material.density", "> 0"]),
     "pin without a node": (sets("pin.0.region.box=[[5, 5, 5], [6, 6, 6]]"), ["pin.0.region", "no node"]),
     "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "pinned"]),
-    "disk too small": (sets("time.duration=1e13"), ["GB"]),
+    "disk too small": (sets("time.duration=9e6"), ["GB"]),
     "two scenes": (["another.toml"], ["unknown argument another.toml"]),
 }
 REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2])]

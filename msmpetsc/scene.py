@@ -19,7 +19,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene_errors import as_given, one_of_problems, problem_lines, restated, rule, unknown_name

@@ -21,6 +21,7 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport
 
 BOUNDARY, INTERIOR = 1, 2
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
+PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
 MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
@@ -85,7 +86,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
     least = max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
     _refuse_above(max_cells, least, grid)
     corners = _slab_triangles(body, grid, axes)
-    boundary = _mark(body.comm, corners, grid.shape[axes], slab, method)
+    boundary = _mark(corners, grid.shape[axes], slab, method)
     if body.report.closed:
         gaps = enclosed_gaps(body.comm, boundary, slab)
     else:
@@ -119,7 +120,7 @@ def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
-def _mark(comm: MPI.Comm, corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
+def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
     """Distinct boundary cells (b, 3) of the slab in lexicographic order.
 
     The paper's samples of a triangle may lie in another slab than its rank's, but then the
@@ -132,9 +133,6 @@ def _mark(comm: MPI.Comm, corners: np.ndarray, shape: np.ndarray, slab: Slab, me
         keys.append(np.unique(cells @ PACK))
     packed = np.unique(np.concatenate(keys))
     return np.stack([packed // PACK[0], packed // PACK[1] % morton.LIMIT, packed % morton.LIMIT], axis=1)
-
-
-PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
 
 
 def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:

@@ -98,7 +98,7 @@ def test_a_strained_block_stores_the_energy_of_an_isotropic_solid(name: str, rot
     lattice = build_lattice(cages_of(block(4, 3, 2)), DENSITY, young_modulus=E)
     size = 1e-7
     q = lattice.nodes @ (np.eye(3) + size * rotation @ strain @ rotation.T)
-    energy = elastic_energy(q, lattice.springs, lattice.rest_length, lattice.stiffness)
+    energy = elastic_energy(q, *lattice.elastic)
     assert energy == pytest.approx(0.5 * twice_density * E * size**2 * 24 * H**3, rel=1e-5)
 
 

@@ -257,14 +257,13 @@ def test_a_body_pressed_to_half_still_gives_a_descent():
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-6)
     x = stepper.step(pressed, pressed, weight(lattice)).position
     stepper.destroy()
-    springs = lattice.springs, lattice.rest_length, lattice.stiffness
     g = np.zeros_like(x)
-    add_elastic_gradient(x, *springs, g)
+    add_elastic_gradient(x, *lattice.elastic, g)
     F = lattice.mass[:, None] * (x - pressed) + T**2 * (g - weight(lattice))
     assert np.sqrt((F**2).sum(axis=1) @ (1 / lattice.mass)) <= 1e-6 * np.sqrt(
         ((x - pressed) ** 2).sum(axis=1) @ lattice.mass
     )
-    assert elastic_energy(x, *springs) < elastic_energy(pressed, *springs)
+    assert elastic_energy(x, *lattice.elastic) < elastic_energy(pressed, *lattice.elastic)
 
 
 def test_unknown_preset_names_the_nearest():

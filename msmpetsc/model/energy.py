@@ -1,5 +1,8 @@
 """Elastic energy of springs, its gradient and its Hessian (paper Eq. 13-15), as compiled loops over springs.
 
+A spring of length l = r (1 + s) pulls with k r (s + b s^3), b its ``stiffening``: Hooke's law where b = 0, and
+the same stiffness k at small strain whatever b. Its energy is k r^2 (s^2 / 2 + b s^4 / 4).
+
 All positions are local, (l, 3): owned nodes then ghosts. A gradient is right at the owned nodes,
 for a rank has every spring of them; the ghosts' rows are not complete and not to be used.
 """
@@ -12,20 +15,28 @@ TINY = 1e-300
 
 
 @numba.njit(cache=True)
-def elastic_energy(q: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray) -> float:
-    """Sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), [J]."""
+def elastic_energy(
+    q: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray, stiffening: float
+) -> float:
+    """Sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
     energy = 0.0
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         stretch = np.sqrt(x * x + y * y + z * z) - rest_length[s]
-        energy += 0.5 * stiffness[s] * stretch * stretch
+        strain = stretch / rest_length[s]
+        energy += 0.5 * stiffness[s] * stretch * stretch * (1.0 + 0.5 * stiffening * strain * strain)
     return energy
 
 
 @numba.njit(cache=True)
 def elastic_change(
-    q: np.ndarray, base: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray
+    q: np.ndarray,
+    base: np.ndarray,
+    springs: np.ndarray,
+    rest_length: np.ndarray,
+    stiffness: np.ndarray,
+    stiffening: float,
 ) -> float:
     """E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
     change = 0.0
@@ -33,22 +44,35 @@ def elastic_change(
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         u, v, w = base[a, 0] - base[b, 0], base[a, 1] - base[b, 1], base[a, 2] - base[b, 2]
-        total = np.sqrt(x * x + y * y + z * z) + np.sqrt(u * u + v * v + w * w)
+        length, before = np.sqrt(x * x + y * y + z * z), np.sqrt(u * u + v * v + w * w)
+        total = length + before
         longer = ((x - u) * (x + u) + (y - v) * (y + v) + (z - w) * (z + w)) / max(total, TINY)
-        change += 0.5 * stiffness[s] * longer * (total - 2.0 * rest_length[s])
+        part = 0.5 * stiffness[s] * longer * (total - 2.0 * rest_length[s])
+        if stiffening > 0.0:  # s^4 / 4 changes by (s^2 + s_0^2) / 2 for each unit that s^2 / 2 does
+            strain, strain_before = length / rest_length[s] - 1.0, before / rest_length[s] - 1.0
+            part *= 1.0 + 0.5 * stiffening * (strain * strain + strain_before * strain_before)
+        change += part
     return change
 
 
 @numba.njit(cache=True)
 def add_elastic_gradient(
-    q: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray, gradient: np.ndarray
+    q: np.ndarray,
+    springs: np.ndarray,
+    rest_length: np.ndarray,
+    stiffness: np.ndarray,
+    stiffening: float,
+    gradient: np.ndarray,
 ) -> None:
-    """Add grad E = L x - J d(x) (Eq. 14-15) [N] to ``gradient`` (l, 3)."""
+    """Add grad E [N] to ``gradient`` (l, 3); without stiffening it is L x - J d(x) (Eq. 14-15)."""
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         length = np.sqrt(x * x + y * y + z * z)
         f = stiffness[s] * (1.0 - rest_length[s] / max(length, TINY))
+        if stiffening > 0.0:
+            strain = length / rest_length[s] - 1.0
+            f *= 1.0 + stiffening * strain * strain
         gradient[a, 0] += f * x
         gradient[a, 1] += f * y
         gradient[a, 2] += f * z
@@ -63,14 +87,15 @@ def add_elastic_hessian(
     springs: np.ndarray,
     rest_length: np.ndarray,
     stiffness: np.ndarray,
+    stiffening: float,
     projected: bool,
     v: np.ndarray,
     product: np.ndarray,
 ) -> None:
     """Add (Hessian of E at q) v [N] to ``product`` (l, 3).
 
-    A spring's block is k (d d^T + (1 - r/l) (I - d d^T)), d its direction and l its length;
-    ``projected`` leaves out the negative part that a compressed spring has across its direction,
+    A spring's block is k ((1 + 3 b s^2) d d^T + (1 - r/l) (1 + b s^2) (I - d d^T)), d its direction and l its
+    length; ``projected`` leaves out the negative part that a compressed spring has across its direction,
     so that the whole is positive semidefinite.
     """
     for s in range(len(springs)):
@@ -78,10 +103,15 @@ def add_elastic_hessian(
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         u, v_, w = v[a, 0] - v[b, 0], v[a, 1] - v[b, 1], v[a, 2] - v[b, 2]
         squared = max(x * x + y * y + z * z, TINY)
-        across = 1.0 - rest_length[s] / np.sqrt(squared)
+        length, tangent = np.sqrt(squared), 1.0
+        across = 1.0 - rest_length[s] / length
+        if stiffening > 0.0:
+            strain = length / rest_length[s] - 1.0
+            tangent += 3.0 * stiffening * strain * strain
+            across *= 1.0 + stiffening * strain * strain
         if projected:
             across = max(across, 0.0)
-        along = (1.0 - across) * (x * u + y * v_ + z * w) / squared
+        along = (tangent - across) * (x * u + y * v_ + z * w) / squared
         fx = stiffness[s] * (across * u + along * x)
         fy = stiffness[s] * (across * v_ + along * y)
         fz = stiffness[s] * (across * w + along * z)

@@ -35,6 +35,7 @@ class Lattice:
     rest_length : (s,) [m]
     stiffness   : (s,) [N/m]
     pinned      : (l,) bool, nodes that do not move
+    stiffening  : of the springs' law (model.energy) [-]; 0 for Hooke's
     """
 
     table: SortedKeys
@@ -49,6 +50,7 @@ class Lattice:
     rest_length: np.ndarray
     stiffness: np.ndarray
     pinned: np.ndarray
+    stiffening: float = 0.0
 
     @property
     def owned(self) -> int:
@@ -59,19 +61,34 @@ class Lattice:
         """(l,) global number of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
 
+    @property
+    def elastic(self) -> tuple:
+        """What the kernels of model.energy take: ends, rest lengths, stiffness of all springs here, and their law."""
+        return self.springs, self.rest_length, self.stiffness, self.stiffening
+
+    @property
+    def elastic_owned(self) -> tuple:
+        """The same of the springs that this rank owns: their sum over the ranks has each spring once."""
+        return *(array[: self.springs_owned] for array in self.elastic[:3]), self.stiffening
+
     def pin(self, where: np.ndarray) -> "Lattice":
         """This lattice with the nodes ``where`` (l,) bool held fast."""
         return replace(self, pinned=self.pinned | where)
 
 
 def build_lattice(
-    cages: Cages, density: float, young_modulus: float | None = None, stiffness: float | None = None
+    cages: Cages,
+    density: float,
+    young_modulus: float | None = None,
+    stiffness: float | None = None,
+    stiffening: float = 0.0,
 ) -> Lattice:
     """Masses and springs of the valid cells (collective).
 
     density       : [kg/m^3]; each cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
+    stiffening    : of the springs' law (model.energy) [-]
     """
     h = cages.grid.cell_size
     corner_keys = morton.encode(cages.ijk[:, None, :] + CORNERS)
@@ -98,6 +115,7 @@ def build_lattice(
         rest_length=h * np.sqrt(kind),
         stiffness=k,
         pinned=np.zeros(len(ijk), bool),
+        stiffening=stiffening,
     )
 
 

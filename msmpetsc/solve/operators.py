@@ -52,7 +52,7 @@ class TrueHessian:
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.unknowns, self.t2 = unknowns, time_step**2
         lattice = unknowns.lattice
-        self.springs = (lattice.springs, lattice.rest_length, lattice.stiffness)
+        self.elastic = lattice.elastic
         self.q = np.empty_like(lattice.nodes)
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
@@ -61,7 +61,7 @@ class TrueHessian:
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
-        add_elastic_hessian(self.q, *self.springs, self.projected, self.v, self.product)
+        add_elastic_hessian(self.q, *self.elastic, self.projected, self.v, self.product)
         lattice, free = self.unknowns.lattice, self.unknowns.free
         scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
 

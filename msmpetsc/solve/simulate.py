@@ -80,12 +80,11 @@ class Simulation:
         owned = slice(lattice.owned)
         position = result.position[owned]
         velocity = (position - before[owned]) / self.time_step
-        springs = (a[: lattice.springs_owned] for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
         sums = self.comm.allreduce(
             np.array(
                 [
                     0.5 * lattice.mass @ (velocity**2).sum(axis=1),
-                    elastic_energy(result.position, *springs),
+                    elastic_energy(result.position, *lattice.elastic_owned),
                     -(self._load(time) * position).sum(),
                     *(lattice.mass @ velocity),
                 ]

@@ -61,8 +61,6 @@ class Stepper:
         self.budget = max_iterations or published
         self.error = error if error is not None or self.budget else DEFAULT_ERROR
         self.unknowns = Unknowns(comm, lattice)
-        self.springs = (lattice.springs, lattice.rest_length, lattice.stiffness)
-        self.owned_springs = tuple(array[: lattice.springs_owned] for array in self.springs)
         self.q, self.y, self.base = (np.empty_like(lattice.nodes) for _ in range(3))
         self.gradient = np.empty_like(lattice.nodes)
         self.load = np.zeros((lattice.owned, 3))
@@ -177,7 +175,7 @@ class Stepper:
         """F(x) = M (x - y) + t^2 (grad E(x) - f_ext)."""
         self.unknowns.to_nodes(x, self.q)
         self.gradient[:] = 0
-        add_elastic_gradient(self.q, *self.springs, self.gradient)
+        add_elastic_gradient(self.q, *self.lattice.elastic, self.gradient)
         owned = self.lattice.owned
         self.gradient[:owned] -= self.load
         scaled_sum(
@@ -199,7 +197,7 @@ class Stepper:
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - self.base[owned]
         inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
-        elastic = elastic_change(self.q, self.base, *self.owned_springs) - (moved * self.load).sum()
+        elastic = elastic_change(self.q, self.base, *self.lattice.elastic_owned) - (moved * self.load).sum()
         change, distance = self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()]))
         return -1.0 if self.last_error < FULL_STEP_ERROR and distance > 0 else change
 

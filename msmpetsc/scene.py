@@ -3,6 +3,7 @@
 import math
 import tomllib
 from collections.abc import Callable, Collection, Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
@@ -40,12 +41,41 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
 MOST_STEPS = 10**9
+DEFAULT_STIFFENING = 10.0
+NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
 Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
 T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
+
+
+def _has_a_volume(box: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    if not all(low < high for low, high in zip(*box, strict=True)):
+        raise rule("must have each coordinate of the first corner below that of the second")
+    return box
+
+
+def _painted(value: Any) -> str | tuple[int, ...]:
+    """A file's name, or numbers of points."""
+    if isinstance(value, str) and value:
+        return value
+    numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
+    if not numbers or not value:
+        raise rule("must be a list of point numbers, from 0, or the name of a file that has them")
+    return tuple(value)
+
+
+def _after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
+    start = info.data.get("start")
+    if stop is not None and start is not None and stop <= start:
+        raise rule(f"must be > start = {start:g}", "start")
+    return stop
+
+
+Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
+Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 
 
 class Table(BaseModel):
@@ -142,6 +172,22 @@ class Material(Table):
     young_modulus: Positive | None = Field(None, description="Young's modulus; Poisson's ratio is 1/4 [Pa]")
     stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
     density: Positive = Field(description="mass density [kg/m^3]")
+    law: Literal["linear", "stiffening"] = Field("linear", description="how a spring pulls at large strain")
+    stiffening: Positive | None = Field(
+        None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
+    )
+
+    @property
+    def law_stiffening(self) -> float:
+        """b of the springs' law, 0 for Hooke's."""
+        return 0.0 if self.law == "linear" else self.stiffening or DEFAULT_STIFFENING
+
+    @field_validator("stiffening")
+    @classmethod
+    def _has_a_use(cls, stiffening: float, info: ValidationInfo) -> float:
+        if info.data.get("law", "stiffening") != "stiffening":
+            raise rule('is for law = "stiffening" only', "law")
+        return stiffening
 
 
 class Time(Table):
@@ -172,14 +218,56 @@ class Gravity(Table):
     acceleration: Vector = Field(description="[m/s^2]")
 
 
-class Obstacle(Table):
-    """What nodes bounce off."""
+class Keyframe(Table):
+    """A place on a path."""
 
-    shape: Literal["plane"] = Field(description="kind of obstacle")
-    point: Vector = Field(description="a point of the plane [m]")
-    normal: UnitVector = Field(description="towards the free side, normalised on reading [-]")
-    response: Literal["reflect"] = Field("reflect", description="what happens on touching")
-    restitution: float = Field(1.0, ge=0, le=1, description="normal speed after over before the impact [-]")
+    time: Positive = Field(description="when it is reached [s]")
+    by: Vector = Field(description="displacement from the start [m]")
+
+
+def _ascending(path: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
+    if any(one.time >= other.time for one, other in pairwise(path)):
+        raise rule("must have ascending times")
+    return path
+
+
+Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
+PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
+
+
+class Obstacle(Table):
+    """What nodes bounce off or are pressed by: a plane, or a box; it may move, and act for a while only."""
+
+    shape: Literal["plane", "box"] = Field(description="kind of obstacle")
+    point: Vector | None = Field(None, description="a point of the plane [m]")
+    normal: UnitVector | None = Field(None, description="of the plane, towards its free side, normalised on reading [-]")
+    box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
+    path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
+    start: NotNegative = Field(0.0, description="is there from this time [s]")
+    stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
+    response: Literal["reflect", "penalty"] = Field("reflect", description="what happens on touching")
+    restitution: float | None = Field(
+        None, ge=0, le=1, description='of "reflect": normal speed after over before the impact; 1 if absent [-]'
+    )
+    stiffness: Positive | None = Field(
+        None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
+    )
+    friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
+
+    _after_start = field_validator("stop")(_after_start)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Obstacle":
+        needed = ("box",) if self.shape == "box" else ("point", "normal")
+        missing = [name for name in needed if getattr(self, name) is None]
+        if missing:
+            raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
+        uses = {"point": "plane", "normal": "plane", "box": "box"}
+        uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
+        for name, use in uses.items():
+            if getattr(self, name) is not None and use not in (self.shape, self.response):
+                raise rule(f"has {name}, which is for {use!r} only")
+        return self
 
 
 class Sphere(Table):
@@ -199,20 +287,25 @@ class HalfSpace(Table):
 class Region(Table):
     """A part of space at rest; the nodes in it are meant."""
 
-    one_of = ("box", "sphere", "half_space")
-    box: Annotated[tuple[Vector, Vector], Strict(False)] | None = Field(
+    one_of = ("box", "sphere", "half_space", "painted")
+    box: Box | None = Field(
         None, description="two corners, each coordinate of the first the lower [m], or [-] if relative"
     )
     sphere: Sphere | None = Field(None, description="a ball [m], or [-] if relative")
     half_space: HalfSpace | None = Field(None, description="one side of a plane [m], or [-] if relative")
+    painted: Painted | None = Field(
+        None,
+        description="numbers, from 0, of points of the prepared surface (/surface/points of the result), or a "
+        "text file beside this file that lists them: the corners of the cells they lie in are meant [-]",
+    )
     relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
 
-    @field_validator("box")
+    @field_validator("relative")
     @classmethod
-    def _has_a_volume(cls, box: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
-        if not all(low < high for low, high in zip(*box, strict=True)):
-            raise rule("must have each coordinate of the first corner below that of the second")
-        return box
+    def _has_a_use(cls, relative: bool, info: ValidationInfo) -> bool:
+        if relative and info.data.get("painted") is not None:
+            raise rule("has no meaning for painted points", "painted")
+        return relative
 
 
 class Pin(Table):
@@ -229,13 +322,15 @@ class Force(Table):
     start: float = Field(0.0, description="acts from this time [s]")
     stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
 
-    @field_validator("stop")
-    @classmethod
-    def _after_start(cls, stop: float, info: ValidationInfo) -> float:
-        start = info.data.get("start")
-        if start is not None and stop <= start:
-            raise rule(f"must be > start = {start:g}", "start")
-        return stop
+    _after_start = field_validator("stop")(_after_start)
+
+
+class Anchor(Table):
+    """Nodes that are led along a path, each keeping its place among them."""
+
+    region: Region = Field(description="the nodes led")
+    path: Path3 = Field(min_length=1, description=f"how they move: {PATH} [s, m]")
+    stop: Positive | None = Field(None, description="let go at this time [s]; never if absent")
 
 
 class Solver(Table):
@@ -260,6 +355,15 @@ class Output(Table):
     surface: bool = Field(True, description="store the surface of every frame")
 
 
+class Picture(Table):
+    """How the result is drawn."""
+
+    eye: Direction = Field((1.0, -2.0, 0.6), description="direction from the body to the eye, of any length [-]")
+    times: ListOf[NotNegative] = Field(
+        (), description="moments drawn beside the start [s]; chosen by their energies if absent"
+    )
+
+
 class SceneFile(Table):
     """What may stand in a scene file; ``SceneFile.model_json_schema()`` is its schema."""
 
@@ -271,9 +375,11 @@ class SceneFile(Table):
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
     obstacle: ListOf[Obstacle] = Field((), description="what nodes bounce off")
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
+    anchor: ListOf[Anchor] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
     solver: Solver = Field(Solver(), description="how a step is solved")
     output: Output = Field(Output(), description="what is stored")
+    picture: Picture | None = Field(None, description="how the result is drawn; by its shape if absent")
 
 
 class Scene(SceneFile):

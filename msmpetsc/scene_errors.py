@@ -27,6 +27,7 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "tuple_type": "must be a list, got {got}",
     "model_type": "must be a table, got {got}",
     "too_few": "must have {length} items, got {got}",
+    "too_short": "must have at least {min_length} item, got {got}",
     "too_long": "must have {max_length} items, got {got}",
     "greater_than": "must be > {gt}, got {got}",
     "greater_than_equal": "must be >= {ge}, got {got}",

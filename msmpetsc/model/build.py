@@ -13,13 +13,19 @@ from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
-from msmpetsc.model.contact import Plane
+from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.model.loads import Load, check_not_empty, inside, spread_by_mass
+from msmpetsc.model.loads import Load, spread_by_mass
+from msmpetsc.model.motion import Path
+from msmpetsc.model.obstacle import Obstacle
+from msmpetsc.model.penalty import Penalty
+from msmpetsc.model.reflection import Reflection
+from msmpetsc.model.region import Finder
 from msmpetsc.scene import Scene
 
-
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
+PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
+STICK = 1e-3  # longest sides a second: a slip this slow is none to friction (Li et al. 2020 use the same)
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
 
 
@@ -35,7 +41,9 @@ class Model:
     lattice: Lattice
     embedding: Embedding | None
     loads: list[Load]
-    planes: list[Plane]
+    anchors: list[Anchor]
+    reflections: list[Reflection]
+    penalties: list[Penalty]
 
 
 def build_model(comm: MPI.Comm, scene: Scene) -> Model:
@@ -43,14 +51,26 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
     body = read_body(comm, scene)
     cages = fill_cages(body, scene)
     material = scene.material
-    lattice = build_lattice(cages, material.density, material.young_modulus, material.stiffness)
-    lattice = _pin(comm, scene, lattice, body.bounds)
+    lattice = build_lattice(
+        cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening
+    )
+    finder = Finder(body, cages, scene.folder)
+    lattice = _pin(comm, scene, lattice, finder)
+    anchors = _anchors(scene, lattice, finder)
+    _check_that_something_moves(comm, lattice, anchors)
     embedding = None
     if scene.output.surface:
         points = np.empty((0, 3)) if body.surface is None else body.surface.points
         embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
-    planes = [Plane(np.array(o.point), np.array(o.normal), o.restitution) for o in scene.obstacle]
-    return Model(body.surface, lattice, embedding, _loads(comm, scene, lattice, body.bounds), planes)
+    return Model(
+        body.surface,
+        lattice,
+        embedding,
+        _loads(comm, scene, lattice, finder),
+        anchors,
+        _reflections(scene),
+        _penalties(comm, scene, lattice, body),
+    )
 
 
 def read_body(comm: MPI.Comm, scene: Scene) -> Body:
@@ -88,23 +108,56 @@ def fill_cages(body: Body, scene: Scene) -> Cages:
     return fill(body, cell_size, cages.method, cages.max_cells)
 
 
-def _pin(comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray) -> Lattice:
+def _pin(comm: MPI.Comm, scene: Scene, lattice: Lattice, finder: Finder) -> Lattice:
     for number, pin in enumerate(scene.pin):
-        where = inside(pin.region, lattice.nodes, bounds)
-        check_not_empty(comm, f"pin.{number}", where[: lattice.owned])
-        lattice = lattice.pin(where)
-    if comm.allreduce(int((~lattice.pinned[: lattice.owned]).sum())) == 0:
-        raise InputError("pin: every node of the lattice is pinned, nothing is left to move")
+        lattice = lattice.pin(finder.find(f"pin.{number}", pin.region, lattice))
     return lattice
 
 
-def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray) -> list[Load]:
+def _anchors(scene: Scene, lattice: Lattice, finder: Finder) -> list[Anchor]:
+    """A pin is stronger than an anchor, and of two anchors on a node the first."""
+    anchors, taken = [], lattice.pinned
+    for number, anchor in enumerate(scene.anchor):
+        where = finder.find(f"anchor.{number}", anchor.region, lattice) & ~taken
+        stop = np.inf if anchor.stop is None else anchor.stop
+        anchors.append(Anchor(where, Path.through(anchor.path), stop))
+        taken = taken | where
+    return anchors
+
+
+def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, anchors: list[Anchor]) -> None:
+    held = lattice.pinned
+    for anchor in anchors:
+        held = held | anchor.where
+    if comm.allreduce(int((~held[: lattice.owned]).sum())) == 0:
+        what = "pin or anchor" if anchors else "pin"
+        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
+
+
+def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, finder: Finder) -> list[Load]:
     loads = []
     if scene.gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, np.inf))
     for number, force in enumerate(scene.force):
-        where = inside(force.region, lattice.nodes[: lattice.owned], bounds)
-        check_not_empty(comm, f"force.{number}", where)
+        where = finder.find(f"force.{number}", force.region, lattice)[: lattice.owned]
         stop = np.inf if force.stop is None else force.stop
         loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, stop))
     return loads
+
+
+def _reflections(scene: Scene) -> list[Reflection]:
+    return [
+        Reflection(Obstacle.of(o), 1.0 if o.restitution is None else o.restitution)
+        for o in scene.obstacle
+        if o.response == "reflect"
+    ]
+
+
+def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body) -> list[Penalty]:
+    stiffest = comm.allreduce(lattice.stiffness.max(initial=0), MPI.MAX)
+    stick = STICK * (body.bounds[1] - body.bounds[0]).max()
+    return [
+        Penalty(Obstacle.of(o), o.stiffness or PENALTY * stiffest, o.friction or 0.0, stick)
+        for o in scene.obstacle
+        if o.response == "penalty"
+    ]

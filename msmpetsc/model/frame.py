@@ -27,5 +27,6 @@ class Frame:
     kinetic: float  # [J]
     elastic: float  # [J]
     potential: float  # [J]
+    contact: float  # [J] in the penalty springs of obstacles
     momentum: np.ndarray
     wall_time: float  # [s] that the step took

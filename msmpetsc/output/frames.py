@@ -43,6 +43,7 @@ SERIES = {
     "kinetic": ("f8", (), "J"),
     "elastic": ("f8", (), "J"),
     "potential": ("f8", (), "J"),
+    "contact": ("f8", (), "J"),
     "momentum": ("f8", (3,), "kg m/s"),
     "wall_time": ("f8", (), "s"),
 }

@@ -9,6 +9,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.model.energy import add_elastic_hessian
+from msmpetsc.model.penalty import Contact
 from msmpetsc.solve.unknowns import Unknowns
 
 
@@ -24,11 +25,33 @@ class Block:
         self.destroy = self.mat.destroy
 
 
-class ThreeColumns:
-    """A (x) I_3 without forming it."""
+class ContactBlocks:
+    """t^2 (Hessian of contact): a 3 x 3 block for each node in contact, added to either operator below."""
 
-    def __init__(self, matrix: PETSc.Mat):
-        self.matrix = matrix
+    def __init__(self, unknowns: Unknowns, time_step: float):
+        self.t2 = time_step**2
+        self.row = np.full(unknowns.lattice.owned, -1)
+        self.row[unknowns.free] = np.arange(unknowns.size)
+        self.rows, self.blocks = np.empty(0, np.int64), np.empty((0, 3, 3))
+
+    def linearise(self, contact: Contact | None, q: np.ndarray) -> None:
+        """Take the blocks at positions q."""
+        nodes, blocks = contact.hessian(q) if contact else (np.empty(0, np.int64), np.empty((0, 3, 3)))
+        free = self.row[nodes] >= 0
+        self.rows, self.blocks = self.row[nodes[free]], self.t2 * blocks[free]
+
+    def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y += blocks x."""
+        if len(self.rows):
+            x, y = x.array_r.reshape(3, -1), y.array.reshape(3, -1)
+            y[:, self.rows] += np.einsum("aij,ja->ia", self.blocks, x[:, self.rows])
+
+
+class ThreeColumns:
+    """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
+
+    def __init__(self, matrix: PETSc.Mat, contact: ContactBlocks | None = None):
+        self.matrix, self.contact = matrix, contact
         self.input = Block(matrix)
         self.product = matrix.matMult(self.input.mat)
         self.values = self.product.getDenseArray().T.reshape(-1)
@@ -37,6 +60,8 @@ class ThreeColumns:
         self.input.values[:] = x.array_r
         self.matrix.matMult(self.input.mat, result=self.product)
         y.array[:] = self.values
+        if self.contact:
+            self.contact.add(x, y)
 
     def destroy(self, _: PETSc.Mat) -> None:
         self.input.destroy()
@@ -49,8 +74,8 @@ class TrueHessian:
     ``projected`` leaves out the negative curvature of compressed springs (model.energy).
     """
 
-    def __init__(self, unknowns: Unknowns, time_step: float):
-        self.unknowns, self.t2 = unknowns, time_step**2
+    def __init__(self, unknowns: Unknowns, time_step: float, contact: ContactBlocks | None = None):
+        self.unknowns, self.t2, self.contact = unknowns, time_step**2, contact
         lattice = unknowns.lattice
         self.elastic = lattice.elastic
         self.q = np.empty_like(lattice.nodes)
@@ -64,6 +89,8 @@ class TrueHessian:
         add_elastic_hessian(self.q, *self.elastic, self.projected, self.v, self.product)
         lattice, free = self.unknowns.lattice, self.unknowns.free
         scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
+        if self.contact:
+            self.contact.add(x, y)
 
 
 @numba.njit(cache=True)

@@ -8,9 +8,11 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
 from msmpetsc.model.energy import elastic_energy
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.penalty import Contact
 from msmpetsc.scene import Scene
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
@@ -32,11 +34,9 @@ class Simulation:
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model):
         self.comm, self.model, self.time_step = comm, model, scene.time.step
-        self.steps = scene.time.steps
-        solver = scene.solver
-        self.stepper = Stepper(
-            comm, model.lattice, scene.time.step, find_preset(solver.preset), solver.error, solver.max_iterations
-        )
+        self.steps, self.solver = scene.time.steps, scene.solver
+        self.held = self._held_at(self.time_step)
+        self.stepper = self._new_stepper()
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
 
@@ -49,14 +49,58 @@ class Simulation:
         yield self._frame(0, start, self.state.q, 0.0)
         for index in range(1, self.steps + 1):
             begin = perf_counter()
-            before = self.state.q
-            load = self._load(index * self.time_step)
+            before, time = self.state.q, index * self.time_step
+            self._let_go(time)
+            contact = self._contact(time)
             try:
-                result = self.stepper.step(before, self.state.q_previous, load)
+                result = self.stepper.step(before, self.state.q_previous, self._load(time), contact, self._led(time))
             except StepFailed as failure:
-                raise StepFailed(f"frame {index} (t = {index * self.time_step:.6g} s) {failure}") from None
-            self.state = self._after_contact(State(result.position, before))
-            yield self._frame(index, result, before, perf_counter() - begin)
+                raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}") from None
+            self.state = self._after_reflection(State(result.position, before), time)
+            yield self._frame(index, result, before, perf_counter() - begin, contact)
+
+    def _new_stepper(self) -> Stepper:
+        """The solver while the same nodes are held: these are no unknowns."""
+        lattice, solver = self.model.lattice, self.solver
+        for anchor in self.held:
+            lattice = lattice.pin(anchor.where)
+        return Stepper(
+            self.comm,
+            lattice,
+            self.time_step,
+            find_preset(solver.preset),
+            solver.error,
+            solver.max_iterations,
+            touches=bool(self.model.penalties),
+        )
+
+    def _held_at(self, time: float) -> list[Anchor]:
+        return [anchor for anchor in self.model.anchors if anchor.holds_at(time)]
+
+    def _let_go(self, time: float) -> None:
+        """Another solver where an anchor's time has come (collective)."""
+        held = self._held_at(time)
+        if len(held) < len(self.held):
+            self.held = held
+            self.stepper.destroy()
+            self.stepper = self._new_stepper()
+            self.stepper.set_up()
+
+    def _led(self, time: float) -> np.ndarray | None:
+        """q_n with the anchored nodes where they will be at ``time``, (l, 3) [m]."""
+        if not self.held:
+            return None
+        q = self.state.q.copy()
+        for anchor in self.held:
+            q[anchor.where] = self.model.lattice.nodes[anchor.where] + anchor.path.at(time)
+        return q
+
+    def _contact(self, time: float) -> Contact | None:
+        """What presses in the step that ends at ``time``."""
+        owned = self.model.lattice.owned
+        q = self.state.q[:owned]
+        presses = [p.during(q, time, self.time_step) for p in self.model.penalties if p.obstacle.acts_at(time)]
+        return Contact(presses, owned) if presses else None
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -70,12 +114,14 @@ class Simulation:
                 total += load.force
         return total
 
-    def _after_contact(self, state: State) -> State:
-        for plane in self.model.planes:
-            state = State(*plane.reflect(state.q, state.q_previous))
+    def _after_reflection(self, state: State, time: float) -> State:
+        for reflection in self.model.reflections:
+            state = State(*reflection.reflect(state.q, state.q_previous, time, self.time_step))
         return state
 
-    def _frame(self, index: int, result: StepResult, before: np.ndarray, wall_time: float) -> Frame:
+    def _frame(
+        self, index: int, result: StepResult, before: np.ndarray, wall_time: float, contact: Contact | None = None
+    ) -> Frame:
         lattice, time = self.model.lattice, index * self.time_step
         owned = slice(lattice.owned)
         position = result.position[owned]
@@ -86,6 +132,7 @@ class Simulation:
                     0.5 * lattice.mass @ (velocity**2).sum(axis=1),
                     elastic_energy(result.position, *lattice.elastic_owned),
                     -(self._load(time) * position).sum(),
+                    contact.energy(position) if contact else 0.0,
                     *(lattice.mass @ velocity),
                 ]
             )
@@ -101,7 +148,8 @@ class Simulation:
             kinetic=sums[0],
             elastic=sums[1],
             potential=sums[2],
-            momentum=sums[3:],
+            contact=sums[3],
+            momentum=sums[4:],
             wall_time=wall_time,
         )
 

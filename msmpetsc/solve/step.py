@@ -13,7 +13,15 @@ from petsc4py import PETSc
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.energy import add_elastic_gradient, elastic_change
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.operators import ScalarPreconditioner, ThreeColumns, TrueHessian, python_matrix, scaled_sum
+from msmpetsc.model.penalty import Contact
+from msmpetsc.solve.operators import (
+    ContactBlocks,
+    ScalarPreconditioner,
+    ThreeColumns,
+    TrueHessian,
+    python_matrix,
+    scaled_sum,
+)
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
@@ -40,6 +48,7 @@ class Stepper:
 
     error          : relative error at which a step is done; None for the preset's own rule
     max_iterations : a budget instead of a promise: the step is taken as it is then
+    touches        : whether steps may be given a ``contact``
 
     The error of x is measured as |F(x)|_(M^-1) / |x - y|_M. It bounds the relative position error
     |x - x*|_M / |x - y|_M wherever E is convex between x and x*, for there the Hessian of g is at
@@ -54,6 +63,7 @@ class Stepper:
         preset: Preset,
         error: float | None = None,
         max_iterations: int | None = None,
+        touches: bool = False,
     ):
         self.comm, self.lattice, self.preset = comm, lattice, preset
         self.t2 = time_step**2
@@ -69,25 +79,33 @@ class Stepper:
         self.owned_objects = [self.unknowns]
         self.defaults = set_defaults(preset)
         try:
-            self._create_solver(time_step)
+            self._create_solver(time_step, touches)
             self.rounding = self._rounding_of_residual()
         except PETSc.Error as error:
             self.destroy()
             raise InputError(f"PETSc refuses its options: {last_words(error)}") from None
 
-    def _create_solver(self, time_step: float) -> None:
+    def _create_solver(self, time_step: float, touches: bool) -> None:
         self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step))
-        self.hessian = TrueHessian(self.unknowns, time_step) if self.preset.true_hessian else None
-        self.operator = self._keep(
-            python_matrix(self.unknowns, self.hessian or ThreeColumns(self.matrix), self.comm)
-        )
+        self.contact_blocks = ContactBlocks(self.unknowns, time_step) if touches else None
+        # contact changes what A is preconditioned with, but not A
+        self.preconditioner = self._keep(self.matrix.copy()) if touches else self.matrix
+        self.scalar = self._keep(self.matrix.createVecLeft())
+        self.matrix.getDiagonal(self.scalar)
+        self.diagonal = self.scalar.array_r.copy()
+        self.added = np.zeros(self.unknowns.size)  # to the preconditioner's diagonal
+        if self.preset.true_hessian:
+            context = self.hessian = TrueHessian(self.unknowns, time_step, self.contact_blocks)
+        else:
+            context, self.hessian = ThreeColumns(self.matrix, self.contact_blocks), None
+        self.operator = self._keep(python_matrix(self.unknowns, context, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
         self.ksp = self._keep(PETSc.KSP().create(self.comm))
         pc = self.ksp.getPC()
         pc.setOptionsPrefix("three_columns_")  # leaves the bare -pc_ to the scalar preconditioner
         pc.setType(PETSc.PC.Type.PYTHON)
-        pc.setPythonContext(ScalarPreconditioner(self.matrix))
+        pc.setPythonContext(ScalarPreconditioner(self.preconditioner))
         self.snes = self._keep(PETSc.SNES().create(self.comm))
         self.inner = self.snes
         if "npc_snes_type" in PETSc.Options().getAll():
@@ -116,14 +134,25 @@ class Stepper:
         except PETSc.Error as error:
             raise InputError(f"PETSc cannot set up the solver: {last_words(error)}") from None
 
-    def step(self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray) -> StepResult:
-        """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included, and the force load (owned, 3) [N].
+    def step(
+        self,
+        q: np.ndarray,
+        q_previous: np.ndarray,
+        load: np.ndarray,
+        contact: Contact | None = None,
+        led: np.ndarray | None = None,
+    ) -> StepResult:
+        """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included.
+
+        load    : force (owned, 3) [N]
+        contact : what presses on the nodes in this step
+        led     : q_n with the held nodes where they will be, (l, 3) [m]; q_n itself if they stay
 
         Raises StepFailed on all ranks.
         """
         self.y = 2 * q - q_previous
-        self.load = load
-        self.q[:] = self.base[:] = q  # pinned nodes stay there
+        self.load, self.contact = load, contact
+        self.q[:] = self.base[:] = q if led is None else led  # held nodes stay there
         self.last_error = self.residual = np.inf
         self._first_guess(q)
         iterations, ksp_its = self._solve()
@@ -178,6 +207,8 @@ class Stepper:
         add_elastic_gradient(self.q, *self.lattice.elastic, self.gradient)
         owned = self.lattice.owned
         self.gradient[:owned] -= self.load
+        if self.contact:
+            self.contact.add_gradient(self.q, self.gradient)
         scaled_sum(
             self.unknowns.free,
             self.lattice.mass,
@@ -198,18 +229,38 @@ class Stepper:
         moved = self.q[owned] - self.base[owned]
         inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
         elastic = elastic_change(self.q, self.base, *self.lattice.elastic_owned) - (moved * self.load).sum()
+        if self.contact:
+            elastic += self.contact.change(self.q, self.base)
         change, distance = self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()]))
         return -1.0 if self.last_error < FULL_STEP_ERROR and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
-        """Called before each linear solve: A is constant, only the true Hessian depends on x."""
+        """Called before each linear solve: A is constant, only the true Hessian and contact depend on x."""
         if self.preset.start_from_b:
             self._start_from_b(snes, x)
-        if self.hessian is None:
-            return
-        self.unknowns.to_nodes(x, self.base)
-        self.hessian.q[:] = self.base
-        self.operator.assemble()
+        changed = False
+        if self.hessian or self.contact_blocks:
+            self.unknowns.to_nodes(x, self.base)
+        if self.contact_blocks:
+            self.contact_blocks.linearise(self.contact, self.base)
+            changed = self._precondition_contact()
+        if self.hessian:
+            self.hessian.q[:] = self.base
+        if self.hessian or changed:
+            self.operator.assemble()
+
+    def _precondition_contact(self) -> bool:
+        """Add to the preconditioner's diagonal what bounds the contact blocks; whether that changed it.
+
+        A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
+        """
+        bound = self.contact.bound(self.base)[self.unknowns.free] if self.contact else np.zeros(self.unknowns.size)
+        changed = self.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR)
+        if changed:
+            self.added = bound
+            self.scalar.array[:] = self.diagonal + self.t2 * bound
+            self.preconditioner.setDiagonal(self.scalar)
+        return changed
 
     def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
         """CG solves A z = F for z = x - x_new; x_new = b = A x - F (Algorithm 1) is z = x - A x + F."""
@@ -231,9 +282,8 @@ class Stepper:
 
     def _rounding_of_residual(self) -> float:
         """|F|_(M^-1) that rounding alone leaves: eps of each row's diagonal entry times a coordinate."""
-        diagonal = self.matrix.getDiagonal().array_r
         size = self.comm.allreduce(np.abs(self.lattice.nodes).max(initial=0), MPI.MAX)
-        rows = 3 * (np.finfo(float).eps * size * diagonal) ** 2 @ self.inverse_mass[: len(diagonal)]
+        rows = 3 * (np.finfo(float).eps * size * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
         return np.sqrt(self.comm.allreduce(rows))
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:

@@ -1,0 +1,19 @@
+"""Nodes that a scene leads along a path, and lets go."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.model.motion import Path
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """where (l,) bool: the nodes, ghosts included; they follow ``path`` while time < stop [s]."""
+
+    where: np.ndarray
+    path: Path
+    stop: float
+
+    def holds_at(self, time: float) -> bool:
+        return time < self.stop

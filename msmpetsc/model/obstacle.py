@@ -1,0 +1,65 @@
+"""Solids that nodes stay out of: convex, so that a few planes say what is inside."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from msmpetsc import scene
+from msmpetsc.model.motion import Path
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """The points behind all faces: one face is a plane, six are a box.
+
+    points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side
+    path            : how it moves
+    start, stop     : it is there while start <= time < stop [s]
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    path: Path
+    start: float = 0.0
+    stop: float = np.inf
+
+    @classmethod
+    def of(cls, told: scene.Obstacle) -> "Obstacle":
+        """The obstacle of a scene."""
+        if told.shape == "box":
+            points = np.repeat(np.array(told.box), 3, axis=0)  # the faces that meet at each of the two corners
+            normals = np.concatenate([-np.eye(3), np.eye(3)])
+        else:
+            points, normals = np.array([told.point]), np.array([told.normal])
+        stop = np.inf if told.stop is None else told.stop
+        return cls(points, normals, Path.through(told.path), told.start, stop)
+
+    def acts_at(self, time: float) -> bool:
+        return self.start <= time < self.stop
+
+    def points_at(self, time: float) -> np.ndarray:
+        """A point of each face (f, 3) [m] at a time."""
+        return self.points + self.path.at(time)
+
+
+@numba.njit(cache=True)
+def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float, int]:
+    """How deep x (3,) lies in the solid [m], and the face that is nearest; not positive outside."""
+    least, face = np.inf, 0
+    for f in range(len(points)):
+        behind = 0.0
+        for c in range(3):
+            behind -= normals[f, c] * (x[c] - points[f, c])
+        if behind < least:
+            least, face = behind, f
+    return least, face
+
+
+@numba.njit(cache=True)
+def depths(q: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``depth`` of positions (n, 3): (n,) [m], and the nearest faces (n,)."""
+    least, face = np.empty(len(q)), np.empty(len(q), np.int64)
+    for i in range(len(q)):
+        least[i], face[i] = depth(q[i], points, normals)
+    return least, face

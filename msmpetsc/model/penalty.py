@@ -1,0 +1,181 @@
+"""Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
+and Coulomb friction on those that were.
+
+A node at depth d > 0 has the energy 1/2 k d^2. Friction opposes the slip u, the way along the surface during the
+step, with mu N once |u| passes a small e; N is the push on the node at the step's start, so that friction has a
+potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020,
+Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from msmpetsc.model.obstacle import Obstacle, depth, depths
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """stiffness [N/m] on each node; friction mu; below the slip speed ``stick`` [m/s] friction fades to nothing."""
+
+    obstacle: Obstacle
+    stiffness: float
+    friction: float
+    stick: float
+
+    def during(self, q: np.ndarray, time: float, time_step: float) -> "Press":
+        """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
+        points, normals = self.obstacle.points_at(time), self.obstacle.normals
+        if self.friction == 0:
+            return Press(points, normals, self.stiffness, None)
+        before = self.obstacle.points_at(time - time_step)
+        inside, face = depths(q, before, normals)
+        nodes = np.flatnonzero(inside > 0)
+        carried = q[nodes] + (points - before)[0]
+        limit = self.friction * self.stiffness * inside[nodes]
+        return Press(points, normals, self.stiffness, Rub(nodes, normals[face[nodes]], carried, limit, self.stick * time_step))
+
+
+@dataclass(frozen=True)
+class Rub:
+    """Friction of one step.
+
+    nodes (a,), normal (a, 3); carried (a, 3): where they are if they do not slip [m]; limit (a,): mu N [N];
+    stick: e [m]
+    """
+
+    nodes: np.ndarray
+    normal: np.ndarray
+    carried: np.ndarray
+    limit: np.ndarray
+    stick: float
+
+    def slip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """u (a, 3) and its length (a,) [m]."""
+        moved = q[self.nodes] - self.carried
+        u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
+        return u, np.linalg.norm(u, axis=1)
+
+    def energy(self, q: np.ndarray) -> float:
+        _, u = self.slip(q)
+        e = self.stick
+        return self.limit @ np.where(u < e, u**2 / e - u**3 / (3 * e**2) + e / 3, u)
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """f'(u) / u, (a,) [1/m]."""
+        return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        u, length = self.slip(q)
+        gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
+
+    def blocks(self, q: np.ndarray) -> np.ndarray:
+        """mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m]."""
+        u, length = self.slip(q)
+        direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
+        slope = self.slope(length)
+        curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
+        across = np.eye(3) - _squares(self.normal)
+        along = (curvature - slope)[:, None, None] * _squares(direction)
+        return self.limit[:, None, None] * (slope[:, None, None] * across + along)
+
+
+@dataclass(frozen=True)
+class Press:
+    """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], and friction, if any."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    stiffness: float
+    rub: Rub | None
+
+
+class Contact:
+    """What all obstacles add to E in one step. Positions q are (owned or more, 3) [m].
+
+    Gradient and Hessian act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
+    """
+
+    def __init__(self, presses: list[Press], owned: int):
+        self.presses, self.owned = presses, owned
+
+    def energy(self, q: np.ndarray) -> float:
+        """Of the push alone, [J]: friction stores none."""
+        return sum(_energy(q[: self.owned], p.points, p.normals, p.stiffness) for p in self.presses)
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """Energy at q less energy at base, friction included [J]."""
+        total = 0.0
+        for press in self.presses:
+            total += _change(q[: self.owned], base[: self.owned], press.points, press.normals, press.stiffness)
+            if press.rub:
+                total += press.rub.energy(q) - press.rub.energy(base)
+        return total
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        for press in self.presses:
+            _add_gradient(q[: self.owned], press.points, press.normals, press.stiffness, gradient)
+            if press.rub:
+                press.rub.add_gradient(q, gradient)
+
+    def hessian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes in contact (a,), ascending, and their blocks (a, 3, 3) [N/m], positive semidefinite."""
+        nodes, blocks = [np.empty(0, np.int64)], [np.empty((0, 3, 3))]
+        for press in self.presses:
+            inside, face = depths(q[: self.owned], press.points, press.normals)
+            pressed = np.flatnonzero(inside > 0)
+            nodes.append(pressed)
+            blocks.append(press.stiffness * _squares(press.normals[face[pressed]]))
+            if press.rub:
+                nodes.append(press.rub.nodes)
+                blocks.append(press.rub.blocks(q))
+        found, place = np.unique(np.concatenate(nodes), return_inverse=True)
+        total = np.zeros((len(found), 3, 3))
+        np.add.at(total, place, np.concatenate(blocks))
+        return found, total
+
+    def bound(self, q: np.ndarray) -> np.ndarray:
+        """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
+        bound = np.zeros(self.owned)
+        for press in self.presses:
+            bound[depths(q[: self.owned], press.points, press.normals)[0] > 0] += press.stiffness
+            if press.rub:
+                bound[press.rub.nodes] += 2 * press.rub.limit / press.rub.stick
+        return bound
+
+
+def _squares(vectors: np.ndarray) -> np.ndarray:
+    """v v^T of each (a, 3), (a, 3, 3)."""
+    return vectors[:, :, None] * vectors[:, None, :]
+
+
+@numba.njit(cache=True)
+def _energy(q, points, normals, stiffness):
+    energy = 0.0
+    for i in range(len(q)):
+        d, _ = depth(q[i], points, normals)
+        if d > 0.0:
+            energy += 0.5 * stiffness * d * d
+    return energy
+
+
+@numba.njit(cache=True)
+def _change(q, base, points, normals, stiffness):
+    change = 0.0
+    for i in range(len(q)):
+        d, d_base = depth(q[i], points, normals)[0], depth(base[i], points, normals)[0]
+        if d > 0.0 or d_base > 0.0:
+            d, d_base = max(d, 0.0), max(d_base, 0.0)
+            change += 0.5 * stiffness * (d - d_base) * (d + d_base)
+    return change
+
+
+@numba.njit(cache=True)
+def _add_gradient(q, points, normals, stiffness, gradient):
+    for i in range(len(q)):
+        d, face = depth(q[i], points, normals)
+        if d > 0.0:
+            for c in range(3):
+                gradient[i, c] -= stiffness * d * normals[face, c]

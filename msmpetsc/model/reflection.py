@@ -1,0 +1,39 @@
+"""Contact as the paper has it (section 5): a node that has reached an obstacle gets its velocity reversed.
+
+There is no velocity in the state, only q_n and q_(n-1); so the paper sets v_(n+1) = -v_n by
+q_(n+1) = q_(n-1): the two are exchanged. The obstacle thereby moves nodes against their springs, which
+adds energy during the impact; it is not a conservative contact.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.model.obstacle import Obstacle, depths
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """An obstacle and its restitution in [0, 1] (1: the paper)."""
+
+    obstacle: Obstacle
+    restitution: float
+
+    def reflect(
+        self, q: np.ndarray, q_previous: np.ndarray, time: float, time_step: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """q_n and q_(n-1) after contact at ``time`` [s], that of q_n; (n, 3) [m] each.
+
+        Where a node of q lies on or in the obstacle and its v_n = q_n - q_(n-1), as seen from the obstacle,
+        goes on into it, the normal part of q_n goes back by that of v_n, which becomes -e times itself.
+        With e = 1 and an obstacle at rest this exchanges the normal parts of q_n and q_(n-1).
+        """
+        if not self.obstacle.acts_at(time):
+            return q, q_previous
+        path = self.obstacle.path
+        inside, face = depths(q, self.obstacle.points_at(time), self.obstacle.normals)
+        normal = self.obstacle.normals[face]
+        into = ((q - q_previous - (path.at(time) - path.at(time - time_step))) * normal).sum(axis=1)
+        hit = (inside >= 0) & (into < 0)
+        back = np.where(hit, into, 0)[:, None] * normal
+        return q - back, q_previous + self.restitution * back

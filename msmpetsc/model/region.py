@@ -1,0 +1,89 @@
+"""Which nodes a scene means by a region."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from msmpetsc.comm import on_root
+from msmpetsc.errors import InputError
+from msmpetsc.geometry import morton
+from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.model.lattice import CORNERS, Lattice
+from msmpetsc.scene import Region
+
+EDGE = 1e-9  # of the body's longest side: a node this near to a region counts as on its edge, whatever was rounded
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds a region's nodes in a body's lattice. folder: where files of painted points lie."""
+
+    body: Body
+    cages: Cages
+    folder: Path
+
+    def find(self, key: str, region: Region, lattice: Lattice) -> np.ndarray:
+        """The local nodes that a region means, (l,) bool (collective).
+
+        key: of the region's table in the scene, for what is told. Raises InputError on all ranks if there are none.
+        """
+        if region.painted is None:
+            where = inside(region, lattice.nodes, self.body.bounds)
+        else:
+            where = self._corners_of(self._painted_cells(key, region.painted), lattice)
+        if self.body.comm.allreduce(int(where[: lattice.owned].sum())) == 0:
+            raise InputError(f"{key}.region holds no node of the lattice")
+        return where
+
+    def _painted_cells(self, key: str, painted: str | tuple[int, ...]) -> np.ndarray:
+        """The cells (k, 3) that painted points of the surface lie in (collective)."""
+
+        def cells() -> np.ndarray:
+            points, numbers = self.body.surface.points, np.array(self._numbers(key, painted))
+            if numbers.max() >= len(points):
+                raise InputError(f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}")
+            return np.unique(self.cages.grid.to_cells(points[numbers]).astype(np.int64), axis=0)
+
+        return self.body.comm.bcast(on_root(self.body.comm, cells))
+
+    def _numbers(self, key: str, painted: str | tuple[int, ...]) -> list[int]:
+        if not isinstance(painted, str):
+            return list(painted)
+        path = self.folder / painted
+        try:
+            numbers = [int(word) for word in path.read_text().split()]
+        except OSError as error:
+            raise InputError(f"{key}.region.painted: {path} cannot be read: {error.strerror}") from None
+        except ValueError:
+            raise InputError(f"{key}.region.painted: {path} is no list of whole numbers") from None
+        if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
+            raise InputError(f"{key}.region.painted: {path} must list point numbers, from 0")
+        return numbers
+
+    def _corners_of(self, cells: np.ndarray, lattice: Lattice) -> np.ndarray:
+        keys = np.unique(morton.encode(cells[:, None, :] + CORNERS))
+        grid = self.cages.grid
+        ijk = np.rint((lattice.nodes - grid.origin) / grid.cell_size).astype(np.int64)
+        return np.isin(morton.encode(ijk), keys)
+
+
+def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) [m] lie in a region or on its edge, (n,) bool.
+
+    bounds : (2, 3) the body's bounding box at rest [m]
+    """
+    sides = bounds[1] - bounds[0]
+    origin, scale, length = (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
+    edge = EDGE * sides.max()
+
+    def place(point: tuple[float, ...]) -> np.ndarray:
+        return origin + np.asarray(point) * scale
+
+    if region.box is not None:
+        low, high = region.box
+        return ((points >= place(low) - edge) & (points <= place(high) + edge)).all(axis=1)
+    if region.sphere is not None:
+        distance = np.linalg.norm(points - place(region.sphere.center), axis=1)
+        return distance <= region.sphere.radius * length + edge
+    return (points - place(region.half_space.point)) @ np.asarray(region.half_space.normal) >= -edge

@@ -70,15 +70,19 @@ class Rub:
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 
-    def blocks(self, q: np.ndarray) -> np.ndarray:
-        """mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m]."""
+    def blocks(self, q: np.ndarray, true: bool) -> np.ndarray:
+        """mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
+
+        The second part is not positive; unless ``true`` it is left out, which is no less than the Hessian.
+        """
         u, length = self.slip(q)
-        direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
         slope = self.slope(length)
-        curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
-        across = np.eye(3) - _squares(self.normal)
-        along = (curvature - slope)[:, None, None] * _squares(direction)
-        return self.limit[:, None, None] * (slope[:, None, None] * across + along)
+        blocks = slope[:, None, None] * (np.eye(3) - _squares(self.normal))
+        if true:
+            direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
+            curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
+            blocks += (curvature - slope)[:, None, None] * _squares(direction)
+        return self.limit[:, None, None] * blocks
 
 
 @dataclass(frozen=True)
@@ -120,8 +124,12 @@ class Contact:
             if press.rub:
                 press.rub.add_gradient(q, gradient)
 
-    def hessian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes in contact (a,), ascending, and their blocks (a, 3, 3) [N/m], positive semidefinite."""
+    def hessian(self, q: np.ndarray, true: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes in contact (a,), ascending, and their blocks (a, 3, 3) [N/m], positive semidefinite.
+
+        true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
+            Hessian, nothing along a slip, would let nodes run to and fro
+        """
         nodes, blocks = [np.empty(0, np.int64)], [np.empty((0, 3, 3))]
         for press in self.presses:
             inside, face = depths(q[: self.owned], press.points, press.normals)
@@ -130,7 +138,7 @@ class Contact:
             blocks.append(press.stiffness * _squares(press.normals[face[pressed]]))
             if press.rub:
                 nodes.append(press.rub.nodes)
-                blocks.append(press.rub.blocks(q))
+                blocks.append(press.rub.blocks(q, true))
         found, place = np.unique(np.concatenate(nodes), return_inverse=True)
         total = np.zeros((len(found), 3, 3))
         np.add.at(total, place, np.concatenate(blocks))

@@ -34,9 +34,9 @@ class ContactBlocks:
         self.row[unknowns.free] = np.arange(unknowns.size)
         self.rows, self.blocks = np.empty(0, np.int64), np.empty((0, 3, 3))
 
-    def linearise(self, contact: Contact | None, q: np.ndarray) -> None:
-        """Take the blocks at positions q."""
-        nodes, blocks = contact.hessian(q) if contact else (np.empty(0, np.int64), np.empty((0, 3, 3)))
+    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
+        """Take the blocks at positions q, ``true`` ones or such as go with A."""
+        nodes, blocks = contact.hessian(q, true) if contact else (np.empty(0, np.int64), np.empty((0, 3, 3)))
         free = self.row[nodes] >= 0
         self.rows, self.blocks = self.row[nodes[free]], self.t2 * blocks[free]
 

@@ -242,7 +242,7 @@ class Stepper:
         if self.hessian or self.contact_blocks:
             self.unknowns.to_nodes(x, self.base)
         if self.contact_blocks:
-            self.contact_blocks.linearise(self.contact, self.base)
+            self.contact_blocks.linearise(self.contact, self.base, self.preset.true_hessian)
             changed = self._precondition_contact()
         if self.hessian:
             self.hessian.q[:] = self.base

@@ -358,7 +358,9 @@ class Output(Table):
 class Picture(Table):
     """How the result is drawn."""
 
-    eye: Direction = Field((1.0, -2.0, 0.6), description="direction from the body to the eye, of any length [-]")
+    eye: Direction | None = Field(
+        None, description="direction from the body to the eye, of any length; across its longer side if absent [-]"
+    )
     times: ListOf[NotNegative] = Field(
         (), description="moments drawn beside the start [s]; chosen by their energies if absent"
     )
@@ -379,7 +381,7 @@ class SceneFile(Table):
     force: ListOf[Force] = Field((), description="forces on parts of the body")
     solver: Solver = Field(Solver(), description="how a step is solved")
     output: Output = Field(Output(), description="what is stored")
-    picture: Picture | None = Field(None, description="how the result is drawn; by its shape if absent")
+    picture: Picture = Field(Picture(), description="how the result is drawn")
 
 
 class Scene(SceneFile):

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from msmpetsc.errors import InputError
 
 
@@ -12,7 +14,10 @@ def add_parser(subparsers) -> None:
     parser.add_argument("result", metavar="OUT.h5", type=Path)
     parser.add_argument("-o", "--output", metavar="PNG", type=Path, help="default: beside the result, ending in .png")
     parser.add_argument("--frames", metavar="0,10,20", help="these frames, in this order")
-    parser.add_argument("--count", metavar="N", type=int, default=5, help="how many moments to choose (default: 5)")
+    parser.add_argument(
+        "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"
+    )
+    parser.add_argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)")
     parser.set_defaults(run=run)
 
 
@@ -20,18 +25,22 @@ def run(args: argparse.Namespace) -> int:
     """Draw and name the picture; returns the exit status."""
     from msmpetsc.output.render import contact_sheet  # here: the other commands need no graphics
 
-    if args.count < 1:
+    if args.count is not None and args.count < 1:
         raise InputError(f"--count must be at least 1, not {args.count}")
     picture = args.output or args.result.with_suffix(".png")
-    print(contact_sheet(args.result, picture, _frames(args.frames), args.count))
+    frames = _numbers("--frames", args.frames, int, "0,10,20")
+    eye = _numbers("--eye", args.eye, float, "1,-2,0.6")
+    if eye is not None and not (len(eye) == 3 and any(eye) and np.isfinite(eye).all()):
+        raise InputError(f"--eye takes three numbers, not all zero, not {args.eye!r}")
+    print(contact_sheet(args.result, picture, frames, args.count, eye))
     return 0
 
 
-def _frames(text: str | None) -> list[int] | None:
+def _numbers(option: str, text: str | None, kind: type, example: str) -> list | None:
     """ "0,10,20" as numbers."""
     if text is None:
         return None
     try:
-        return [int(part) for part in text.split(",")]
+        return [kind(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--frames takes numbers like 0,10,20, not {text!r}") from None
+        raise InputError(f"{option} takes numbers like {example}, not {text!r}") from None

@@ -1,8 +1,7 @@
 """A contact sheet: some moments of a result side by side in one picture.
 
 All bodies stand in one scene, seen by one camera without perspective, each shifted to the right by one panel: so
-scale and height can be compared between them. Lengths here are in the camera's own axes, x to the right, y away
-from the eye, z up, unless said otherwise.
+scale and height can be compared between them. Beside each stand the obstacles and forces of its own time.
 """
 
 import os
@@ -16,51 +15,93 @@ import h5py
 import numpy as np
 import pyvista as pv
 from PIL import Image
+from pydantic import ValidationError
 from scipy.sparse import csr_array
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.camera import Camera, place_camera
 from msmpetsc.output.frames import finished, open_result
+from msmpetsc.output.marks import Ground, Marks, arrows, held, obstacles
+from msmpetsc.scene import SceneFile
 
-BODY, GROUND, GROUND_EDGE, SHADOW, INK = "#8fabc6", "#efece6", "#b9b3a6", "#cdc7bb", "#333a42"
-YAW, ELEVATION = np.radians(25), np.radians(14)  # how far the eye stands to the side, and above
+BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
+GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
+GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.3
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
-TO_EYE = np.array([0.0, -np.cos(ELEVATION), np.sin(ELEVATION)])
 CAPTION = 76  # [px]
 MARGIN = 0.08  # of the greatest extent, around the bodies
+COUNT = 5  # moments, where nothing is said
 
 
 @dataclass(frozen=True)
-class Plane:
-    """A plane obstacle: a point of it and its unit normal, (3,) each."""
+class Panel:
+    """One moment: surface points (v, 3) [m], how far each is held (v,) in [0, 1], and what stands beside them."""
 
-    point: np.ndarray
-    normal: np.ndarray
+    points: np.ndarray
+    held: np.ndarray
+    marks: Marks
+    caption: tuple[str, str]
 
 
 def contact_sheet(
-    h5_path: str | Path, png_path: str | Path, frames: Sequence[int] | None = None, count: int = 5
+    h5_path: str | Path,
+    png_path: str | Path,
+    frames: Sequence[int] | None = None,
+    count: int | None = None,
+    eye: Sequence[float] | None = None,
 ) -> Path:
-    """Draw the surface at these frames, or at `count` that `choose_moments` finds; returns png_path."""
+    """Draw the surface at some moments of a result; returns png_path.
+
+    frames : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
+    eye    : direction from the body to the eye (3,); the scene's picture.eye if None
+    """
     with open_result(h5_path) as file:
-        total = finished(file)
-        if total == 0:
-            raise InputError(f"{h5_path} has no finished frame")
-        moments = dict.fromkeys(frames, "") if frames else choose_moments(file, count)
-        outside = [index for index in moments if not 0 <= index < total]
-        if outside:
-            raise InputError(f"{h5_path} has frames 0 to {total - 1}, not {outside[0]}")
-        bodies = [surface_points(file, index) for index in moments]
-        captions = [(f"t = {file['frames/time'][index]:.3f} s", why) for index, why in moments.items()]
-        triangles, scene = file["surface/triangles"][...], tomllib.loads(file.attrs.get("scene", ""))
-    axes = camera_axes(np.concatenate(bodies), scene)
-    planes = [
-        Plane(axes @ obstacle["point"], axes @ _unit(obstacle["normal"]))
-        for obstacle in scene.get("obstacle", [])
-        if obstacle.get("shape") == "plane"
-    ]
-    draw([points @ axes.T for points in bodies], triangles, planes, captions, Path(png_path))
+        scene = read_scene(file)
+        if "embedding" not in file:
+            raise InputError(f"{h5_path} has no surface to draw: its scene says output.surface = false")
+        moments = _moments(file, scene, frames, count)
+        bodies = {index: surface_points(file, index) for index in moments}
+        everywhere = np.concatenate(list(bodies.values()))
+        gravity = scene.gravity and scene.gravity.acceleration
+        camera = place_camera(everywhere, gravity, scene.picture.eye if eye is None else eye)
+        panels = [
+            _panel(file, scene, camera, everywhere, points, index, moments[index]) for index, points in bodies.items()
+        ]
+        triangles = file["surface/triangles"][...]
+    draw(panels, triangles, camera, Path(png_path))
     return Path(png_path)
+
+
+def read_scene(file: h5py.File) -> SceneFile:
+    """The scene of a result, as run."""
+    try:
+        return SceneFile.model_validate(tomllib.loads(file.attrs["scene"]))
+    except ValidationError as error:
+        raise InputError(f"{file.filename} was run by another version, with a scene unknown to this one") from error
+
+
+def _moments(file: h5py.File, scene: SceneFile, frames: Sequence[int] | None, count: int | None) -> dict[int, str]:
+    """The frames to draw, each with its reason or ""."""
+    total = finished(file)
+    if total == 0:
+        raise InputError(f"{file.filename} has no finished frame")
+    if frames:
+        moments = dict.fromkeys(frames, "")
+    elif count is None and scene.picture.times:
+        moments = moments_at(file, scene.picture.times)
+    else:
+        moments = choose_moments(file, count or COUNT)
+    outside = [index for index in moments if not 0 <= index < total]
+    if outside:
+        raise InputError(f"{file.filename} has frames 0 to {total - 1}, not {outside[0]}")
+    return moments
+
+
+def moments_at(file: h5py.File, times: Sequence[float]) -> dict[int, str]:
+    """The start, and the finished frames nearest to these times [s], in order of time."""
+    time = file["frames/time"][: finished(file)]
+    return {0: "start"} | {int(np.argmin(abs(time - wanted))): "" for wanted in sorted(times)} | {0: "start"}
 
 
 def choose_moments(file: h5py.File, count: int) -> dict[int, str]:
@@ -91,46 +132,46 @@ def surface_points(file: h5py.File, index: int) -> np.ndarray:
     """(v, 3) surface points of a frame [m]: as stored, or W @ positions."""
     if "frames/surface" in file:
         return file["frames/surface"][index].astype(float)
-    embedding, position = file["embedding"], file["frames/position"][index]
+    return _embedding(file) @ file["frames/position"][index]
+
+
+def _embedding(file: h5py.File) -> csr_array:
+    """W (v, n)."""
+    embedding, nodes = file["embedding"], file["frames/position"].shape[1]
     parts = tuple(embedding[name][...] for name in ("weights", "indices", "indptr"))
-    return csr_array(parts, shape=(len(parts[2]) - 1, len(position))) @ position
+    return csr_array(parts, shape=(len(parts[2]) - 1, nodes))
 
 
-def camera_axes(points: np.ndarray, scene: dict) -> np.ndarray:
-    """(3, 3): rows are the directions right, away and up of the picture in the scene's axes.
+def _panel(
+    file: h5py.File, scene: SceneFile, camera: Camera, bodies: np.ndarray, points: np.ndarray, index: int, why: str
+) -> Panel:
+    """The moment of a frame whose surface points (v, 3) are given; bodies (n, 3): those of all panels."""
+    time, nodes, position = file["frames/time"][index], file["lattice/nodes"][...], file["frames/position"][index]
+    rest = file["surface/points"][...]
+    bounds = np.array([rest.min(axis=0), rest.max(axis=0)])
+    grounds, glass = obstacles(scene, time, bodies, camera)
+    marks = Marks(grounds, glass, arrows(scene, time, nodes, position, bounds))
+    share = np.clip(_embedding(file) @ held(scene, time, nodes, bounds).astype(float), 0, 1)
+    return Panel(points, share, marks, (f"t = {time:.3f} s", why))
 
-    Up is against gravity (z without it); the longer horizontal extent of the points lies across the picture.
-    """
-    gravity = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
-    up = _unit(-gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
-    flat = np.delete(np.eye(3), np.argmax(abs(up)), axis=0)
-    flat = np.array([_unit(axis - (axis @ up) * up) for axis in flat])
-    right = flat[np.argmax(np.ptp(points @ flat.T, axis=0))]
-    away = np.cross(up, right)
-    return np.array([np.cos(YAW) * right + np.sin(YAW) * away, np.cos(YAW) * away - np.sin(YAW) * right, up])
 
-
-def draw(
-    bodies: list[np.ndarray], triangles: np.ndarray, planes: list[Plane], captions: list[tuple[str, str]], path: Path
-) -> None:
-    """Render the bodies (v, 3), in camera axes, from left to right on their planes, with captions below."""
-    low, high = _box(bodies, planes)
-    size = high - low
-    panel = size[0], size[2] * np.cos(ELEVATION) + size[1] * np.sin(ELEVATION)  # [m] in the picture
-    scale = min(PANEL_WIDTH / panel[0], PANEL_HEIGHT / panel[1])  # [px/m]
-    width, height = max(NARROWEST, round(scale * panel[0])), round(scale * panel[1]) + CAPTION  # [px]
+def draw(panels: list[Panel], triangles: np.ndarray, camera: Camera, path: Path) -> None:
+    """Render the panels from left to right, with captions below."""
+    low, high = _frame(panels, camera)
+    scale = min(PANEL_WIDTH / (high - low)[0], PANEL_HEIGHT / (high - low)[1])  # [px/m]
+    width, height = np.maximum([NARROWEST, 1], np.round(scale * (high - low))).astype(int)  # [px]
     with _quiet_opengl():
-        plotter = pv.Plotter(off_screen=True, window_size=(width * len(bodies), height), lighting="none")
+        plotter = pv.Plotter(off_screen=True, window_size=(width * len(panels), height + CAPTION), lighting="none")
         plotter.set_background("white")
-        for number, points in enumerate(bodies):
-            shift = np.array([number * width / scale, 0, 0])
-            for plane in planes:
-                _draw_plane(plotter, plane, low, high, shift)
-                _draw_shadow(plotter, plane, points, triangles, shift)
-            body = pv.PolyData.from_regular_faces(points + shift, triangles)
-            plotter.add_mesh(body, color=BODY, smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
-            _write_caption(plotter, captions[number], (number + 0.5) * width)
-        _set_eye(plotter, np.array([low, high + shift]), height, scale)
+        shown = np.concatenate([points for panel in panels for points in (panel.points, panel.marks.corners)])
+        depth = np.ptp(shown @ camera.to_eye)
+        for number, panel in enumerate(panels):
+            _draw_panel(plotter, panel, triangles, number * width / scale * camera.right, 2 * depth * camera.to_eye)
+            _write_caption(plotter, panel.caption, (number + 0.5) * width)
+        row = np.array([(len(panels) - 1) / 2 * width / scale, -CAPTION / 2 / scale])
+        across, upward = (low + high) / 2 + row
+        middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
+        _set_eye(plotter, camera, middle, (height + CAPTION) / scale, 4 * depth)
         plotter.enable_anti_aliasing("ssaa")
         picture = plotter.screenshot(return_img=True)
         plotter.close()
@@ -145,41 +186,54 @@ def _save(picture: np.ndarray, path: Path) -> None:
         raise InputError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from error
 
 
-def _box(bodies: list[np.ndarray], planes: list[Plane]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (3,), (3,) of what every panel shows: all bodies, and the planes' feet below them if not far away."""
-    points = np.concatenate(bodies)
-    reach = np.ptp(points, axis=0).max()
-    shown = [points]
-    for plane in planes:
-        above = (points - plane.point) @ plane.normal
-        nearest = np.argmin(above)
-        if above[nearest] < reach:
-            shown.append((points[nearest] - above[nearest] * plane.normal)[None])
-    shown = np.concatenate(shown)
-    return shown.min(axis=0) - MARGIN * reach, shown.max(axis=0) + MARGIN * reach
+def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Lower left and upper right (2,), (2,) [m] of what every panel shows, in the picture's plane."""
+    bodies = np.concatenate([panel.points for panel in panels])
+    margin = MARGIN * np.ptp(bodies, axis=0).max()
+    inner = [camera.flat(points) for panel in panels for points in (panel.points, *panel.marks.glass, *panel.marks.arrows)]
+    inner = np.concatenate(inner)
+    ground = [camera.flat(ground.corners) for panel in panels for ground in panel.marks.grounds]
+    rows = np.concatenate([inner - margin, inner + margin, *ground])
+    return rows.min(axis=0), rows.max(axis=0)
 
 
-def _draw_plane(plotter: pv.Plotter, plane: Plane, low: np.ndarray, high: np.ndarray, shift: np.ndarray) -> None:
-    """The part of the plane within a panel's box; seen from behind it would hide the body, so it is left out."""
-    axis = int(np.argmax(abs(plane.normal)))  # the plane's height along it is a function of the other two
-    one, two = (axis + 1) % 3, (axis + 2) % 3
-    corners = np.empty((4, 3))
-    corners[:, one] = low[one], high[one], high[one], low[one]
-    corners[:, two] = low[two], low[two], high[two], high[two]
-    rest = (corners - plane.point)[:, [one, two]] @ plane.normal[[one, two]]
-    corners[:, axis] = plane.point[axis] - rest / plane.normal[axis]
-    if plane.normal @ TO_EYE > 0:
-        patch = pv.PolyData.from_regular_faces(corners + shift, [[0, 1, 2, 3]])
-        plotter.add_mesh(patch, color=GROUND, lighting=False, show_edges=True, edge_color=GROUND_EDGE, line_width=2)
+def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, shift: np.ndarray, front: np.ndarray) -> None:
+    """shift: (3,) from the first panel to this one; front: (3,) towards the eye, out of what could hide anything."""
+    for ground in panel.marks.grounds:
+        _draw_ground(plotter, ground, panel.points, triangles, shift)
+    body = pv.PolyData.from_regular_faces(panel.points + shift, triangles)
+    colours = (1 - panel.held[:, None]) * _rgb(BODY) + panel.held[:, None] * _rgb(HELD)
+    look = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
+    plotter.add_mesh(body, scalars=colours.astype(np.uint8), rgb=True, **look)
+    for corners in panel.marks.glass:
+        _draw_glass(plotter, corners + shift)
+    for tail, tip in panel.marks.arrows:  # without perspective, nearer to the eye is the same place of the picture
+        shape = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045, tip_resolution=40, shaft_resolution=40)
+        arrow = pv.Arrow(tail + shift + front, tip - tail, scale=float(np.linalg.norm(tip - tail)), **shape)
+        plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.6, diffuse=0.5)
 
 
-def _draw_shadow(plotter: pv.Plotter, plane: Plane, points: np.ndarray, triangles: np.ndarray, shift) -> None:
-    """The body's projection on the plane: it shows where the body is above it, and how high."""
-    above = (points - plane.point) @ plane.normal
+def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray, shift) -> None:
+    """With the body's projection as a shadow: it shows where the body is above the ground, and how high."""
+    patch = pv.PolyData.from_regular_faces(ground.corners + shift, [[0, 1, 2, 3]])
+    plotter.add_mesh(patch, color=GROUND, lighting=False, show_edges=True, edge_color=GROUND_EDGE, line_width=2)
+    above = (points - ground.corners[0]) @ ground.normal
     lift = 2e-3 * np.ptp(points, axis=0).max()  # or the two surfaces would flicker into each other
-    shadow = points - np.outer(above - lift, plane.normal)
-    if plane.normal @ TO_EYE > 0:
-        plotter.add_mesh(pv.PolyData.from_regular_faces(shadow + shift, triangles), color=SHADOW, lighting=False)
+    shadow = points - np.outer(above - lift, ground.normal)
+    plotter.add_mesh(pv.PolyData.from_regular_faces(shadow + shift, triangles), color=SHADOW, lighting=False)
+
+
+def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:
+    """A body of corners (8, 3) numbered 4i + 2j + k, seen through, with its edges."""
+    faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
+    solid = pv.PolyData.from_regular_faces(corners, faces)
+    plotter.add_mesh(solid, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
+    edges = solid.extract_feature_edges(feature_angle=1)
+    plotter.add_mesh(edges, color=GLASS_EDGE, line_width=2, lighting=False)
+
+
+def _rgb(colour: str) -> np.ndarray:
+    return np.array(pv.Color(colour).int_rgb, float)
 
 
 def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float) -> None:
@@ -190,17 +244,15 @@ def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float)
             actor.prop.justification_horizontal = "center"
 
 
-def _set_eye(plotter: pv.Plotter, box: np.ndarray, height: int, scale: float) -> None:
-    """Look without perspective at the whole row of panels, box (2,3), with the captions' strip left free below."""
-    middle, far = box.mean(axis=0), 10 * np.linalg.norm(box[1] - box[0])
-    middle = middle - CAPTION / 2 / scale * np.cross(TO_EYE, [1.0, 0, 0])
-    camera = plotter.camera
-    camera.focal_point, camera.position, camera.up = middle, middle + far * TO_EYE, (0, 0, 1)
-    camera.enable_parallel_projection()
-    camera.parallel_scale = height / 2 / scale
-    camera.clipping_range = (far / 2, 2 * far)
-    for place, intensity in (((-0.5, -1, 1.4), 0.85), ((1, -0.6, 0.3), 0.35)):
-        plotter.add_light(pv.Light(position=place, intensity=intensity, light_type="scene light"))
+def _set_eye(plotter: pv.Plotter, camera: Camera, middle: np.ndarray, height: float, far: float) -> None:
+    """Look without perspective at `middle` (3,) of a picture that is `height` [m] high, from `far` [m] away."""
+    view = plotter.camera
+    view.focal_point, view.position, view.up = middle, middle + far * camera.to_eye, camera.upward
+    view.enable_parallel_projection()
+    view.parallel_scale = height / 2
+    view.clipping_range = (far / 100, 2 * far)
+    for place, intensity in (((-0.5, 1.1, 1.3), 0.85), ((1, 0.15, 0.65), 0.35)):
+        plotter.add_light(pv.Light(position=place, intensity=intensity, light_type="camera light"))
 
 
 @contextmanager
@@ -217,7 +269,3 @@ def _quiet_opengl() -> Iterator[None]:
     finally:
         os.dup2(terminal, 2)
         os.close(terminal)
-
-
-def _unit(vector: Sequence[float]) -> np.ndarray:
-    return np.asarray(vector, float) / np.linalg.norm(vector)

@@ -1,0 +1,145 @@
+"""What stands beside the body at a time: obstacles, arrows for the forces, and the parts that are held.
+
+Geometry only, in the scene's axes [m]; it comes from the scene and the lattice of a result, nothing is drawn here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.model.loads import inside
+from msmpetsc.output.camera import Camera, unit
+from msmpetsc.scene import Keyframe, Obstacle, Region, SceneFile
+
+ARROW = 0.2  # length of an arrow, of the body's longest side
+NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
+CUT = 1.3  # a longer box is cut to this, of the bodies' extent
+MARGIN = 0.08  # by which a plane is drawn larger than the bodies, of their longest extent
+THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A plane that the body stands on or lies against: corners (4, 3) of the part drawn, unit normal (3,)."""
+
+    corners: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Of one panel.
+
+    grounds : planes drawn as they are
+    glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
+    arrows  : (2, 3) each, tail and tip
+    """
+
+    grounds: list[Ground]
+    glass: list[np.ndarray]
+    arrows: list[np.ndarray]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(n, 3) of all obstacles."""
+        return np.concatenate([np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass])
+
+
+def displacement(path: Sequence[Keyframe], time: float) -> np.ndarray:
+    """(3,) [m]: none at time 0, in straight lines through the path's places, staying at the last."""
+    times = [0.0, *(key.time for key in path)]
+    places = np.array([(0.0, 0.0, 0.0), *(key.by for key in path)])
+    return np.array([np.interp(time, times, coordinate) for coordinate in places.T])
+
+
+def acts_at(time: float, start: float, stop: float | None) -> bool:
+    return start <= time and (stop is None or time < stop)
+
+
+def obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
+    """Grounds, and corners (8, 3) of what is drawn as glass, as they stand at a time.
+
+    bodies : (n, 3) surface points of all panels, which say how much of an obstacle is worth showing
+    """
+    grounds, glass = [], []
+    for obstacle in scene.obstacle:
+        if not acts_at(time, obstacle.start, obstacle.stop):
+            continue
+        by = displacement(obstacle.path, time)
+        if obstacle.shape == "box":
+            glass += _box(np.array(obstacle.box) + by, bodies)
+        elif _is_near(obstacle, by, bodies):
+            ground = _patch(np.array(obstacle.point) + by, np.array(obstacle.normal), bodies, camera)
+            if ground.normal @ camera.to_eye > 0 and ground.normal @ camera.up > -1e-6:
+                grounds.append(ground)
+            else:
+                glass.append(_plate(ground, THICKNESS * _reach(bodies)))
+    return grounds, glass
+
+
+def _reach(bodies: np.ndarray) -> float:
+    return np.ptp(bodies, axis=0).max()
+
+
+def _is_near(plane: Obstacle, by: np.ndarray, bodies: np.ndarray) -> bool:
+    return ((bodies - plane.point - by) @ plane.normal).min() < NEAR * _reach(bodies)
+
+
+def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> Ground:
+    """The rectangle of a plane that the bodies stand before, with a margin; its sides lie as the picture's do."""
+    across = min(camera.right, camera.away, key=lambda axis: abs(axis @ normal))
+    one = unit(across - (across @ normal) * normal)
+    two = np.cross(normal, one)
+    margin = MARGIN * _reach(bodies)
+    (low1, high1), (low2, high2) = [((bodies @ axis).min() - margin, (bodies @ axis).max() + margin) for axis in (one, two)]
+    corners = np.array([(low1, low2), (high1, low2), (high1, high2), (low1, high2)]) @ [one, two]
+    return Ground(corners + (point @ normal) * normal, normal)
+
+
+def _plate(patch: Ground, thickness: float) -> np.ndarray:
+    """(8, 3) corners of a plate on the side of the plane where no body is."""
+    front = patch.corners[[0, 1, 3, 2]]
+    return np.concatenate([front, front - thickness * patch.normal])
+
+
+def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
+    """(8, 3) corners of a box (2, 3), cut along the axes where it is much longer than the bodies; none if far away."""
+    low, high = bodies.min(axis=0), bodies.max(axis=0)
+    extent = high - low
+    margin = (CUT - 1) / 2 * extent
+    long = box[1] - box[0] > CUT * extent
+    box = np.where(long, np.clip(box, low - margin, high + margin), box)
+    gap = np.maximum(box[0] - high, low - box[1]).max()
+    if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
+        return []
+    return [np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])]
+
+
+def arrows(
+    scene: SceneFile, time: float, nodes: np.ndarray, position: np.ndarray, bounds: np.ndarray
+) -> list[np.ndarray]:
+    """(2, 3) each, tail and tip, of the forces that act: from the middle of the nodes pulled, all of one length.
+
+    nodes, position : (n, 3) at rest and at that time; bounds : (2, 3) the body's bounding box at rest
+    """
+    length = ARROW * np.ptp(bounds, axis=0).max()
+    found = []
+    for force in scene.force:
+        where = _chosen(force.region, nodes, bounds)
+        if acts_at(time, force.start, force.stop) and any(force.total) and where.any():
+            tail = position[where].mean(axis=0)
+            found.append(np.array([tail, tail + length * unit(force.total)]))
+    return found
+
+
+def held(scene: SceneFile, time: float, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Which nodes (n,) bool are pinned or led at a time."""
+    regions = [pin.region for pin in scene.pin]
+    regions += [anchor.region for anchor in scene.anchor if acts_at(time, 0.0, anchor.stop)]
+    return np.any([np.zeros(len(nodes), bool), *(_chosen(region, nodes, bounds) for region in regions)], axis=0)
+
+
+def _chosen(region: Region, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Which nodes (n,) bool a region means. Painted ones are not found yet: no arrow, no tint."""
+    return np.zeros(len(nodes), bool) if region.painted is not None else inside(region, nodes, bounds)

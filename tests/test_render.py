@@ -4,6 +4,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,21 @@ from scipy.sparse import csr_array
 from msmpetsc.cli import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.model.frame import Frame
-from msmpetsc.output import render
+from msmpetsc.output import marks, render
+from msmpetsc.output.camera import YAW, place_camera
 from msmpetsc.output.frames import ResultFile, open_result
+from msmpetsc.scene import SceneFile
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.timeout(60)
-SCENE = """
+BARE = """
+mesh.source = "ball"
+cages.count = 1
+material = { stiffness = 1.0, density = 1.0 }
+time = { step = 0.1, duration = 1.0 }
+"""
+SCENE = f"""
+{BARE}
 [[obstacle]]
 shape = "plane"
 point = [0, 0, 0]
@@ -41,13 +51,16 @@ def result(tmp_path) -> Path:
 
 
 def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
-    """Without surface: twice the ball as lattice, and an embedding that halves it."""
+    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     rows = len(ball.vertices)
-    halve = csr_array(np.eye(rows) / 2)
-    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}) as file:
+    factor = 1 if surface else 2
+    embedding = csr_array(np.eye(rows) / factor)
+    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, overwrite=True) as file:
         file.write("surface/triangles", np.array(ball.faces))
-        for name, part in (("weights", halve.data), ("indices", halve.indices), ("indptr", halve.indptr)):
+        file.write("surface/points", ball.vertices + [0, 0, HEIGHTS[0]])
+        file.write("lattice/nodes", factor * (ball.vertices + [0, 0, HEIGHTS[0]]))
+        for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
         file.start_frames(len(HEIGHTS), rows, rows if surface else None)
         for index, height in enumerate(HEIGHTS):
@@ -55,7 +68,8 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
             energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)
             numbers = dict(step_error=0.0, iterations=1, ksp_its=1, momentum=np.zeros(3), wall_time=0.0)
             drawn = points if surface else None
-            file.append(Frame(index=index, time=index / 10, position=2 * points, surface=drawn, **energies, **numbers))
+            place = dict(time=index / 10, position=factor * points, surface=drawn)
+            file.append(Frame(index=index, **place, **energies, **numbers))
     return path
 
 
@@ -75,22 +89,185 @@ def test_surface_that_was_not_stored_is_computed(result, tmp_path):
         assert render.surface_points(file, 4) == pytest.approx(render.surface_points(stored, 4), abs=1e-7)
 
 
+@pytest.fixture
+def panels(tmp_path, monkeypatch):
+    """panels(scene tables, options) of a sheet that is not drawn."""
+
+    def sheet(tables: str, **options) -> list[render.Panel]:
+        drawn = []
+        monkeypatch.setattr(render, "draw", lambda panels, *_: drawn.extend(panels))
+        path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + tables)
+        render.contact_sheet(path, tmp_path / "x.png", **options)
+        return drawn
+
+    return sheet
+
+
+def test_moments_of_the_scene(panels):
+    tables = "picture.times = [0.72, 99.0, 0.26, 0.3]"
+    assert [p.caption for p in panels(tables)] == [
+        ("t = 0.000 s", "start"), ("t = 0.300 s", ""), ("t = 0.700 s", ""), ("t = 1.000 s", "")
+    ]  # fmt: skip
+    assert [p.caption[0] for p in panels(tables, frames=[4, 2])] == ["t = 0.400 s", "t = 0.200 s"]
+    assert [p.caption[1] for p in panels(tables, count=2)] == ["start", "end"]
+
+
+POINTS = np.random.default_rng(0).normal(size=(50, 3)) * [1, 9, 2]
+EYES = [None, (1, -2, 0.6), (-3, 0.5, -1), (0, 0, 1), (0, -1, 0), (3, 0, 4)]
+
+
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 0, 4.0)])
-def test_axes_are_right_handed_with_gravity_down(gravity):
-    points = np.random.default_rng(0).normal(size=(50, 3)) * [1, 9, 2]
-    axes = render.camera_axes(points, {"gravity": {"acceleration": gravity}})
+@pytest.mark.parametrize("eye", EYES)
+def test_camera_stands_upright_and_at_the_eye(gravity, eye):
+    camera = place_camera(POINTS, gravity, eye)
+    axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
+    assert np.cross(camera.right, camera.upward) == pytest.approx(camera.to_eye)  # the picture is no mirror image
+    assert camera.upward @ camera.up > -1e-9
+    if eye is not None:
+        assert camera.to_eye @ eye == pytest.approx(np.linalg.norm(eye))
 
 
-def test_the_longer_side_lies_across(result):
-    points = np.random.default_rng(0).normal(size=(50, 3)) * [1, 9, 2]
-    assert abs(render.camera_axes(points, {})[0] @ [0, 1, 0]) == pytest.approx(np.cos(render.YAW))
+def test_the_longer_side_lies_across():
+    assert abs(place_camera(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
+    assert abs(place_camera(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
+
+
+def test_the_eye_chooses_the_side(tmp_path):
+    """Each side of the ball is held once: dark pixels are seen from there only."""
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
+    dark = []
+    for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
+        picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
+        ball = picture[: -render.CAPTION].astype(int)
+        dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
+    assert dark[0] > 0.5 and dark[1] < 0.1
+
+
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+LED = """
+[[anchor]]
+region = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }
+path = [{ time = 1.0, by = [0, 0, 1] }]
+stop = 0.5
+[[pin]]
+region.painted = [0, 1]
+"""
+
+
+def test_held_parts(panels):
+    east, led = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
+    assert ((east.held == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.held.mean() < 0.5
+    assert ((led[0].held == 1) == (led[0].points[:, 2] <= 0.48)).all()
+    assert (led[1].held == led[0].held).all()
+    assert not led[2].held.any()
+
+
+FORCE = """
+[[force]]
+region = { box = [[0, -1, 0.5], [1, 1, 1]] }
+total = [0, 0, -7.0]
+start = 0.2
+stop = 0.8
+[[force]]
+region.painted = [0, 1]
+total = [1, 0, 0]
+"""
+
+
+def test_an_arrow_for_each_force_while_it_acts(panels):
+    before, first, last, after = panels(FORCE, frames=[1, 2, 7, 8])
+    assert before.marks.arrows == after.marks.arrows == []
+    pulled = (first.points[:, 0] >= 0) & (first.points[:, 2] >= HEIGHTS[2])
+    for panel in (first, last):
+        ((tail, tip),) = panel.marks.arrows
+        assert tail == pytest.approx(panel.points[pulled].mean(axis=0), abs=1e-6)
+        assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
+
+
+def test_an_arrow_is_seen_in_front_of_the_body(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + FORCE)
+    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[2, 8]))).astype(int)
+    red = [(panel[..., 0] - panel[..., 2] > 90).sum() for panel in np.split(picture, 2, axis=1)]
+    assert red[0] > 500 and red[1] == 0
+
+
+PLATE = """
+[[obstacle]]
+shape = "box"
+box = [[-0.125, -0.1, 0.62], [0.125, 0.1, 0.64]]
+path = [{ time = 0.2, by = [0, 0, -0.2] }, { time = 0.6, by = [0.2, 0, -0.2] }]
+stop = 0.8
+"""
+
+
+@pytest.mark.parametrize(
+    "time, by", [(0, (0, 0, 0)), (0.1, (0, 0, -0.1)), (0.2, (0, 0, -0.2)), (0.3, (0.05, 0, -0.2)), (9, (0.2, 0, -0.2))]
+)
+def test_a_path_leads_in_straight_lines(time, by):
+    path = SceneFile.model_validate(tomllib.loads(BARE + PLATE)).obstacle[0].path
+    assert marks.displacement(path, time) == pytest.approx(by)
+    assert marks.displacement((), time) == pytest.approx([0, 0, 0])
+
+
+def test_obstacles_stand_where_they_are_at_the_time(panels):
+    rest = np.array([(x, y, z) for x in (-0.125, 0.125) for y in (-0.1, 0.1) for z in (0.62, 0.64)])
+    start, between, gone = panels(PLATE, frames=[0, 1, 8])
+    assert start.marks.glass == [pytest.approx(rest)] and between.marks.glass == [pytest.approx(rest - [0, 0, 0.1])]
+    assert gone.marks.glass == []
+
+
+def plane(height: float, normal: str) -> str:
+    return f'[[obstacle]]\nshape = "plane"\npoint = [0, 0, {height}]\nnormal = {normal}\n'
+
+
+def test_what_would_hide_the_body_is_glass(panels):
+    above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].marks
+    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
+    assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
+    ground = plane(0.4, "[0, 0, 1]")
+    below = panels(ground, frames=[0])[0].marks
+    assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
+    assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []
+    assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].marks.corners) == 0  # over half a ball away
+
+
+def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
+    box = '[[obstacle]]\nshape = "box"\nbox = [[-50, -50, {}], [50, 50, {}]]\n'
+    (glass,) = panels(box.format(-50, 0.39), frames=[0])[0].marks.glass
+    assert np.ptp(glass, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
+    assert glass[:, 2].max() == 0.39 and glass[:, 2].min() == pytest.approx(0.4 - 0.15 * 0.2)
+    assert panels(box.format(1.0, 1.01), frames=[0])[0].marks.glass == []
+
+
+def test_glass_is_seen_at_its_place_and_through(tmp_path):
+    level = "picture.eye = [0, -1, 0]"
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + level + PLATE)
+    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -render.CAPTION]
+    panels = np.split(picture, 3, axis=1)
+    across = np.flatnonzero(is_body(panels[2]).any(axis=0))
+    left, ball = across[0] - 2, slice(across[0], across[-1] + 1)
+    _, through, alone = [is_body(panel[:, ball]).sum() for panel in panels]
+    assert through == pytest.approx(alone, rel=0.03)  # at 0.1 s the plate stands before a thirteenth of the ball
+    above, before, gone = [np.flatnonzero((panel[:, :left] < 250).any(axis=(1, 2))) for panel in panels]
+    metre = np.ptp(body_rows(panels[2])) / 0.2
+    assert before[0] - above[0] == pytest.approx(0.1 * metre, abs=3)
+    assert np.ptp(before) == pytest.approx(0.02 * metre, abs=3)
+    assert len(gone) == 0
+
+
+def is_body(picture: np.ndarray) -> np.ndarray:
+    """Which pixels show the body: only it is clearly blue."""
+    return picture[..., 2].astype(int) - picture[..., 0] > 25
 
 
 def body_rows(picture: np.ndarray) -> tuple[int, int]:
-    """First and last row of pixels that show the body: only it is clearly blue."""
-    blue = picture[..., 2].astype(int) - picture[..., 0] > 25
+    """First and last row of pixels that show the body; it must not reach the picture's edges."""
+    blue = is_body(picture)
     assert not blue[:, 0].any() and not blue[:, -1].any() and not blue[0].any() and not blue[-1].any()
     rows = np.flatnonzero(blue.any(axis=1))
     return rows[0], rows[-1]
@@ -113,7 +290,7 @@ def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
 
 
 def test_no_ground_where_the_scene_has_none(tmp_path):
-    path = write_ball(tmp_path / "x.h5", surface=True, scene="")
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE)
     picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[3])))
     assert not (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any()
 
@@ -121,7 +298,7 @@ def test_no_ground_where_the_scene_has_none(tmp_path):
 def test_command_draws_beside_the_result(result, capsys):
     parser = argparse.ArgumentParser()
     command.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["render", str(result), "--frames", "2,0,4"])
+    args = parser.parse_args(["render", str(result), "--frames", "2,0,4", "--eye=-1,2,0"])
     assert args.run(args) == 0
     assert capsys.readouterr().out.strip() == str(result.with_suffix(".png"))
     assert Image.open(result.with_suffix(".png")).size[0] % 3 == 0
@@ -133,6 +310,9 @@ def test_command_draws_beside_the_result(result, capsys):
         (["--frames", "0,11"], "has frames 0 to 10, not 11"),
         (["--frames", "first"], "--frames takes numbers"),
         (["--count", "0"], "--count must be at least 1"),
+        (["--eye", "1,2"], "--eye takes three numbers"),
+        (["--eye", "0,0,0"], "--eye takes three numbers"),
+        (["--eye", "north"], "--eye takes numbers"),
         (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
     ],
 )

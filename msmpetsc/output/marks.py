@@ -10,7 +10,7 @@ import numpy as np
 
 from msmpetsc.model.loads import inside
 from msmpetsc.output.camera import Camera, unit
-from msmpetsc.scene import Keyframe, Obstacle, Region, SceneFile
+from msmpetsc.scene import Keyframe, Region, SceneFile
 
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
@@ -69,12 +69,14 @@ def obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera)
         by = displacement(obstacle.path, time)
         if obstacle.shape == "box":
             glass += _box(np.array(obstacle.box) + by, bodies)
-        elif _is_near(obstacle, by, bodies):
-            ground = _patch(np.array(obstacle.point) + by, np.array(obstacle.normal), bodies, camera)
-            if ground.normal @ camera.to_eye > 0 and ground.normal @ camera.up > -1e-6:
-                grounds.append(ground)
-            else:
-                glass.append(_plate(ground, THICKNESS * _reach(bodies)))
+            continue
+        point, normal = np.array(obstacle.point) + by, np.array(obstacle.normal)
+        if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
+            continue
+        if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:
+            grounds.append(_patch(point, normal, bodies, np.array([camera.right, camera.away])))
+        else:
+            glass.append(_plate(_patch(point, normal, bodies, np.eye(3)), THICKNESS * _reach(bodies)))
     return grounds, glass
 
 
@@ -82,18 +84,14 @@ def _reach(bodies: np.ndarray) -> float:
     return np.ptp(bodies, axis=0).max()
 
 
-def _is_near(plane: Obstacle, by: np.ndarray, bodies: np.ndarray) -> bool:
-    return ((bodies - plane.point - by) @ plane.normal).min() < NEAR * _reach(bodies)
-
-
-def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> Ground:
-    """The rectangle of a plane that the bodies stand before, with a margin; its sides lie as the picture's do."""
-    across = min(camera.right, camera.away, key=lambda axis: abs(axis @ normal))
+def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, axes: np.ndarray) -> Ground:
+    """The rectangle of a plane that the bodies stand before, with a margin; one side as one of the axes if it can."""
+    across = min(axes, key=lambda axis: abs(axis @ normal))
     one = unit(across - (across @ normal) * normal)
-    two = np.cross(normal, one)
-    margin = MARGIN * _reach(bodies)
-    (low1, high1), (low2, high2) = [((bodies @ axis).min() - margin, (bodies @ axis).max() + margin) for axis in (one, two)]
-    corners = np.array([(low1, low2), (high1, low2), (high1, high2), (low1, high2)]) @ [one, two]
+    sides = np.array([one, np.cross(normal, one)])
+    reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
+    (left, low), (right, high) = reached.min(axis=0) - margin, reached.max(axis=0) + margin
+    corners = np.array([(left, low), (right, low), (right, high), (left, high)]) @ sides
     return Ground(corners + (point @ normal) * normal, normal)
 
 

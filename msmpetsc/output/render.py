@@ -27,9 +27,9 @@ from msmpetsc.scene import SceneFile
 
 BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
-GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.3
+GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.22
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
-CAPTION = 76  # [px]
+CAPTION = 94  # [px]
 MARGIN = 0.08  # of the greatest extent, around the bodies
 COUNT = 5  # moments, where nothing is said
 
@@ -190,10 +190,10 @@ def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]
     """Lower left and upper right (2,), (2,) [m] of what every panel shows, in the picture's plane."""
     bodies = np.concatenate([panel.points for panel in panels])
     margin = MARGIN * np.ptp(bodies, axis=0).max()
-    inner = [camera.flat(points) for panel in panels for points in (panel.points, *panel.marks.glass, *panel.marks.arrows)]
-    inner = np.concatenate(inner)
-    ground = [camera.flat(ground.corners) for panel in panels for ground in panel.marks.grounds]
-    rows = np.concatenate([inner - margin, inner + margin, *ground])
+    marks = [panel.marks for panel in panels]
+    inner = camera.flat(np.concatenate([bodies, *(points for mark in marks for points in (*mark.glass, *mark.arrows))]))
+    grounds = [camera.flat(ground.corners) for mark in marks for ground in mark.grounds]
+    rows = np.concatenate([inner - margin, inner + margin, *grounds])
     return rows.min(axis=0), rows.max(axis=0)
 
 
@@ -209,8 +209,9 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, shift:
         _draw_glass(plotter, corners + shift)
     for tail, tip in panel.marks.arrows:  # without perspective, nearer to the eye is the same place of the picture
         shape = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045, tip_resolution=40, shaft_resolution=40)
-        arrow = pv.Arrow(tail + shift + front, tip - tail, scale=float(np.linalg.norm(tip - tail)), **shape)
-        plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.6, diffuse=0.5)
+        length = float(np.linalg.norm(tip - tail))
+        arrow = pv.Arrow(start=tail + shift + front, direction=tip - tail, scale=length, **shape)
+        plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray, shift) -> None:
@@ -238,7 +239,7 @@ def _rgb(colour: str) -> np.ndarray:
 
 def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float) -> None:
     """Time and reason below a panel whose middle is `middle` [px]."""
-    for text, size, height in zip(caption, (15, 11), (CAPTION - 34, CAPTION - 60)):
+    for text, size, height in zip(caption, (15, 11), (42, 16), strict=True):
         if text:
             actor = plotter.add_text(text, position=(middle, height), font_size=size, color=INK)
             actor.prop.justification_horizontal = "center"

@@ -3,14 +3,15 @@
 Geometry only, in the scene's axes [m]; it comes from the scene and the lattice of a result, nothing is drawn here.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from msmpetsc.model.loads import inside
+from msmpetsc.model.motion import Path
+from msmpetsc.model.region import inside
 from msmpetsc.output.camera import Camera, unit
-from msmpetsc.scene import Keyframe, Region, SceneFile
+from msmpetsc.scene import Region, SceneFile
 
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
@@ -46,11 +47,29 @@ class Marks:
         return np.concatenate([np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass])
 
 
-def displacement(path: Sequence[Keyframe], time: float) -> np.ndarray:
-    """(3,) [m]: none at time 0, in straight lines through the path's places, staying at the last."""
-    times = [0.0, *(key.time for key in path)]
-    places = np.array([(0.0, 0.0, 0.0), *(key.by for key in path)])
-    return np.array([np.interp(time, times, coordinate) for coordinate in places.T])
+@dataclass(frozen=True)
+class Rest:
+    """The body at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m]."""
+
+    nodes: np.ndarray
+    cells: np.ndarray
+    points: np.ndarray
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) corners of the surface's bounding box [m]."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+
+    def find(self, region: Region) -> np.ndarray:
+        """Which nodes (n,) bool a region means; none if it is painted in a file, which the result does not hold."""
+        if region.painted is None:
+            return inside(region, self.nodes, self.bounds)
+        where = np.zeros(len(self.nodes), bool)
+        if not isinstance(region.painted, str):
+            middles = KDTree(self.nodes[self.cells].mean(axis=1))
+            cells = middles.query(self.points[list(region.painted)], p=np.inf)[1]  # cubes: the nearest is around it
+            where[self.cells[cells]] = True
+        return where
 
 
 def acts_at(time: float, start: float, stop: float | None) -> bool:
@@ -66,7 +85,7 @@ def obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera)
     for obstacle in scene.obstacle:
         if not acts_at(time, obstacle.start, obstacle.stop):
             continue
-        by = displacement(obstacle.path, time)
+        by = Path.through(obstacle.path).at(time)
         if obstacle.shape == "box":
             glass += _box(np.array(obstacle.box) + by, bodies)
             continue
@@ -114,30 +133,22 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     return [np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])]
 
 
-def arrows(
-    scene: SceneFile, time: float, nodes: np.ndarray, position: np.ndarray, bounds: np.ndarray
-) -> list[np.ndarray]:
+def arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
     """(2, 3) each, tail and tip, of the forces that act: from the middle of the nodes pulled, all of one length.
 
-    nodes, position : (n, 3) at rest and at that time; bounds : (2, 3) the body's bounding box at rest
+    position : (n, 3) of the nodes at that time [m]
     """
-    length = ARROW * np.ptp(bounds, axis=0).max()
+    length = ARROW * np.ptp(rest.bounds, axis=0).max()
     found = []
     for force in scene.force:
-        where = _chosen(force.region, nodes, bounds)
-        if acts_at(time, force.start, force.stop) and any(force.total) and where.any():
+        if acts_at(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
             tail = position[where].mean(axis=0)
             found.append(np.array([tail, tail + length * unit(force.total)]))
     return found
 
 
-def held(scene: SceneFile, time: float, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def held(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
     """Which nodes (n,) bool are pinned or led at a time."""
     regions = [pin.region for pin in scene.pin]
     regions += [anchor.region for anchor in scene.anchor if acts_at(time, 0.0, anchor.stop)]
-    return np.any([np.zeros(len(nodes), bool), *(_chosen(region, nodes, bounds) for region in regions)], axis=0)
-
-
-def _chosen(region: Region, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Which nodes (n,) bool a region means. Painted ones are not found yet: no arrow, no tint."""
-    return np.zeros(len(nodes), bool) if region.painted is not None else inside(region, nodes, bounds)
+    return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, regions)], axis=0)

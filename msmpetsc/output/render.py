@@ -22,7 +22,7 @@ from vtkmodules.vtkRenderingCore import vtkRenderWindow
 from msmpetsc.errors import InputError
 from msmpetsc.output.camera import Camera, place_camera
 from msmpetsc.output.frames import finished, open_result
-from msmpetsc.output.marks import Ground, Marks, arrows, held, obstacles
+from msmpetsc.output.marks import Ground, Marks, Rest, arrows, held, obstacles
 from msmpetsc.scene import SceneFile
 
 BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
@@ -146,12 +146,11 @@ def _panel(
     file: h5py.File, scene: SceneFile, camera: Camera, bodies: np.ndarray, points: np.ndarray, index: int, why: str
 ) -> Panel:
     """The moment of a frame whose surface points (v, 3) are given; bodies (n, 3): those of all panels."""
-    time, nodes, position = file["frames/time"][index], file["lattice/nodes"][...], file["frames/position"][index]
-    rest = file["surface/points"][...]
-    bounds = np.array([rest.min(axis=0), rest.max(axis=0)])
+    rest = Rest(*(file[name][...] for name in ("lattice/nodes", "lattice/cells", "surface/points")))
+    time = file["frames/time"][index]
     grounds, glass = obstacles(scene, time, bodies, camera)
-    marks = Marks(grounds, glass, arrows(scene, time, nodes, position, bounds))
-    share = np.clip(_embedding(file) @ held(scene, time, nodes, bounds).astype(float), 0, 1)
+    marks = Marks(grounds, glass, arrows(scene, time, rest, file["frames/position"][index]))
+    share = np.clip(_embedding(file) @ held(scene, time, rest).astype(float), 0, 1)
     return Panel(points, share, marks, (f"t = {time:.3f} s", why))
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -231,6 +232,7 @@ def test_what_would_hide_the_body_is_glass(panels):
     above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].marks
     assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
     assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
+    assert panels(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []  # nothing lies on it
     ground = plane(0.4, "[0, 0, 1]")
     below = panels(ground, frames=[0])[0].marks
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
@@ -324,6 +326,15 @@ def test_what_cannot_be_drawn_is_told(result, options, told):
     args = parser.parse_args(["render", str(result), *options])
     with pytest.raises(InputError, match=told):
         args.run(args)
+
+
+def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True)
+    for key, told in ("embedding", "no surface to draw"), ("scene", "another version"):
+        with h5py.File(path, "r+") as file:
+            del (file.attrs if key == "scene" else file)[key]
+        with pytest.raises(InputError, match=told):
+            render.contact_sheet(path, tmp_path / "x.png")
 
 
 def test_without_opengl_one_line_names_the_package(result, tmp_path):

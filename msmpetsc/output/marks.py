@@ -16,7 +16,7 @@ from msmpetsc.scene import Region, SceneFile
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
 CUT = 1.3  # a longer box is cut to this, of the bodies' extent
-MARGIN = 0.08  # by which a plane is drawn larger than the bodies, of their longest extent
+MARGIN = 0.08  # around the bodies, of their longest extent: so much larger a plane is drawn
 THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
 
 
@@ -76,11 +76,19 @@ def acts_at(time: float, start: float, stop: float | None) -> bool:
     return start <= time and (stop is None or time < stop)
 
 
-def obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
-    """Grounds, and corners (8, 3) of what is drawn as glass, as they stand at a time.
+def marks_at(
+    scene: SceneFile, time: float, rest: Rest, position: np.ndarray, bodies: np.ndarray, camera: Camera
+) -> Marks:
+    """What stands beside the body at a time [s].
 
-    bodies : (n, 3) surface points of all panels, which say how much of an obstacle is worth showing
+    position : (n, 3) of the nodes at that time [m]
+    bodies   : (b, 3) surface points of all panels [m], which say how much of an obstacle is worth showing
     """
+    grounds, glass = _obstacles(scene, time, bodies, camera)
+    return Marks(grounds, glass, _arrows(scene, time, rest, position))
+
+
+def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
     grounds, glass = [], []
     for obstacle in scene.obstacle:
         if not acts_at(time, obstacle.start, obstacle.stop):
@@ -133,11 +141,7 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     return [np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])]
 
 
-def arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
-    """(2, 3) each, tail and tip, of the forces that act: from the middle of the nodes pulled, all of one length.
-
-    position : (n, 3) of the nodes at that time [m]
-    """
+def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
     length = ARROW * np.ptp(rest.bounds, axis=0).max()
     found = []
     for force in scene.force:

@@ -15,14 +15,13 @@ import h5py
 import numpy as np
 import pyvista as pv
 from PIL import Image
-from pydantic import ValidationError
 from scipy.sparse import csr_array
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
 from msmpetsc.output.camera import Camera, place_camera
 from msmpetsc.output.frames import finished, open_result
-from msmpetsc.output.marks import Ground, Marks, Rest, arrows, held, obstacles
+from msmpetsc.output.marks import MARGIN, Ground, Marks, Rest, held, marks_at
 from msmpetsc.scene import SceneFile
 
 BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
@@ -30,7 +29,6 @@ GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
 GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.22
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
 CAPTION = 94  # [px]
-MARGIN = 0.08  # of the greatest extent, around the bodies
 COUNT = 5  # moments, where nothing is said
 
 
@@ -65,9 +63,13 @@ def contact_sheet(
         everywhere = np.concatenate(list(bodies.values()))
         gravity = scene.gravity and scene.gravity.acceleration
         camera = place_camera(everywhere, gravity, scene.picture.eye if eye is None else eye)
-        panels = [
-            _panel(file, scene, camera, everywhere, points, index, moments[index]) for index, points in bodies.items()
-        ]
+        rest = Rest(*(file[name][...] for name in ("lattice/nodes", "lattice/cells", "surface/points")))
+        panels = []
+        for index, points in bodies.items():
+            time = file["frames/time"][index]
+            marks = marks_at(scene, time, rest, file["frames/position"][index], everywhere, camera)
+            caption = f"t = {time:.3f} s", moments[index]
+            panels.append(Panel(points, _on_surface(file, held(scene, time, rest)), marks, caption))
         triangles = file["surface/triangles"][...]
     draw(panels, triangles, camera, Path(png_path))
     return Path(png_path)
@@ -76,8 +78,8 @@ def contact_sheet(
 def read_scene(file: h5py.File) -> SceneFile:
     """The scene of a result, as run."""
     try:
-        return SceneFile.model_validate(tomllib.loads(file.attrs["scene"]))
-    except ValidationError as error:
+        return SceneFile.model_validate(tomllib.loads(file.attrs.get("scene", "")))
+    except ValueError as error:  # pydantic's and tomllib's
         raise InputError(f"{file.filename} was run by another version, with a scene unknown to this one") from error
 
 
@@ -101,7 +103,8 @@ def _moments(file: h5py.File, scene: SceneFile, frames: Sequence[int] | None, co
 def moments_at(file: h5py.File, times: Sequence[float]) -> dict[int, str]:
     """The start, and the finished frames nearest to these times [s], in order of time."""
     time = file["frames/time"][: finished(file)]
-    return {0: "start"} | {int(np.argmin(abs(time - wanted))): "" for wanted in sorted(times)} | {0: "start"}
+    nearest = {0, *(int(np.argmin(abs(time - wanted))) for wanted in times)}
+    return {index: "" if index else "start" for index in sorted(nearest)}
 
 
 def choose_moments(file: h5py.File, count: int) -> dict[int, str]:
@@ -142,16 +145,11 @@ def _embedding(file: h5py.File) -> csr_array:
     return csr_array(parts, shape=(len(parts[2]) - 1, nodes))
 
 
-def _panel(
-    file: h5py.File, scene: SceneFile, camera: Camera, bodies: np.ndarray, points: np.ndarray, index: int, why: str
-) -> Panel:
-    """The moment of a frame whose surface points (v, 3) are given; bodies (n, 3): those of all panels."""
-    rest = Rest(*(file[name][...] for name in ("lattice/nodes", "lattice/cells", "surface/points")))
-    time = file["frames/time"][index]
-    grounds, glass = obstacles(scene, time, bodies, camera)
-    marks = Marks(grounds, glass, arrows(scene, time, rest, file["frames/position"][index]))
-    share = np.clip(_embedding(file) @ held(scene, time, rest).astype(float), 0, 1)
-    return Panel(points, share, marks, (f"t = {time:.3f} s", why))
+def _on_surface(file: h5py.File, nodes: np.ndarray) -> np.ndarray:
+    """How far each surface point follows these nodes (n,) bool: (v,) in [0, 1]."""
+    if not nodes.any():
+        return np.zeros(len(file["surface/points"]))
+    return np.clip(_embedding(file) @ nodes.astype(float), 0, 1)
 
 
 def draw(panels: list[Panel], triangles: np.ndarray, camera: Camera, path: Path) -> None:
@@ -163,7 +161,7 @@ def draw(panels: list[Panel], triangles: np.ndarray, camera: Camera, path: Path)
         plotter = pv.Plotter(off_screen=True, window_size=(width * len(panels), height + CAPTION), lighting="none")
         plotter.set_background("white")
         shown = np.concatenate([points for panel in panels for points in (panel.points, panel.marks.corners)])
-        depth = np.ptp(shown @ camera.to_eye)
+        depth = np.linalg.norm(np.ptp(shown, axis=0))  # nothing reaches farther towards the eye
         for number, panel in enumerate(panels):
             _draw_panel(plotter, panel, triangles, number * width / scale * camera.right, 2 * depth * camera.to_eye)
             _write_caption(plotter, panel.caption, (number + 0.5) * width)

@@ -119,7 +119,8 @@ def test_free_flight_keeps_momentum_and_loses_angular_momentum_as_implicit_euler
 
 
 @pytest.mark.parametrize("error", [1e-2, 1e-10])
-def test_a_shaken_body_keeps_its_momentum_whatever_the_error_of_the_steps(error: float):
+def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(error: float):
     """Every cell gives each of its corners the same mass and the same diagonal entry of L: Jacobi's preconditioner
-    is a multiple of M, and CG then leaves no net force however early it stops."""
+    is a multiple of M, and CG then brings in no net force however early it stops. (A start from q_n does, but this
+    one is not taken here.)"""
     assert STUDY["free_flight"](1 / 100, STUDY["SHAKE"], error=error)[0] < 1e-12

@@ -22,7 +22,7 @@ def frame(index: int, nodes: slice = slice(None), points: slice | None = slice(N
     """Frame `index` of a body of NODES nodes and POINTS surface points, the rows of one rank."""
     surface = None if points is None else -positions(index, POINTS)[points]
     numbers = dict(step_error=index / 7, iterations=index + 1, ksp_its=index + 2, wall_time=index / 3)
-    energies = dict(kinetic=index + 0.1, elastic=index + 0.2, potential=index + 0.3)
+    energies = dict(kinetic=index + 0.1, elastic=index + 0.2, potential=index + 0.3, contact=index + 0.4)
     momentum = np.array([index, 1.0, 2.0])
     position = positions(index, NODES)[nodes]
     arrays = dict(position=position, surface=surface, momentum=momentum)

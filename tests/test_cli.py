@@ -247,7 +247,7 @@ BAD = {  # what is wrong: arguments after the scene, and what the one line must 
     "key unknown": (sets("mehs.size=1"), ["mehs", "'mesh'"]),
     "density negative": (sets("material.density=-1"), ["material.density", "> 0"]),
     "pin without a node": (sets("pin.0.region.box=[[5, 5, 5], [6, 6, 6]]"), ["pin.0.region", "no node"]),
-    "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "pinned"]),
+    "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "held"]),
     "disk too small": (sets("time.duration=9e6"), ["GB"]),
     "two scenes": (["another.toml"], ["unknown argument another.toml"]),
 }

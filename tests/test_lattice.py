@@ -12,7 +12,7 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import Grid
-from msmpetsc.model.energy import elastic_energy
+from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import CORNERS, Lattice, build_lattice
 from msmpetsc.model.material import EDGE, FACE_DIAGONAL, SPACE_DIAGONAL, calibrated_stiffness
 
@@ -98,7 +98,7 @@ def test_a_strained_block_stores_the_energy_of_an_isotropic_solid(name: str, rot
     lattice = build_lattice(cages_of(block(4, 3, 2)), DENSITY, young_modulus=E)
     size = 1e-7
     q = lattice.nodes @ (np.eye(3) + size * rotation @ strain @ rotation.T)
-    energy = elastic_energy(q, *lattice.elastic)
+    energy = Elasticity(MPI.COMM_SELF, lattice).energy(q)
     assert energy == pytest.approx(0.5 * twice_density * E * size**2 * 24 * H**3, rel=1e-5)
 
 

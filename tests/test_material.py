@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
-from msmpetsc.model.energy import add_elastic_gradient, add_elastic_hessian
+from msmpetsc.model.elasticity import Elasticity
 
 STUDY = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "material_study"))
 ACROSS, slope = STUDY["ACROSS"], STUDY["slope"]
@@ -23,7 +24,7 @@ def test_the_matrix_is_the_products_own_hessian_at_rest():
     lattice = STUDY["box"]((4, 3, 2), 0.1)
     v = np.random.default_rng(0).standard_normal(lattice.nodes.shape)
     product = np.zeros_like(v)
-    add_elastic_hessian(lattice.nodes, *lattice.elastic, False, v, product)
+    Elasticity(MPI.COMM_SELF, lattice).add_hessian(lattice.nodes, False, v, product)
     np.testing.assert_allclose((STUDY["hessian"](lattice) @ v.ravel()).reshape(-1, 3), product, atol=1e-9)
 
 
@@ -41,7 +42,8 @@ def test_uniform_strain_leaves_inner_nodes_without_force(name: str):
     """By the product's gradient, at a strain of 10%: each spring is balanced by the one across."""
     lattice = STUDY["box"]((5, 4, 4), 0.1)
     force = np.zeros_like(lattice.nodes)
-    add_elastic_gradient(lattice.nodes @ (np.eye(3) + 0.1 * STRAINS[name][0]).T, *lattice.elastic, force)
+    stretched = lattice.nodes @ (np.eye(3) + 0.1 * STRAINS[name][0]).T
+    Elasticity(MPI.COMM_SELF, lattice).add_gradient(stretched, force)
     inner = STUDY["inner_nodes"](lattice)
     assert inner.sum() == 4 * 3 * 3
     assert np.abs(force[inner]).max() < 1e-12 * np.abs(force).max()

@@ -4,7 +4,7 @@ Each rank holds the nodes it owns, the ghost nodes that its springs reach, and e
 end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numba
 import numpy as np
@@ -19,6 +19,7 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0
 # the place in a 3 x 3 x 3 block of nodes of corner b seen from corner a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
+NO_CELLS = np.empty((0, 8), np.int64)
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class Lattice:
     stiffness   : (s,) [N/m]
     pinned      : (l,) bool, nodes that do not move
     stiffening  : of the springs' law (model.energy) [-]; 0 for Hooke's
+    local_cells : (d, 8) local corner nodes of all cells around the owned nodes, only where the law stiffens;
+                  the first ``cells_owned`` belong to this rank, as their first corner does
     """
 
     table: SortedKeys
@@ -51,6 +54,8 @@ class Lattice:
     stiffness: np.ndarray
     pinned: np.ndarray
     stiffening: float = 0.0
+    local_cells: np.ndarray = field(default_factory=lambda: NO_CELLS)
+    cells_owned: int = 0
 
     @property
     def owned(self) -> int:
@@ -60,16 +65,6 @@ class Lattice:
     def global_numbers(self) -> np.ndarray:
         """(l,) global number of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
-
-    @property
-    def elastic(self) -> tuple:
-        """What the kernels of model.energy take: ends, rest lengths, stiffness of all springs here, and their law."""
-        return self.springs, self.rest_length, self.stiffness, self.stiffening
-
-    @property
-    def elastic_owned(self) -> tuple:
-        """The same of the springs that this rank owns: their sum over the ranks has each spring once."""
-        return *(array[: self.springs_owned] for array in self.elastic[:3]), self.stiffening
 
     def pin(self, where: np.ndarray) -> "Lattice":
         """This lattice with the nodes ``where`` (l,) bool held fast."""
@@ -102,6 +97,7 @@ def build_lattice(
         k = calibrated_stiffness(young_modulus, h, kind, sharing)
     else:
         k = np.full(len(springs), float(stiffness))
+    first_owned = local_cells[:, 0] < len(table.keys)
     return Lattice(
         table=table,
         cell_size=h,
@@ -116,6 +112,8 @@ def build_lattice(
         stiffness=k,
         pinned=np.zeros(len(ijk), bool),
         stiffening=stiffening,
+        local_cells=local_cells[np.argsort(~first_owned, kind="stable")] if stiffening else NO_CELLS,
+        cells_owned=int(first_owned.sum()) if stiffening else 0,
     )
 
 

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.model.energy import add_elastic_hessian
+from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.penalty import Contact
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -71,13 +71,14 @@ class ThreeColumns:
 class TrueHessian:
     """M + t^2 (Hessian of E) at the positions last linearised about, applied spring by spring.
 
-    ``projected`` leaves out the negative curvature of compressed springs (model.energy).
+    ``projected`` leaves out its negative parts, as of compressed springs (model.energy).
     """
 
-    def __init__(self, unknowns: Unknowns, time_step: float, contact: ContactBlocks | None = None):
-        self.unknowns, self.t2, self.contact = unknowns, time_step**2, contact
+    def __init__(
+        self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, contact: ContactBlocks | None = None
+    ):
+        self.unknowns, self.elasticity, self.t2, self.contact = unknowns, elasticity, time_step**2, contact
         lattice = unknowns.lattice
-        self.elastic = lattice.elastic
         self.q = np.empty_like(lattice.nodes)
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
@@ -86,7 +87,7 @@ class TrueHessian:
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
-        add_elastic_hessian(self.q, *self.elastic, self.projected, self.v, self.product)
+        self.elasticity.add_hessian(self.q, self.projected, self.v, self.product)
         lattice, free = self.unknowns.lattice, self.unknowns.free
         scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
         if self.contact:

@@ -10,7 +10,6 @@ from mpi4py import MPI
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
-from msmpetsc.model.energy import elastic_energy
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.penalty import Contact
 from msmpetsc.scene import Scene
@@ -130,7 +129,7 @@ class Simulation:
             np.array(
                 [
                     0.5 * lattice.mass @ (velocity**2).sum(axis=1),
-                    elastic_energy(result.position, *lattice.elastic_owned),
+                    self.stepper.elasticity.energy(result.position),
                     -(self._load(time) * position).sum(),
                     contact.energy(position) if contact else 0.0,
                     *(lattice.mass @ velocity),

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.energy import add_elastic_gradient, elastic_change
+from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
 from msmpetsc.solve.operators import (
@@ -27,7 +27,7 @@ from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
-FULL_STEP_ERROR = 1e-6  # below it g, quadratic in the error, has nothing left to tell
+FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -66,6 +66,7 @@ class Stepper:
         touches: bool = False,
     ):
         self.comm, self.lattice, self.preset = comm, lattice, preset
+        self.elasticity = Elasticity(comm, lattice)
         self.t2 = time_step**2
         published = preset.iterations if error is None else None
         self.budget = max_iterations or published
@@ -95,7 +96,7 @@ class Stepper:
         self.diagonal = self.scalar.array_r.copy()
         self.added = np.zeros(self.unknowns.size)  # to the preconditioner's diagonal
         if self.preset.true_hessian:
-            context = self.hessian = TrueHessian(self.unknowns, time_step, self.contact_blocks)
+            context = self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self.contact_blocks)
         else:
             context, self.hessian = ThreeColumns(self.matrix, self.contact_blocks), None
         self.operator = self._keep(python_matrix(self.unknowns, context, self.comm))
@@ -153,6 +154,7 @@ class Stepper:
         self.y = 2 * q - q_previous
         self.load, self.contact = load, contact
         self.q[:] = self.base[:] = q if led is None else led  # held nodes stay there
+        self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
         self.last_error = self.residual = np.inf
         self._first_guess(q)
         iterations, ksp_its = self._solve()
@@ -185,13 +187,14 @@ class Stepper:
 
         Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
         y and the elastic corrections c = x - y of the last steps extrapolated, near in smooth motion; and
-        q_n, which after an impact is not folded over as y may be.
+        q_n, which after an impact is not folded over as y may be, moved by what the free flight moves on average
+        where nothing is held, so that a step that stops early keeps the momentum.
         """
         guesses = [self.y]
         if self.preset.extrapolate:
             flight = self.y.copy()
             flight[: self.lattice.owned] += self.t2 * self.load / self.lattice.mass[:, None]
-            guesses += [flight, q]
+            guesses += [flight, q + self._drift(flight - q)]
             if self.corrections:
                 guesses.append(self.y + 2 * self.corrections[0] - self.corrections[-1])
         values = []
@@ -200,11 +203,19 @@ class Stepper:
             values.append(self._objective(self.snes, self.x) if len(guesses) > 1 else 0.0)
         self.unknowns.from_nodes(guesses[int(np.argmin(values))], self.x)
 
+    def _drift(self, moved: np.ndarray) -> np.ndarray | float:
+        """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
+        if self.unknowns.total < self.lattice.table.total:
+            return 0.0
+        sums = np.append(self.lattice.mass @ moved[: self.lattice.owned], self.lattice.mass.sum())
+        sums = self.comm.allreduce(sums)
+        return sums[:3] / sums[3]
+
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """F(x) = M (x - y) + t^2 (grad E(x) - f_ext)."""
         self.unknowns.to_nodes(x, self.q)
         self.gradient[:] = 0
-        add_elastic_gradient(self.q, *self.lattice.elastic, self.gradient)
+        self.elasticity.add_gradient(self.q, self.gradient)
         owned = self.lattice.owned
         self.gradient[:owned] -= self.load
         if self.contact:
@@ -228,7 +239,7 @@ class Stepper:
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - self.base[owned]
         inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
-        elastic = elastic_change(self.q, self.base, *self.lattice.elastic_owned) - (moved * self.load).sum()
+        elastic = self.elasticity.change(self.q, self.base) - (moved * self.load).sum()
         if self.contact:
             elastic += self.contact.change(self.q, self.base)
         change, distance = self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()]))
@@ -276,14 +287,13 @@ class Stepper:
         away = ((self.q[free] - self.y[free]) ** 2).sum(axis=1) @ self.lattice.mass[free]
         residual, away = np.sqrt(self.comm.allreduce(np.array([f * self.inverse_mass @ f, away])))
         self.residual = residual
-        if residual <= self.rounding:
+        if residual <= self.rounding * self.reach:
             return 0.0
         return residual / away if away > 0 else np.inf  # the start x = y tells nothing yet
 
     def _rounding_of_residual(self) -> float:
-        """|F|_(M^-1) that rounding alone leaves: eps of each row's diagonal entry times a coordinate."""
-        size = self.comm.allreduce(np.abs(self.lattice.nodes).max(initial=0), MPI.MAX)
-        rows = 3 * (np.finfo(float).eps * size * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
+        """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: eps of each row's diagonal entry."""
+        rows = 3 * (np.finfo(float).eps * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
         return np.sqrt(self.comm.allreduce(rows))
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:

@@ -1,0 +1,53 @@
+"""The elastic energy of a lattice, whatever its law: what the solver sees of a material."""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.energy import add_elastic_gradient, add_elastic_hessian, elastic_change, elastic_energy
+from msmpetsc.model.inversion import add_resistance_gradient, add_resistance_hessian, resistance_energy
+from msmpetsc.model.lattice import Lattice
+
+ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
+RESISTANCE = 1 / 8  # K of a corner, of the stiffest spring's stiffness times h^2: a cell's eight make one of those
+
+
+class Elasticity:
+    """E of this rank's share of a lattice, its gradient and its Hessian: Hooke's springs (model.energy), or, where
+    the law stiffens, stiffening ones and cells that resist being turned inside out (model.inversion).
+
+    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
+    owned nodes.
+    """
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.all = lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening
+        self.own = *(array[: lattice.springs_owned] for array in self.all[:3]), lattice.stiffening
+        self.cells = self.own_cells = None
+        if lattice.stiffening > 0:
+            stiffest = comm.allreduce(lattice.stiffness.max(initial=0), MPI.MAX)
+            volume, h = ONSET * lattice.cell_size**3, lattice.cell_size
+            self.cells = lattice.local_cells, volume, RESISTANCE * stiffest * h**2
+            self.own_cells = lattice.local_cells[: lattice.cells_owned], *self.cells[1:]
+
+    def energy(self, q: np.ndarray) -> float:
+        """[J]"""
+        return elastic_energy(q, *self.own) + (resistance_energy(q, *self.own_cells) if self.cells else 0.0)
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """E(q) - E(base) [J]."""
+        change = elastic_change(q, base, *self.own)
+        if self.cells:
+            change += resistance_energy(q, *self.own_cells) - resistance_energy(base, *self.own_cells)
+        return change
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        """Add grad E [N] to ``gradient`` (l, 3)."""
+        add_elastic_gradient(q, *self.all, gradient)
+        if self.cells:
+            add_resistance_gradient(q, *self.cells, gradient)
+
+    def add_hessian(self, q: np.ndarray, projected: bool, v: np.ndarray, product: np.ndarray) -> None:
+        """Add (Hessian of E at q) v [N] to ``product`` (l, 3); ``projected`` leaves out its negative parts."""
+        add_elastic_hessian(q, *self.all, projected, v, product)
+        if self.cells:
+            add_resistance_hessian(q, *self.cells, projected, v, product)

@@ -46,7 +46,11 @@ def elastic_change(
         u, v, w = base[a, 0] - base[b, 0], base[a, 1] - base[b, 1], base[a, 2] - base[b, 2]
         length, before = np.sqrt(x * x + y * y + z * z), np.sqrt(u * u + v * v + w * w)
         total = length + before
-        longer = ((x - u) * (x + u) + (y - v) * (y + v) + (z - w) * (z + w)) / max(total, TINY)
+        # how the ends moved, from node to node: x - u would keep only the digits of x
+        dx = (q[a, 0] - base[a, 0]) - (q[b, 0] - base[b, 0])
+        dy = (q[a, 1] - base[a, 1]) - (q[b, 1] - base[b, 1])
+        dz = (q[a, 2] - base[a, 2]) - (q[b, 2] - base[b, 2])
+        longer = (dx * (x + u) + dy * (y + v) + dz * (z + w)) / max(total, TINY)
         part = 0.5 * stiffness[s] * longer * (total - 2.0 * rest_length[s])
         if stiffening > 0.0:  # s^4 / 4 changes by (s^2 + s_0^2) / 2 for each unit that s^2 / 2 does
             strain, strain_before = length / rest_length[s] - 1.0, before / rest_length[s] - 1.0

@@ -8,7 +8,7 @@ from msmpetsc.model.inversion import add_resistance_gradient, add_resistance_hes
 from msmpetsc.model.lattice import Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
-RESISTANCE = 1 / 8  # K of a corner, of the stiffest spring's stiffness times h^2: a cell's eight make one of those
+RESISTANCE = 1.0
 
 
 class Elasticity:

@@ -60,7 +60,7 @@ PRESETS = {
             **NO_STOP_BY_SIZE,
             "snes_max_linear_solve_fail": "100",
             **JACOBI_CG,
-            "ksp_rtol": "1e-3",
+            "ksp_rtol": "1e-1",
         },
         true_hessian=True,
     ),

@@ -1,0 +1,243 @@
+"""Every scene of the paper at about 1,000 cells: what its figure shows, in numbers from the result file alone.
+
+Bounds, not values: a coarse lattice is stiffer than the full one, its thin limbs thicker.
+"""
+
+import tomllib
+from functools import cache
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import run
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.registry import find
+from msmpetsc.model.inversion import least_volumes
+from msmpetsc.model.motion import Path as Motion
+from msmpetsc.model.region import inside
+from msmpetsc.scene import SceneFile
+
+SCENES = Path(__file__).parents[1] / "scenes"
+PAPER_CELLS = {"armadillo": 8338, "dragon": 11536, "lung": 6499, "heart": 3126, "bunny": 9946, "brain": 13661}
+ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
+pytestmark = pytest.mark.timeout(400)
+
+
+class Result:
+    """A finished run: its scene, and all of its arrays."""
+
+    def __init__(self, path: Path):
+        with h5py.File(path) as file:
+            self.scene = SceneFile.model_validate(tomllib.loads(file.attrs["scene"]))
+            self.time, self.q, self.kinetic = (file[f"frames/{name}"][:] for name in ("time", "position", "kinetic"))
+            self.nodes, self.mass = file["lattice/nodes"][:], file["lattice/mass"][:]
+            self.cells = file["lattice/cells"][:]
+            points = file["surface/points"][:]
+        self.h = np.ptp(self.nodes[self.cells[0]], axis=0).max()
+        self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
+        self.height = np.ptp(self.bounds, axis=0)[2]
+
+    def zone(self, low: list[float], high: list[float]) -> np.ndarray:
+        """Nodes of a box in parts of the bounding box, (n,) bool."""
+        u = (self.nodes - self.bounds[0]) / np.ptp(self.bounds, axis=0)
+        return ((u >= low) & (u <= high)).all(axis=1)
+
+    def region(self, table) -> np.ndarray:
+        """Nodes of a pin's, anchor's or force's region."""
+        return inside(table.region, self.nodes, self.bounds)
+
+    def mean(self, x: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """Mean by mass over some nodes of (..., n, 3)."""
+        return np.einsum("...nc,n->...c", x[..., where, :], self.mass[where]) / self.mass[where].sum()
+
+    def moved(self, frame: int, where: np.ndarray) -> np.ndarray:
+        """Mean displacement of some nodes from rest (3,), in heights of the body."""
+        return self.mean(self.q[frame] - self.nodes, where) / self.height
+
+    def middle_velocity(self) -> np.ndarray:
+        """(T - 1, 3) [m/s]: of the step that ends at frame 1, 2, ..."""
+        return np.diff(self.mean(self.q, np.ones(len(self.mass), bool)), axis=0) / self.time[1]
+
+    def inverted(self, frame: int) -> int:
+        """Cells with a corner turned inside out."""
+        return int((least_volumes(self.q[frame], self.cells) <= 0).sum())
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """result("heart_pull", ranks=2, "--frames", "3"): each run is made once."""
+    folder = tmp_path_factory.mktemp("scenes")
+
+    @cache
+    def run_scene(name: str, *options: str, ranks: int = 1) -> Result:
+        skip_without_mesh(name)
+        path = folder / f"{name}{len(list(folder.iterdir()))}.h5"
+        command = ("-m", "msmpetsc.cli.main", "run", SCENES / f"{name}.toml", "-o", path)
+        done = run(ranks, *command, "--set", "cages.count=1000", *options, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return Result(path)
+
+    return run_scene
+
+
+def skip_without_mesh(name: str) -> None:
+    source = tomllib.loads((SCENES / f"{name}.toml").read_text())["mesh"]["source"]
+    try:
+        found = find(source)
+    except InputError as error:
+        pytest.skip(str(error))
+    if found is None:
+        pytest.skip(f"mesh '{source}' is not here: msmpetsc fetch {source}")
+
+
+def test_every_scene_has_the_papers_cells_and_four_moments():
+    assert len(ALL) == 8
+    for name in ALL:
+        scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
+        assert scene.cages.count == PAPER_CELLS[name.split("_")[0]]
+        assert len(scene.picture.times) == 4 and scene.picture.times[-1] <= scene.time.duration
+
+
+# ---- Figure 7
+
+
+@pytest.mark.parametrize(("name", "least"), [("leg", 0.1), ("palm", 0.07), ("forehead", 0.07)])
+def test_the_dragged_armadillo_comes_to_rest_and_its_dragged_part_has_followed(result, name: str, least: float):
+    run = result(f"armadillo_{name}")
+    (force,) = run.scene.force
+    direction = np.array(force.total) / np.linalg.norm(force.total)
+    assert run.kinetic[-1] < 1e-6 * run.kinetic.max()
+    assert least < run.moved(-1, run.region(force)) @ direction < 0.4
+    held = run.region(run.scene.pin[0])
+    assert np.array_equal(run.q[-1][held], run.nodes[held])
+    assert run.inverted(-1) == 0
+
+
+def test_the_armadillos_other_leg_goes_along(result):
+    run = result("armadillo_leg")
+    assert run.moved(-1, run.zone([0, 0, 0], [0.4, 1, 0.2]))[0] > 0.05
+
+
+# ---- Figure 8
+
+
+def knee_angle(run: Result, q: np.ndarray) -> float:
+    """Between thigh and shank of the hind legs, as seen from the side [degrees]."""
+    zones = ([0, 0.3, 0.45], [1, 0.5, 0.55]), ([0, 0.3, 0.3], [1, 0.5, 0.4]), ([0, 0.1, 0.2], [1, 0.3, 0.3])
+    thigh, knee, hock = (run.mean(q, run.zone(*zone))[1:] for zone in zones)
+    up, down = thigh - knee, hock - knee
+    return np.degrees(np.arccos(up @ down / np.linalg.norm(up) / np.linalg.norm(down)))
+
+
+def test_the_dragon_is_raised_to_rest_and_pushed_to_rest_and_bends_its_knees(result):
+    run = result("dragon_raise_push")
+    turn = np.searchsorted(run.time, run.scene.force[1].start - 1e-9)  # the first frame under the force reversed
+    assert run.kinetic[turn - 1] < 1e-6 * run.kinetic[:turn].max()
+    assert run.kinetic[-1] < 1e-6 * run.kinetic[turn:].max()
+    for zone in (([0, 0.5, 0.8], [1, 0.9, 1]), ([0, 0.15, 0.8], [1, 0.5, 1])):  # head, wings
+        raised, pushed = run.moved(turn - 1, run.zone(*zone))[2], run.moved(-1, run.zone(*zone))[2]
+        assert raised > 0.004 and pushed < -0.004
+    rest, raised, pushed = (knee_angle(run, q) for q in (run.nodes, run.q[turn - 1], run.q[-1]))
+    assert pushed < rest - 0.2 and raised > rest + 0.2
+    assert run.moved(-1, run.zone([0, 0.25, 0.3], [1, 0.5, 0.45]))[2] < -0.002  # hind knees go down
+
+
+# ---- Figure 9
+
+
+def shape_error(a: np.ndarray, b: np.ndarray, mass: np.ndarray) -> float:
+    """Distance of b (n, 3) from a after the best rigid motion, rms by mass [m]."""
+    a, b = (x - mass @ x / mass.sum() for x in (a, b))
+    u, _, vt = np.linalg.svd((a * mass[:, None]).T @ b)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return np.sqrt(mass @ ((a @ turn - b) ** 2).sum(axis=1) / mass.sum())
+
+
+def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_while_its_trachea_sags(result):
+    run = result("lung_press")
+    plate = run.scene.obstacle[1]
+    low = plate.box[0][2] + np.array([Motion.through(plate.path).at(time)[2] for time in run.time])
+    there = run.time < plate.stop - 1e-9
+    assert low.min() < 0.8 * 0.21  # the lobes are 0.21 m high
+    assert run.q[:, :, 2].min() > -0.3 * run.h
+    assert (run.q[there, :, 2].max(axis=1) < low[there] + 0.3 * run.h).all()
+    body, tip = run.zone([0, 0, 0], [1, 1, 0.5]), run.zone([0, 0, 0.95], [1, 1, 1])
+    assert shape_error(run.nodes[body], run.q[-1][body], run.mass[body]) < 0.02 * run.height
+    assert run.moved(-1, body)[2] > -0.03  # its own weight
+    assert run.moved(-1, tip)[2] < -0.3
+    assert all(run.inverted(frame) == 0 for frame in range(0, len(run.q), 10))
+
+
+def press_to(share: float) -> list[str]:
+    """Options that let the plate go down to a share of the lung's height."""
+    by = f"[0, 0, {share * 0.37 - 0.38:.4f}]"
+    return ["--set", f"obstacle.1.path.0.by={by}", "--set", f"obstacle.1.path.1.by={by}"]
+
+
+def test_pressed_to_30_percent_the_linear_law_inverts_cells_for_good_and_the_stiffening_one_does_not(result):
+    """Section 6 of the paper: "its deformation effects will begin to distort"."""
+    few = ["--set", "cages.count=500", "--set", "time.duration=2.4", "--set", "solver.error=1e-2"]
+    stiffening = result("lung_press", *press_to(0.3), *few)
+    linear = result("lung_press", *press_to(0.3), *few, "--set", "material.law=linear")
+    pressed = np.searchsorted(linear.time, 1.3)
+    assert linear.inverted(pressed) > 0.05 * len(linear.cells) and linear.inverted(-1) > 0.05 * len(linear.cells)
+    assert stiffening.inverted(pressed) == stiffening.inverted(-1) == 0
+    body = stiffening.zone([0, 0, 0], [1, 1, 0.5])
+    errors = [shape_error(run.nodes[body], run.q[-1][body], run.mass[body]) for run in (linear, stiffening)]
+    assert errors[1] < 0.5 * errors[0]
+
+
+# ---- Figure 10
+
+
+def test_the_heart_follows_the_pull_and_returns(result):
+    run = result("heart_pull")
+    (anchor,) = run.scene.anchor
+    led, held = run.region(anchor), np.searchsorted(run.time, anchor.stop - 1e-9)
+    pull = np.linalg.norm(anchor.path[-1].by)
+    away = run.q[held - 1][led] - run.nodes[led]
+    np.testing.assert_allclose(away, np.broadcast_to(anchor.path[-1].by, away.shape), atol=1e-12)
+    assert np.linalg.norm(run.q[held][led] - run.q[held - 1][led], axis=1).min() > 0.1 * pull  # let go
+    assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.01 * pull
+    assert run.inverted(held - 1) == 0
+
+
+def test_on_two_ranks_the_heart_is_led_and_let_go_alike(result):
+    """Past the time when the anchored nodes become unknowns."""
+    options = ["--set", "cages.count=300", "--set", "time.step=0.08", "--frames", "12", "--error", "1e-8"]
+    one, two = result("heart_pull", *options), result("heart_pull", *options, ranks=2)
+    assert np.abs(one.q - two.q).max() < 1e-6 * one.height
+
+
+def test_on_two_ranks_the_lung_is_pressed_alike(result):
+    options = ["--set", "cages.count=300", "--set", "time.step=0.05", "--frames", "8", "--error", "1e-6"]
+    one, two = result("lung_press", *options), result("lung_press", *options, ranks=2)
+    assert one.q[-1][:, 2].max() < 0.34  # the plate has come down to this
+    assert np.abs(one.q - two.q).max() < 1e-4 * one.height
+
+
+# ---- Figure 11
+
+
+@pytest.mark.parametrize("name", ["bunny_fall", "brain_fall"])
+def test_it_falls_freely_hits_the_ground_and_leaps(result, name: str):
+    run = result(name)
+    gravity, t = np.array(run.scene.gravity.acceleration), run.scene.time.step
+    contact = int(np.argmax(run.q[:, :, 2].min(axis=1) <= 0))
+    n = np.arange(contact)[:, None, None]
+    np.testing.assert_allclose(run.q[:contact], run.nodes + gravity * t**2 * n * (n + 1) / 2, rtol=0, atol=1e-10)
+    v = run.middle_velocity()[:, 2]
+    assert v[contact - 2] == pytest.approx(gravity[2] * t * (contact - 1), rel=1e-9)
+    assert v[contact:].max() > -0.5 * v[contact - 2]  # reversed
+    assert max(run.inverted(frame) for frame in range(contact, len(run.q), 20)) == 0
+
+
+def test_the_bunnys_ears_move_on_while_its_body_has_stopped(result):
+    run = result("bunny_fall")
+    contact = int(np.argmax(run.q[:, :, 2].min(axis=1) <= 0))
+    turned = contact + int(np.argmax(run.middle_velocity()[contact:, 2] > 0))
+    ears = run.mean(run.q, run.zone([0, 0, 0.85], [1, 1, 1]))[:, 2]
+    feet = run.mean(run.q, run.zone([0, 0, 0], [1, 1, 0.1]))[:, 2]
+    assert ears[turned + 1] < ears[turned] and feet[turned + 1] > feet[turned]

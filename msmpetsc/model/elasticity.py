@@ -4,8 +4,13 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.energy import add_elastic_gradient, add_elastic_hessian, elastic_change, elastic_energy
-from msmpetsc.model.inversion import add_resistance_gradient, add_resistance_hessian, resistance_energy
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.inversion import (
+    add_resistance_gradient,
+    add_resistance_hessian,
+    least_volumes,
+    resistance_energy,
+)
+from msmpetsc.model.lattice import NO_CELLS, Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
 RESISTANCE = 1.0
@@ -46,8 +51,20 @@ class Elasticity:
         if self.cells:
             add_resistance_gradient(q, *self.cells, gradient)
 
-    def add_hessian(self, q: np.ndarray, projected: bool, v: np.ndarray, product: np.ndarray) -> None:
-        """Add (Hessian of E at q) v [N] to ``product`` (l, 3); ``projected`` leaves out its negative parts."""
+    def resisting(self, q: np.ndarray) -> np.ndarray:
+        """The cells (r, 8) that resist at q: few, so that products with the Hessian need not look at all."""
+        if not self.cells:
+            return NO_CELLS
+        cells, volume, _ = self.cells
+        return cells[least_volumes(q, cells) < volume]
+
+    def add_hessian(
+        self, q: np.ndarray, resisting: np.ndarray, projected: bool, v: np.ndarray, product: np.ndarray
+    ) -> None:
+        """Add (Hessian of E at q) v [N] to ``product`` (l, 3); ``resisting``: the cells that do at q.
+
+        projected : leave out its negative parts
+        """
         add_elastic_hessian(q, *self.all, projected, v, product)
-        if self.cells:
-            add_resistance_hessian(q, *self.cells, projected, v, product)
+        if len(resisting):
+            add_resistance_hessian(q, resisting, *self.cells[1:], projected, v, product)

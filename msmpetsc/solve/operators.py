@@ -84,10 +84,15 @@ class TrueHessian:
         self.product = np.empty_like(lattice.nodes)
         self.projected = False
 
+    def linearise(self, q: np.ndarray) -> None:
+        """Take the Hessian at positions q (l, 3)."""
+        self.q[:] = q
+        self.resisting = self.elasticity.resisting(q)
+
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
-        self.elasticity.add_hessian(self.q, self.projected, self.v, self.product)
+        self.elasticity.add_hessian(self.q, self.resisting, self.projected, self.v, self.product)
         lattice, free = self.unknowns.lattice, self.unknowns.free
         scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
         if self.contact:

@@ -256,7 +256,7 @@ class Stepper:
             self.contact_blocks.linearise(self.contact, self.base, self.preset.true_hessian)
             changed = self._precondition_contact()
         if self.hessian:
-            self.hessian.q[:] = self.base
+            self.hessian.linearise(self.base)
         if self.hessian or changed:
             self.operator.assemble()
 

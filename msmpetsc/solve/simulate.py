@@ -114,8 +114,10 @@ class Simulation:
         return total
 
     def _after_reflection(self, state: State, time: float) -> State:
+        free = ~self.stepper.lattice.pinned[:, None]  # what is held does not give way
         for reflection in self.model.reflections:
-            state = State(*reflection.reflect(state.q, state.q_previous, time, self.time_step))
+            q, q_previous = reflection.reflect(state.q, state.q_previous, time, self.time_step)
+            state = State(np.where(free, q, state.q), np.where(free, q_previous, state.q_previous))
         return state
 
     def _frame(

@@ -47,6 +47,7 @@ PRESETS = {
             "npc_snes_linesearch_type": "basic",
             "npc_snes_max_it": "1",
             "npc_snes_norm_schedule": "none",
+            "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
             **JACOBI_CG,
             "ksp_rtol": "1e-1",
         },

@@ -57,10 +57,16 @@ class Rub:
         u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
         return u, np.linalg.norm(u, axis=1)
 
-    def energy(self, q: np.ndarray) -> float:
-        _, u = self.slip(q)
-        e = self.stick
-        return self.limit @ np.where(u < e, u**2 / e - u**3 / (3 * e**2) + e / 3, u)
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
+        (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
+        moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
+        longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
+        low, low_0 = np.minimum(length, e), np.minimum(length_0, e)
+        beyond = np.maximum(length, e) - np.maximum(length_0, e)
+        within = np.where(np.maximum(length, length_0) < e, longer, low - low_0)
+        beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
+        return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
 
     def slope(self, u: np.ndarray) -> np.ndarray:
         """f'(u) / u, (a,) [1/m]."""
@@ -114,7 +120,7 @@ class Contact:
         for press in self.presses:
             total += _change(q[: self.owned], base[: self.owned], press.points, press.normals, press.stiffness)
             if press.rub:
-                total += press.rub.energy(q) - press.rub.energy(base)
+                total += press.rub.change(q, base)
         return total
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
@@ -173,8 +179,14 @@ def _energy(q, points, normals, stiffness):
 def _change(q, base, points, normals, stiffness):
     change = 0.0
     for i in range(len(q)):
-        d, d_base = depth(q[i], points, normals)[0], depth(base[i], points, normals)[0]
-        if d > 0.0 or d_base > 0.0:
+        d, face = depth(q[i], points, normals)
+        d_base, face_base = depth(base[i], points, normals)
+        if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
+            deeper = 0.0
+            for c in range(3):
+                deeper -= normals[face, c] * (q[i, c] - base[i, c])
+            change += 0.5 * stiffness * deeper * (d + d_base)
+        elif d > 0.0 or d_base > 0.0:
             d, d_base = max(d, 0.0), max(d_base, 0.0)
             change += 0.5 * stiffness * (d - d_base) * (d + d_base)
     return change

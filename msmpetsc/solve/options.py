@@ -19,6 +19,7 @@ from msmpetsc.errors import InputError, did_you_mean
 
 READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view)$")
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
+ASKED = "asked_"  # PETSc prints a help text once a prefix, and the bare one's may have had its turn
 TYPES = {
     "snes": (PETSc.SNES, ["newtonls", "newtontr", "anderson", "ngmres", "qn"]),
     "ksp": (PETSc.KSP, ["cg", "pipecg", "minres", "gmres", "preonly"]),
@@ -72,14 +73,17 @@ def _known_names() -> set[str]:
         for kind, types in TYPES.values():
             for name in types:
                 solver = kind().create(PETSc.COMM_SELF)
+                solver.setOptionsPrefix(f"{ASKED}{name}_")
                 solver.setType(name)
                 solver.setFromOptions()
                 solver.destroy()
-        PETSc.Mat().create(PETSc.COMM_SELF).setFromOptions()
+        matrix = PETSc.Mat().create(PETSc.COMM_SELF)
+        matrix.setOptionsPrefix(f"{ASKED}mat_")
+        matrix.setFromOptions()
+        matrix.destroy()
         database.delValue("help")
-    printed = set(re.findall(r"(?<=\s-)[a-z]\w+(?=[ :])", text[0]))
-    # PETSc prints a help text once, and a preset's NPC may have had it under its own prefix
-    return printed | {name.removeprefix("npc_") for name in printed}
+    printed = re.findall(r"(?<=\s-)[a-z]\w+(?=[ :])", text[0])
+    return {re.sub(f"^{ASKED}[a-z]+_", "", name) for name in printed}
 
 
 @contextmanager

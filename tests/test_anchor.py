@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import trimesh
 from block_scene import CELL, SIDES, G, block_scene, play
+from conftest import run
 from mpi4py import MPI
 from test_cli import IN_ONE_PROCESS, errors
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import build_model, fill_cages, read_body
 from msmpetsc.scene import load_scene
+from msmpetsc.solve.simulate import Simulation
 
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
@@ -113,27 +115,26 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     play(led_scene(tmp_path, 1, anchors[1:]))
 
 
-@pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
-def test_a_let_go_on_two_ranks_with_options_of_the_user(msmpetsc, tmp_path: Path, preset: str):
-    """The solver is built three times; the left anchor, of more than half of the body, leaves a rank with little to solve."""
-    most = {"box": [[0, 0, 0], [0.38, 0.5, 0.25]]}
-    anchors = [{"region": most, "path": UP, "stop": 0.025}, {"region": RIGHT, "path": UP, "stop": 0.045}]
-    scene = led_scene(tmp_path, 6, anchors, gravity={"acceleration": [0, 0, -G]})
-    option = ("-ksp_rtol", "1e-8") if preset != "fast-msm" else ("-mat_mumps_icntl_7", "2")
-    files = {}
-    for ranks in (1, 2):
-        out = tmp_path / f"{ranks}.h5"
-        done = msmpetsc(ranks, "run", scene, "-o", out, "--preset", preset, "--error", "1e-10", *option, timeout=60)
-        assert done.returncode == 0, done.stderr
-        files[ranks] = h5py.File(out)["frames/position"][:]
-    assert np.linalg.norm(files[2] - files[1]) < 1e-8 * np.linalg.norm(files[1] - files[1][0])
+def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path: Path, capsys):
+    """And one of the user's that the first solver used is not called unused, nor taken out with our defaults."""
+    from petsc4py import PETSc
 
-
-def test_a_wrong_option_is_still_told_where_the_solver_is_built_again(msmpetsc, tmp_path: Path):
-    scene = led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}])
-    done = msmpetsc(1, "run", scene, "-o", tmp_path / "o.h5", "-ksp_rtoll", "1e-8", timeout=60)
-    assert done.returncode == 2
-    assert "-ksp_rtoll" in done.stderr and "'ksp_rtol'" in done.stderr
+    scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
+    database = PETSc.Options()
+    database.setValue("ksp_rtol", "1e-8")
+    try:
+        with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+            first = simulation.stepper
+            assert len(list(simulation.frames())) == 4
+            assert simulation.stepper is not first and simulation.stepper.ksp.getTolerances()[0] == 1e-8
+            simulation.refuse_unused_options(at_end=True)
+            database.setValue("ksp_tpye", "cg")
+            with capsys.disabled(), pytest.raises(InputError, match="-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout
+                simulation.refuse_unused_options(at_end=True)
+        assert database.getString("ksp_rtol") == "1e-8"
+    finally:
+        database.delValue("ksp_rtol")
+        database.delValue("ksp_tpye")
 
 
 # ---- painted regions
@@ -221,29 +222,53 @@ def test_the_ball_has_the_points_the_cases_think(balls: Path):
     assert len(trimesh.load(balls / "ball.ply").vertices) == 162
 
 
+# ---- on one rank and on two, by the command line
+
+PRESETS = "newton", "anderson", "fast-msm"
+
+
+@pytest.fixture(scope="module")
+def runs(balls: Path) -> dict[int, tuple[Path, list]]:
+    """On so many ranks: the folder of results, and (status, what was told) of each rank for each of all commands."""
+    half, most_of_it = {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]}, {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]}
+    anchors = [{"region": half, "path": UP, "stop": 0.025}, {"region": most_of_it, "path": UP, "stop": 0.045}]
+    led = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
+    found = {}
+    for ranks in (1, 2):
+        out = balls / f"ranks{ranks}"
+        commands = [[led, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"] for preset in PRESETS]
+        commands += [[balls / "scene.toml", "-o", out / "painted.h5"]]
+        for value in WRONG:
+            commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]
+        commands = [["run", *map(str, command), "-ksp_rtol", "1e-8"] for command in commands]
+        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=100)
+        assert done.returncode == 0, done.stderr
+        found[ranks] = out, [json.loads(line) for line in done.stdout.splitlines()]
+    return found
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_two_ranks_lead_and_let_go_as_one(runs: dict, preset: str):
+    """The solver is built three times; at first six nodes of the last corner are free, which leaves one rank none."""
+    files = {}
+    for ranks, (out, answers) in runs.items():
+        assert [status for status, _ in answers[PRESETS.index(preset)]] == [0] * ranks, answers
+        files[ranks] = h5py.File(out / f"{preset}.h5")["frames/position"][:]
+    assert np.linalg.norm(files[2] - files[1]) < 1e-8 * np.linalg.norm(files[1] - files[1][0])
+
+
+def test_two_ranks_find_the_same_painted_nodes(runs: dict):
+    one, two = (h5py.File(out / "painted.h5")["lattice/pinned"][:] for out, _ in runs.values())
+    assert len(one) > 8
+    np.testing.assert_array_equal(two, one)
+
+
 @pytest.mark.parametrize("ranks", [1, 2])
-def test_what_cannot_be_painted_is_told_in_one_line(on_ranks, balls: Path, ranks: int):
-    out = balls / f"out{ranks}" / "o.h5"
-    commands = [
-        ["run", str(balls / "scene.toml"), "-o", str(out), "--set", f"pin.0.region.painted={value}"] for value in WRONG
-    ]
-    done = on_ranks(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=60)
-    assert done.returncode == 0, done.stderr
-    for words, line in zip(WRONG.values(), done.stdout.splitlines(), strict=True):
-        answers = json.loads(line)
+def test_what_cannot_be_painted_is_told_in_one_line(runs: dict, ranks: int):
+    out, found = runs[ranks]
+    for words, answers in zip(WRONG.values(), found[-len(WRONG) :], strict=True):
         assert [status for status, _ in answers] == [2] * ranks, answers
         lines = [line for _, told in answers for line in told.splitlines() if "note:" not in line]
         assert len(lines) == 1 and lines == errors(answers[0][1]), answers
         assert all(word in lines[0] for word in words), lines
-    assert not list(out.parent.glob("*"))
-
-
-def test_two_ranks_find_the_same_nodes(msmpetsc, balls: Path):
-    pinned = {}
-    for ranks in (1, 2):
-        out = balls / f"ranks{ranks}.h5"
-        done = msmpetsc(ranks, "run", balls / "scene.toml", "-o", out, timeout=60)
-        assert done.returncode == 0, done.stderr
-        pinned[ranks] = h5py.File(out)["lattice/pinned"][:]
-    assert len(pinned[1]) > 8
-    np.testing.assert_array_equal(pinned[2], pinned[1])
+    assert not list(out.glob("wrong*"))

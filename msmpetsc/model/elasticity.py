@@ -8,6 +8,7 @@ from msmpetsc.model.inversion import (
     add_resistance_gradient,
     add_resistance_hessian,
     least_volumes,
+    resistance_change,
     resistance_energy,
 )
 from msmpetsc.model.lattice import NO_CELLS, Lattice
@@ -42,7 +43,7 @@ class Elasticity:
         """E(q) - E(base) [J]."""
         change = elastic_change(q, base, *self.own)
         if self.cells:
-            change += resistance_energy(q, *self.own_cells) - resistance_energy(base, *self.own_cells)
+            change += resistance_change(q, base, *self.own_cells)
         return change
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:

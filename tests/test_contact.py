@@ -109,7 +109,8 @@ def test_both_regimes_of_friction_are_among_the_cases():
 def test_a_node_in_two_obstacles_gets_both():
     floor, wall = plane([0, 0, 0], [0, 0, 1]), plane([0, 0, 0], [1, 0, 0])
     q = np.array([[-0.1, 5, -0.2], [0.3, 0, -0.4], [1, 1, 1]])
-    contact = Contact([Penalty(floor, 10.0, 0.0, 1.0).during(q, T, T), Penalty(wall, 30.0, 0.0, 1.0).during(q, T, T)], 3)
+    both = Penalty(floor, 10.0, 0.0, 1.0), Penalty(wall, 30.0, 0.0, 1.0)
+    contact = Contact([p.during(q, T, T) for p in both], 3)
     np.testing.assert_allclose(gradient(contact, q), [[-30 * 0.1, 0, -10 * 0.2], [0, 0, -10 * 0.4], [0, 0, 0]])
     nodes, blocks = contact.hessian(q, true=True)
     assert nodes.tolist() == [0, 1]
@@ -130,7 +131,7 @@ def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side:
 
 
 def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
-    """A node 0.2 deep in a plane that goes 0.05 along x in the step: held, mu N f'(u) with f' = 2 s - s^2 at s = u/e."""
+    """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at s = u/e < 1."""
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)  # 0.5 and 0.2 m/s
     start = np.array([[0.0, 0, -0.2]])
     carried = start + [0.05, 0.02, 0]
@@ -248,7 +249,7 @@ def press(folder: Path, **tables) -> Path:
 
 
 def test_a_plate_presses_a_block_with_E_A_strain_and_lets_it_go(tmp_path: Path):
-    """4% pressed. The contact springs, 9 of k at each end, take their share of the way: the block's end sinks into them."""
+    """4% pressed. The contact springs, 9 of k at each end, take their share of the way."""
     model, frames = play(press(tmp_path))
     rest = model.lattice.nodes
     low, high = rest[:, 2] == 0, rest[:, 2] == 0.5
@@ -334,7 +335,7 @@ def test_a_path_stays_at_its_last_place():
 
 @pytest.mark.parametrize("hold", ["pin", "anchor"])
 def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str):
-    """A plane comes up through the bottom of a block that is held there: struck, it would leave with the plane's speed."""
+    """A plane comes up through the bottom of a block that is held there: struck, it would take the plane's speed."""
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
     led = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
     rising = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1], "path": [{"time": 1.0, "by": [0, 0, 1]}]}

@@ -28,6 +28,7 @@ from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell
+PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -169,18 +170,23 @@ class Stepper:
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
         if its very first direction has negative curvature it climbs, and the line search says so: the
-        projected Hessian takes over.
+        projected Hessian takes over for some iterations (_linearise).
         """
         its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
         self.snes.solve(None, self.x)
         # an NPC goes on counting
         iterations, ksp_its = self.snes.its, self.inner.getLinearSolveIterations() - its_before
-        if self.hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH:
+        most = self.snes.getTolerances()[3]
+        while self._climbs() and iterations < most:
             self.hessian.projected = True
             self.snes.solve(None, self.x)
-            self.hessian.projected = False
             iterations, ksp_its = iterations + self.snes.its, ksp_its + self.inner.getLinearSolveIterations()
+        if self.hessian:
+            self.hessian.projected = False
         return iterations, ksp_its
+
+    def _climbs(self) -> bool:
+        return self.hessian is not None and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
 
     def _first_guess(self, q: np.ndarray) -> None:
         """Put the start of least g into x.
@@ -257,6 +263,7 @@ class Stepper:
             changed = self._precondition_contact()
         if self.hessian:
             self.hessian.linearise(self.base)
+            self.hessian.projected = self.hessian.projected and snes.its < PROJECTED
         if self.hessian or changed:
             self.operator.assemble()
 

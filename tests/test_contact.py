@@ -74,6 +74,17 @@ def test_the_gradient_is_the_slope_of_the_change(penalties: list[Penalty]):
 
 
 @cases
+def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
+    """Against the first and second derivative: a plain difference of energies has no digit left here."""
+    contact, q, v = pressed(penalties)
+    nodes, blocks = contact.hessian(q, true=True)
+    moved = q + 1e-11 * v
+    v = moved - q  # q + v is rounded
+    second = 0.5 * np.einsum("ai,aij,aj", v[nodes], blocks, v[nodes])
+    assert contact.change(moved, q) == pytest.approx((gradient(contact, q) * v).sum() + second, rel=1e-8, abs=0)
+
+
+@cases
 def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
     contact, q, v = pressed(penalties)
     step = 1e-7
@@ -204,6 +215,15 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(msmpetsc, tmp_path: P
     np.testing.assert_allclose(file["frames/contact"][:], 0.5 * k * (depth**2).sum(axis=1), rtol=1e-12)
     if 2 in files:
         assert np.linalg.norm(files[2]["frames/position"][:] - q) < 1e-8 * np.linalg.norm(q - q[0])
+
+
+@pytest.mark.parametrize("preset", ["anderson", "newton"])
+def test_a_ground_of_a_thousand_springs_is_stood_on(tmp_path: Path, preset: str):
+    """Whose push on y, in the first step, is more than 1e4 times the weight."""
+    stiff, solver = GROUND | {"stiffness": 1400 * STIFFEST}, {"preset": preset, "error": 1e-3}
+    model, frames = play(grounded(tmp_path, [0, 0, -G], 20, 0.05, stiff, solver=solver))
+    depth = np.maximum(-frames[-1].position[:, 2], 0)
+    assert 1400 * STIFFEST * depth.sum() == pytest.approx(MASS * G, rel=0.01)
 
 
 def slide(folder: Path, slope: float, friction: float, steps: int = 60, t: float = 0.01) -> np.ndarray:

@@ -117,7 +117,7 @@ def test_a_change_of_energy_keeps_its_digits(q: np.ndarray):
     moved = q + 1e-12 * V
     v = moved - q  # q + v is rounded
     change = resistance_change(moved, q, *RESIST)
-    assert change == pytest.approx((gradient(q) * v).sum() + 0.5 * (hessian_times(q, v) * v).sum(), rel=1e-9)
+    assert change == pytest.approx((gradient(q) * v).sum() + 0.5 * (hessian_times(q, v) * v).sum(), rel=1e-9, abs=0)
     for far in (REST, 0.7 * REST, 0.5 * q + 0.1, REST * [1, -0.5, 1]):
         plain = resistance_energy(far, *RESIST) - resistance_energy(q, *RESIST)
         assert resistance_change(far, q, *RESIST) == pytest.approx(plain, rel=1e-9)

@@ -99,6 +99,11 @@ def test_load_acts_from_start_to_before_stop():
     assert [load.acts_at(time) for time in (0.99, 1.0, 1.99, 2.0)] == [False, True, True, False]
 
 
+def test_a_time_that_is_rounded_beside_start_or_stop_counts_as_it():
+    late = np.nextafter(1.8, 0)
+    assert not Load(np.zeros((1, 3)), 0.0, 1.8).acts_at(late) and Load(np.zeros((1, 3)), 1.8, 2.0).acts_at(late)
+
+
 FLOOR = np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 STILL = Motion.through(())
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.model.motion import Path
+from msmpetsc.model.motion import Path, within
 
 
 @dataclass(frozen=True)
@@ -16,4 +16,4 @@ class Anchor:
     stop: float
 
     def holds_at(self, time: float) -> bool:
-        return time < self.stop
+        return within(time, 0.0, self.stop)

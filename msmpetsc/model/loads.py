@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.model.motion import within
+
 
 @dataclass(frozen=True)
 class Load:
@@ -15,7 +17,7 @@ class Load:
     stop: float
 
     def acts_at(self, time: float) -> bool:
-        return self.start <= time < self.stop
+        return within(time, self.start, self.stop)
 
 
 def spread_by_mass(comm: MPI.Comm, total: tuple[float, ...], where: np.ndarray, mass: np.ndarray) -> np.ndarray:

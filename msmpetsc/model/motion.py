@@ -1,4 +1,4 @@
-"""How what a scene leads moves: along straight lines between places given for times."""
+"""When what a scene names is there, and how it moves: along straight lines between places given for times."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,6 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.scene import Keyframe
+
+SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
+
+
+def within(time: float, start: float, stop: float | None) -> bool:
+    """start <= time < stop [s], whatever was rounded; stop None is never."""
+    return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
 
 
 @dataclass(frozen=True)

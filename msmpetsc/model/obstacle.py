@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from msmpetsc import scene
-from msmpetsc.model.motion import Path
+from msmpetsc.model.motion import Path, within
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Obstacle:
         return cls(points, normals, Path.through(told.path), told.start, stop)
 
     def acts_at(self, time: float) -> bool:
-        return self.start <= time < self.stop
+        return within(time, self.start, self.stop)
 
     def points_at(self, time: float) -> np.ndarray:
         """A point of each face (f, 3) [m] at a time."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from msmpetsc.model.motion import Path
+from msmpetsc.model.motion import Path, within
 from msmpetsc.model.region import inside
 from msmpetsc.output.camera import Camera, unit
 from msmpetsc.scene import Region, SceneFile
@@ -72,10 +72,6 @@ class Rest:
         return where
 
 
-def acts_at(time: float, start: float, stop: float | None) -> bool:
-    return start <= time and (stop is None or time < stop)
-
-
 def marks_at(
     scene: SceneFile, time: float, rest: Rest, position: np.ndarray, bodies: np.ndarray, camera: Camera
 ) -> Marks:
@@ -91,7 +87,7 @@ def marks_at(
 def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
     grounds, glass = [], []
     for obstacle in scene.obstacle:
-        if not acts_at(time, obstacle.start, obstacle.stop):
+        if not within(time, obstacle.start, obstacle.stop):
             continue
         by = Path.through(obstacle.path).at(time)
         if obstacle.shape == "box":
@@ -145,7 +141,7 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
     length = ARROW * np.ptp(rest.bounds, axis=0).max()
     found = []
     for force in scene.force:
-        if acts_at(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
+        if within(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
             tail = position[where].mean(axis=0)
             found.append(np.array([tail, tail + length * unit(force.total)]))
     return found
@@ -154,5 +150,5 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
 def held(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
     """Which nodes (n,) bool are pinned or led at a time."""
     regions = [pin.region for pin in scene.pin]
-    regions += [anchor.region for anchor in scene.anchor if acts_at(time, 0.0, anchor.stop)]
+    regions += [anchor.region for anchor in scene.anchor if within(time, 0.0, anchor.stop)]
     return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, regions)], axis=0)

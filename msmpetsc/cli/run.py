@@ -53,7 +53,7 @@ class ListPresets(argparse.Action):
         from msmpetsc.solve.presets import PRESETS
 
         if MPI.COMM_WORLD.rank == 0:
-            print("\n".join(f"{name:10} {preset.about}" for name, preset in PRESETS.items()))
+            print("\n".join(f"{name:16} {preset.about}" for name, preset in PRESETS.items()))
         parser.exit()
 
 

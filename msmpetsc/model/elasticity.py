@@ -14,7 +14,7 @@ from msmpetsc.model.inversion import (
 from msmpetsc.model.lattice import NO_CELLS, Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
-RESISTANCE = 1.0
+RESISTANCE = 1.0  # K of a corner, of the stiffest spring's stiffness times h^2: an eighth left a lung pressed to 30% torn
 
 
 class Elasticity:

@@ -2,7 +2,8 @@
 
 Each corner of a cell spans a box with the three edges that meet there; J is its signed volume over that at rest.
 Where J < J_0 the corner has the energy  K (1 - J / J_0)^3,  nothing elsewhere, with two continuous derivatives and
-a finite push even where J < 0: so a cell that has been turned is turned back.
+a finite push even where J < 0: so a cell that has been turned is turned back, though its neighbours may then hold
+it creased.
 
 All positions are local, (l, 3), and a gradient is right at the owned nodes, as in model.energy.
 """

@@ -34,6 +34,14 @@ CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
 PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
+NEWTON = {
+    "snes_type": "newtonls",
+    "snes_linesearch_type": "bt",
+    "snes_max_it": "100",
+    **NO_STOP_BY_SIZE,
+    "snes_max_linear_solve_fail": "100",
+    "ksp_rtol": "1e-1",
+}
 
 PRESETS = {
     "anderson": Preset(
@@ -53,16 +61,13 @@ PRESETS = {
         },
     ),
     "newton": Preset(
-        "Newton's method with the true Hessian and a line search: the reference, and the most accurate",
-        {
-            "snes_type": "newtonls",
-            "snes_linesearch_type": "bt",
-            "snes_max_it": "100",
-            **NO_STOP_BY_SIZE,
-            "snes_max_linear_solve_fail": "100",
-            **JACOBI_CG,
-            "ksp_rtol": "1e-1",
-        },
+        "Newton's method with the true Hessian and a line search: the reference, the most accurate, the most robust",
+        {**NEWTON, **JACOBI_CG},
+        true_hessian=True,
+    ),
+    "newton-multigrid": Preset(
+        "The same with algebraic multigrid for A: long steps, stiff bodies, fine lattices",
+        {**NEWTON, **JACOBI_CG, "pc_type": "gamg"},
         true_hessian=True,
     ),
     "fast-msm": Preset(

@@ -71,12 +71,12 @@ def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")
 
     @cache
-    def run_scene(name: str, *options: str, ranks: int = 1) -> Result:
+    def run_scene(name: str, *options: str, ranks: int = 1, may_fail: bool = False) -> Result:
         skip_without_mesh(name)
         path = folder / f"{name}{len(list(folder.iterdir()))}.h5"
         command = ("-m", "msmpetsc.cli.main", "run", SCENES / f"{name}.toml", "-o", path)
         done = run(ranks, *command, "--set", "cages.count=1000", *options, timeout=300)
-        assert done.returncode == 0, done.stderr
+        assert done.returncode == 0 or may_fail and done.returncode == 3, done.stderr
         return Result(path)
 
     return run_scene
@@ -180,10 +180,9 @@ def test_pressed_to_30_percent_the_linear_law_inverts_cells_for_good_and_the_sti
     """Section 6 of the paper: "its deformation effects will begin to distort"."""
     few = ["--set", "cages.count=500", "--set", "time.duration=2.4", "--set", "solver.error=1e-2"]
     stiffening = result("lung_press", *press_to(0.3), *few)
-    linear = result("lung_press", *press_to(0.3), *few, "--set", "material.law=linear")
-    pressed = np.searchsorted(linear.time, 1.3)
-    assert linear.inverted(pressed) > 0.05 * len(linear.cells) and linear.inverted(-1) > 0.05 * len(linear.cells)
-    assert stiffening.inverted(pressed) == stiffening.inverted(-1) == 0
+    linear = result("lung_press", *press_to(0.3), *few, "--set", "material.law=linear", may_fail=True)
+    assert linear.inverted(-1) > 0.05 * len(linear.cells)
+    assert all(stiffening.inverted(frame) == 0 for frame in range(len(stiffening.q)))
     body = stiffening.zone([0, 0, 0], [1, 1, 0.5])
     errors = [shape_error(run.nodes[body], run.q[-1][body], run.mass[body]) for run in (linear, stiffening)]
     assert errors[1] < min(errors[0], 0.05 * linear.height)

@@ -24,8 +24,11 @@ def elastic_energy(
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         stretch = np.sqrt(x * x + y * y + z * z) - rest_length[s]
-        strain = stretch / rest_length[s]
-        energy += 0.5 * stiffness[s] * stretch * stretch * (1.0 + 0.5 * stiffening * strain * strain)
+        part = 0.5 * stiffness[s] * stretch * stretch
+        if stiffening > 0.0:
+            strain = stretch / rest_length[s]
+            part *= 1.0 + 0.5 * stiffening * strain * strain
+        energy += part
     return energy
 
 
@@ -40,16 +43,15 @@ def elastic_change(
 ) -> float:
     """E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
     change = 0.0
+    moved = q - base
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         u, v, w = base[a, 0] - base[b, 0], base[a, 1] - base[b, 1], base[a, 2] - base[b, 2]
+        # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
+        dx, dy, dz = moved[a, 0] - moved[b, 0], moved[a, 1] - moved[b, 1], moved[a, 2] - moved[b, 2]
+        x, y, z = u + dx, v + dy, w + dz
         length, before = np.sqrt(x * x + y * y + z * z), np.sqrt(u * u + v * v + w * w)
         total = length + before
-        # how the ends moved, from node to node: x - u would keep only the digits of x
-        dx = (q[a, 0] - base[a, 0]) - (q[b, 0] - base[b, 0])
-        dy = (q[a, 1] - base[a, 1]) - (q[b, 1] - base[b, 1])
-        dz = (q[a, 2] - base[a, 2]) - (q[b, 2] - base[b, 2])
         longer = (dx * (x + u) + dy * (y + v) + dz * (z + w)) / max(total, TINY)
         part = 0.5 * stiffness[s] * longer * (total - 2.0 * rest_length[s])
         if stiffening > 0.0:  # s^4 / 4 changes by (s^2 + s_0^2) / 2 for each unit that s^2 / 2 does

@@ -30,10 +30,14 @@ class Reflection:
         """
         if not self.obstacle.acts_at(time):
             return q, q_previous
-        path = self.obstacle.path
         inside, face = depths(q, self.obstacle.points_at(time), self.obstacle.normals)
-        normal = self.obstacle.normals[face]
-        into = ((q - q_previous - (path.at(time) - path.at(time - time_step))) * normal).sum(axis=1)
-        hit = (inside >= 0) & (into < 0)
-        back = np.where(hit, into, 0)[:, None] * normal
-        return q - back, q_previous + self.restitution * back
+        at = np.flatnonzero(inside >= 0)
+        if len(at) == 0:
+            return q, q_previous
+        normal, path = self.obstacle.normals[face[at]], self.obstacle.path
+        v = q[at] - q_previous[at] - (path.at(time) - path.at(time - time_step))
+        back = np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal
+        q, q_previous = q.copy(), q_previous.copy()
+        q[at] -= back
+        q_previous[at] += self.restitution * back
+        return q, q_previous

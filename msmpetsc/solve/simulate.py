@@ -114,11 +114,13 @@ class Simulation:
         return total
 
     def _after_reflection(self, state: State, time: float) -> State:
-        free = ~self.stepper.lattice.pinned[:, None]  # what is held does not give way
+        q, q_previous = state.q, state.q_previous
         for reflection in self.model.reflections:
-            q, q_previous = reflection.reflect(state.q, state.q_previous, time, self.time_step)
-            state = State(np.where(free, q, state.q), np.where(free, q_previous, state.q_previous))
-        return state
+            q, q_previous = reflection.reflect(q, q_previous, time, self.time_step)
+        if q is state.q:
+            return state
+        free = ~self.stepper.lattice.pinned[:, None]  # what is held does not give way
+        return State(np.where(free, q, state.q), np.where(free, q_previous, state.q_previous))
 
     def _frame(
         self, index: int, result: StepResult, before: np.ndarray, wall_time: float, contact: Contact | None = None

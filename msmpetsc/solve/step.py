@@ -28,6 +28,7 @@ from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell
+ROUNDINGS = 3  # of a row of F: in free fall one was passed now and then
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
@@ -158,15 +159,21 @@ class Stepper:
         self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
         self.last_error = self.residual = np.inf
         self._first_guess(q)
-        iterations, ksp_its = self._solve()
-        if self.snes.reason < 0:
-            raise StepFailed(self._failure())
+        iterations, ksp_its = (0, 0) if self._is_solved() else self._solve()
         self.unknowns.to_nodes(self.x, self.q)
         self.corrections = [self.q - self.y, *self.corrections[:1]]
         return StepResult(self.q.copy(), self.last_error, iterations, ksp_its)
 
+    def _is_solved(self) -> bool:
+        """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
+        if self.inner is self.snes:
+            return False
+        self._residual(self.snes, self.x, self.work)
+        self.last_error = self._error_of(self.work)
+        return self.last_error <= (self.error or 0.0)
+
     def _solve(self) -> tuple[int, int]:
-        """SNES iterations and KSP iterations that took x to the solution.
+        """SNES iterations and KSP iterations that took x to the solution. Raises StepFailed.
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
         if its very first direction has negative curvature it climbs, and the line search says so: the
@@ -183,6 +190,8 @@ class Stepper:
             iterations, ksp_its = iterations + self.snes.its, ksp_its + self.inner.getLinearSolveIterations()
         if self.hessian:
             self.hessian.projected = False
+        if self.snes.reason < 0:
+            raise StepFailed(self._failure())
         return iterations, ksp_its
 
     def _climbs(self) -> bool:
@@ -299,8 +308,8 @@ class Stepper:
         return residual / away if away > 0 else np.inf  # the start x = y tells nothing yet
 
     def _rounding_of_residual(self) -> float:
-        """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: eps of each row's diagonal entry."""
-        rows = 3 * (np.finfo(float).eps * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
+        """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: some eps of each row's diagonal."""
+        rows = 3 * (ROUNDINGS * np.finfo(float).eps * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
         return np.sqrt(self.comm.allreduce(rows))
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:

@@ -188,6 +188,8 @@ class Stepper:
             self.hessian.projected = True
             self.snes.solve(None, self.x)
             iterations, ksp_its = iterations + self.snes.its, ksp_its + self.inner.getLinearSolveIterations()
+            if self.snes.its == 0:  # neither Hessian leads on
+                break
         if self.hessian:
             self.hessian.projected = False
         if self.snes.reason < 0:

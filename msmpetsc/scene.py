@@ -1,13 +1,11 @@
-"""Scene file (TOML) -> frozen, validated Scene. What a key means and its unit stand in its description."""
+"""The schema of a scene: frozen, validated tables. What a key means and its unit stand in its description."""
 
 import math
-import tomllib
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
-import tomli_w
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -22,8 +20,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails
 
-from msmpetsc.errors import InputError
-from msmpetsc.scene_errors import as_given, one_of_problems, problem_lines, restated, rule, unknown_name
+from msmpetsc.scene_errors import one_of_problems, restated, rule, unknown_name
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -72,6 +69,17 @@ def _after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
     if stop is not None and start is not None and stop <= start:
         raise rule(f"must be > start = {start:g}", "start")
     return stop
+
+
+def _only_for(other: str, value: str) -> Callable[..., Any]:
+    """A validator of a key that has a meaning only where another key of its table has this value."""
+
+    def check(cls, given: Any, info: ValidationInfo) -> Any:
+        if info.data.get(other, value) != value:
+            raise rule(f'is for {other} = "{value}" only', other)
+        return given
+
+    return check
 
 
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
@@ -157,12 +165,7 @@ class Cages(Table):
     smoothing: float = Field(1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]')
     max_cells: Count = Field(5_000_000, description="refuse a lattice of more cells than this [-]")
 
-    @field_validator("smoothing")
-    @classmethod
-    def _has_a_use(cls, smoothing: float, info: ValidationInfo) -> float:
-        if info.data.get("embedding", "cages") != "cages":
-            raise rule('is for embedding = "cages" only', "embedding")
-        return smoothing
+    _has_a_use = field_validator("smoothing")(_only_for("embedding", "cages"))
 
 
 class Material(Table):
@@ -177,17 +180,12 @@ class Material(Table):
         None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
     )
 
+    _has_a_use = field_validator("stiffening")(_only_for("law", "stiffening"))
+
     @property
     def law_stiffening(self) -> float:
         """b of the springs' law, 0 for Hooke's."""
         return 0.0 if self.law == "linear" else self.stiffening or DEFAULT_STIFFENING
-
-    @field_validator("stiffening")
-    @classmethod
-    def _has_a_use(cls, stiffening: float, info: ValidationInfo) -> float:
-        if info.data.get("law", "stiffening") != "stiffening":
-            raise rule('is for law = "stiffening" only', "law")
-        return stiffening
 
 
 class Time(Table):
@@ -389,96 +387,3 @@ class Scene(SceneFile):
 
     text: str = Field("", description="the TOML text, overrides included")
     folder: Path = Field(Path(), description="folder of the file")
-
-
-def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None) -> Scene:
-    """Read and check a scene file.
-
-    overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
-        number; they replace or insert before anything is checked.
-    presets: the known names of solver presets; any name will do if None.
-
-    Raises InputError naming every problem of the file, one a line.
-    """
-    path, overrides = Path(path), list(overrides)
-    file_text = _read(path)
-    data = _parse(path, file_text)
-    keys = {_override(data, override): override for override in overrides}
-    try:
-        checked = SceneFile.model_validate(data, context={"presets": presets})
-    except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
-    return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_bytes().decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such scene file") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder, not a scene file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 text (byte {error.start})") from None
-
-
-def _parse(path: Path, text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        last = text.rstrip().count("\n") + 1
-        problem = str(error).replace("at end of document", f"at the end, line {last}")
-        raise InputError(f"{path}: is not TOML: {problem}") from None
-    except RecursionError:
-        raise InputError(f"{path}: is nested too deeply") from None
-    except ValueError:  # all that tomllib leaves to int(): Python's limit on digits
-        raise InputError(f"{path}: has an integer of too many digits") from None
-
-
-def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
-    """Carry out one "key.path=value" in ``data``; returns the key path."""
-    try:
-        name, equals, raw = override.partition("=")
-        path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
-        if not equals or not raw.strip() or "" in path:
-            raise InputError("must read key.path=value")
-        value = _override_value(raw.strip())
-        holder: Any = data
-        for key, following in zip(path, path[1:], strict=False):
-            empty = [] if isinstance(following, int) else {}
-            holder = _put(holder, key, empty, replace=False)
-        _put(holder, path[-1], value, replace=True)
-    except InputError as error:
-        raise InputError(f"--set {as_given(override)}: {error}") from None
-    return path
-
-
-def _override_value(raw: str) -> Any:
-    try:
-        parsed = tomllib.loads(f"value = {raw}")
-    except (ValueError, RecursionError):
-        if raw[0] in "\"'[{" or "\n" in raw:
-            raise InputError("the value is not TOML") from None
-        return raw
-    if set(parsed) != {"value"}:
-        raise InputError("must hold a single value")
-    return parsed["value"]
-
-
-def _put(holder: Any, key: str | int, value: Any, replace: bool) -> Any:
-    """Put ``value`` at ``key`` of a table or list (where absent, or ``replace``); returns what is there then."""
-    if isinstance(holder, dict):
-        key = str(key)
-        if replace or key not in holder:
-            holder[key] = value
-    elif not isinstance(holder, list):
-        raise InputError(f"{key!r} has no place in {as_given(holder)}, which is no table or list")
-    elif not isinstance(key, int) or key > len(holder):
-        raise InputError(f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}")
-    elif key == len(holder):
-        holder.append(value)
-    elif replace:
-        holder[key] = value
-    return holder[key]

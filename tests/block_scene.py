@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.frame import Frame
-from msmpetsc.scene import load_scene
+from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
 CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long

@@ -14,7 +14,7 @@ from test_cli import IN_ONE_PROCESS, errors
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import build_model, fill_cages, read_body
-from msmpetsc.scene import load_scene
+from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
 T = 0.01

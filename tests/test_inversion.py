@@ -20,7 +20,7 @@ from msmpetsc.model.inversion import (
     resistance_energy,
 )
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.scene import load_scene
+from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.step import Stepper
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene import Scene, SceneFile, load_scene
+from msmpetsc.scene import Scene, SceneFile
+from msmpetsc.scene_reading import load_scene
 
 EXAMPLE = """\
 title = "Bunny falls and leaps"

@@ -17,7 +17,8 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.xdmf import write_xdmf
-from msmpetsc.scene import Scene, load_scene
+from msmpetsc.scene import Scene
+from msmpetsc.scene_reading import load_scene
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model

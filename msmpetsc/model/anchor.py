@@ -9,11 +9,11 @@ from msmpetsc.model.motion import Path, within
 
 @dataclass(frozen=True)
 class Anchor:
-    """where (l,) bool: the nodes, ghosts included; they follow ``path`` while time < stop [s]."""
+    """where (l,) bool: the nodes, ghosts included; they follow ``path`` while time < stop [s], None: always."""
 
     where: np.ndarray
     path: Path
-    stop: float
+    stop: float | None
 
     def holds_at(self, time: float) -> bool:
         return within(time, 0.0, self.stop)

@@ -119,8 +119,7 @@ def _anchors(scene: Scene, lattice: Lattice, finder: Finder) -> list[Anchor]:
     anchors, taken = [], lattice.pinned
     for number, anchor in enumerate(scene.anchor):
         where = finder.find(f"anchor.{number}", anchor.region, lattice) & ~taken
-        stop = np.inf if anchor.stop is None else anchor.stop
-        anchors.append(Anchor(where, Path.through(anchor.path), stop))
+        anchors.append(Anchor(where, Path.through(anchor.path), anchor.stop))
         taken = taken | where
     return anchors
 
@@ -137,11 +136,10 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, anchors: list[
 def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, finder: Finder) -> list[Load]:
     loads = []
     if scene.gravity is not None:
-        loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, np.inf))
+        loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
     for number, force in enumerate(scene.force):
         where = finder.find(f"force.{number}", force.region, lattice)[: lattice.owned]
-        stop = np.inf if force.stop is None else force.stop
-        loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, stop))
+        loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
 
 
@@ -154,10 +152,8 @@ def _reflections(scene: Scene) -> list[Reflection]:
 
 
 def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body) -> list[Penalty]:
-    stiffest = comm.allreduce(lattice.stiffness.max(initial=0), MPI.MAX)
-    stick = STICK * (body.bounds[1] - body.bounds[0]).max()
-    return [
-        Penalty(Obstacle.of(o), o.stiffness or PENALTY * stiffest, o.friction or 0.0, stick)
-        for o in scene.obstacle
-        if o.response == "penalty"
-    ]
+    pressing = [o for o in scene.obstacle if o.response == "penalty"]
+    if not pressing:
+        return []
+    usual, stick = PENALTY * lattice.stiffest(comm), STICK * (body.bounds[1] - body.bounds[0]).max()
+    return [Penalty(Obstacle.of(o), o.stiffness or usual, o.friction or 0.0, stick) for o in pressing]

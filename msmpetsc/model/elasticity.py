@@ -30,9 +30,8 @@ class Elasticity:
         self.own = *(array[: lattice.springs_owned] for array in self.all[:3]), lattice.stiffening
         self.cells = self.own_cells = None
         if lattice.stiffening > 0:
-            stiffest = comm.allreduce(lattice.stiffness.max(initial=0), MPI.MAX)
             volume, h = ONSET * lattice.cell_size**3, lattice.cell_size
-            self.cells = lattice.local_cells, volume, RESISTANCE * stiffest * h**2
+            self.cells = lattice.local_cells, volume, RESISTANCE * lattice.stiffest(comm) * h**2
             self.own_cells = lattice.local_cells[: lattice.cells_owned], *self.cells[1:]
 
     def energy(self, q: np.ndarray) -> float:

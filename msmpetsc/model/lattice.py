@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numba
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry import morton
@@ -65,6 +66,10 @@ class Lattice:
     def global_numbers(self) -> np.ndarray:
         """(l,) global number of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
+
+    def stiffest(self, comm: MPI.Comm) -> float:
+        """The greatest stiffness of any spring [N/m] (collective)."""
+        return comm.allreduce(self.stiffness.max(initial=0), MPI.MAX)
 
     def pin(self, where: np.ndarray) -> "Lattice":
         """This lattice with the nodes ``where`` (l,) bool held fast."""

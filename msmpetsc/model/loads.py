@@ -10,11 +10,11 @@ from msmpetsc.model.motion import within
 
 @dataclass(frozen=True)
 class Load:
-    """A force of nodes: force (owned, 3) [N], acting while start <= time < stop [s]."""
+    """A force of nodes: force (owned, 3) [N], acting while start <= time < stop [s]; None: to the end."""
 
     force: np.ndarray
     start: float
-    stop: float
+    stop: float | None
 
     def acts_at(self, time: float) -> bool:
         return within(time, self.start, self.stop)

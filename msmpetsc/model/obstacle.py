@@ -15,14 +15,14 @@ class Obstacle:
 
     points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side
     path            : how it moves
-    start, stop     : it is there while start <= time < stop [s]
+    start, stop     : it is there while start <= time < stop [s]; None: to the end
     """
 
     points: np.ndarray
     normals: np.ndarray
     path: Path
     start: float = 0.0
-    stop: float = np.inf
+    stop: float | None = None
 
     @classmethod
     def of(cls, told: scene.Obstacle) -> "Obstacle":
@@ -32,8 +32,7 @@ class Obstacle:
             normals = np.concatenate([-np.eye(3), np.eye(3)])
         else:
             points, normals = np.array([told.point]), np.array([told.normal])
-        stop = np.inf if told.stop is None else told.stop
-        return cls(points, normals, Path.through(told.path), told.start, stop)
+        return cls(points, normals, Path.through(told.path), told.start, told.stop)
 
     def acts_at(self, time: float) -> bool:
         return within(time, self.start, self.stop)

@@ -40,6 +40,7 @@ NEWTON = {
     "snes_max_it": "100",
     **NO_STOP_BY_SIZE,
     "snes_max_linear_solve_fail": "100",
+    **JACOBI_CG,
     "ksp_rtol": "1e-1",
 }
 
@@ -62,12 +63,12 @@ PRESETS = {
     ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the reference, the most accurate, the most robust",
-        {**NEWTON, **JACOBI_CG},
+        NEWTON,
         true_hessian=True,
     ),
     "newton-multigrid": Preset(
         "The same with algebraic multigrid for A: long steps, stiff bodies, fine lattices",
-        {**NEWTON, **JACOBI_CG, "pc_type": "gamg"},
+        {**NEWTON, "pc_type": "gamg"},
         true_hessian=True,
     ),
     "fast-msm": Preset(

@@ -351,6 +351,7 @@ class Output(Table):
     """What is stored beside the lattice."""
 
     surface: bool = Field(True, description="store the surface of every frame")
+    every: Count = Field(1, description="store every N-th step only, and the last [-]")
 
 
 class Picture(Table):

@@ -165,7 +165,7 @@ def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> 
     """Run, and store each frame when it is done; those before a failure stay (collective)."""
     lattice, embedding = simulation.model.lattice, simulation.model.embedding
     owned = slice(lattice.owned)
-    file.start_frames(simulation.steps + 1, lattice.owned, embedding.points if embedding else None)
+    file.start_frames(simulation.stored, lattice.owned, embedding.points if embedding else None)
     progress = Progress(simulation.steps, enabled=comm.rank == 0)
     try:
         for frame in simulation.frames():

@@ -9,11 +9,12 @@ import numpy as np
 class Frame:
     """One time of a run. Arrays hold this rank's rows; the numbers are of the whole body.
 
+    index      : number of the step that it shows, 0 for the start
     position   : (n_local, 3) node positions [m]
     surface    : (v_local, 3) surface points [m], or None where the scene does not ask for them
-    step_error : bound on the relative error of the step (0 for frame 0)
-    iterations : outer (SNES) iterations of the step
-    ksp_its    : KSP iterations of the step, summed
+    step_error : bound on the relative error of a step, the greatest since the frame stored before (0 for frame 0)
+    iterations : outer (SNES) iterations of these steps, summed
+    ksp_its    : KSP iterations of these steps, summed
     momentum   : (3,) [kg m/s]
     """
 
@@ -29,4 +30,4 @@ class Frame:
     potential: float  # [J]
     contact: float  # [J] in the penalty springs of obstacles
     momentum: np.ndarray
-    wall_time: float  # [s] that the step took
+    wall_time: float  # [s] that these steps took

@@ -36,10 +36,12 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 
 @dataclass(frozen=True)
 class StepResult:
-    """position (l, 3) [m], ghosts included; error: bound on the relative error of the step; iterations
-    of SNES; ksp_its, the KSP iterations of all of them."""
+    """position (l, 3) [m], ghosts included; previous (l, 3) [m]: q_(n-1) for the next step, so that the velocity
+    is (position - previous) / t; error: bound on the relative error of the step; iterations of SNES; ksp_its, the
+    KSP iterations of all of them."""
 
     position: np.ndarray
+    previous: np.ndarray
     error: float
     iterations: int
     ksp_its: int
@@ -162,7 +164,7 @@ class Stepper:
         iterations, ksp_its = (0, 0) if self._is_solved() else self._solve()
         self.unknowns.to_nodes(self.x, self.q)
         self.corrections = [self.q - self.y, *self.corrections[:1]]
-        return StepResult(self.q.copy(), self.last_error, iterations, ksp_its)
+        return StepResult(self.q.copy(), q, self.last_error, iterations, ksp_its)
 
     def _is_solved(self) -> bool:
         """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""

@@ -9,7 +9,6 @@ import pytest
 from mpi4py import MPI
 
 from msmpetsc.model.elasticity import Elasticity
-from msmpetsc.model.lattice import NO_CELLS
 
 STUDY = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "material_study"))
 ACROSS, slope = STUDY["ACROSS"], STUDY["slope"]
@@ -25,7 +24,7 @@ def test_the_matrix_is_the_products_own_hessian_at_rest():
     lattice = STUDY["box"]((4, 3, 2), 0.1)
     v = np.random.default_rng(0).standard_normal(lattice.nodes.shape)
     product = np.zeros_like(v)
-    Elasticity(MPI.COMM_SELF, lattice).add_hessian(lattice.nodes, NO_CELLS, False, v, product)
+    Elasticity(MPI.COMM_SELF, lattice).hessian_at(lattice.nodes).add_product(v, product)
     np.testing.assert_allclose((STUDY["hessian"](lattice) @ v.ravel()).reshape(-1, 3), product, atol=1e-9)
 
 

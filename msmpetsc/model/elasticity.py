@@ -3,7 +3,13 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.energy import add_elastic_gradient, add_elastic_hessian, elastic_change, elastic_energy
+from msmpetsc.model.energy import (
+    add_elastic_gradient,
+    add_elastic_product,
+    elastic_change,
+    elastic_energy,
+    elastic_hessian,
+)
 from msmpetsc.model.inversion import (
     add_resistance_gradient,
     add_resistance_hessian,
@@ -58,13 +64,25 @@ class Elasticity:
         cells, volume, _ = self.cells
         return cells[least_volumes(q, cells) < volume]
 
-    def add_hessian(
-        self, q: np.ndarray, resisting: np.ndarray, projected: bool, v: np.ndarray, product: np.ndarray
-    ) -> None:
-        """Add (Hessian of E at q) v [N] to ``product`` (l, 3); ``resisting``: the cells that do at q.
+    def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
+        """The Hessian of E at q.
 
-        projected : leave out its negative parts
+        projected : without its negative parts, as of compressed springs
         """
-        add_elastic_hessian(q, *self.all, projected, v, product)
+        return Hessian(self, q, self.resisting(q), projected)
+
+
+class Hessian:
+    """The Hessian of E at one q, ready for many products; ``resisting``: the cells that do there."""
+
+    def __init__(self, elasticity: Elasticity, q: np.ndarray, resisting: np.ndarray, projected: bool):
+        self.springs, self.blocks = elasticity.all[0], elastic_hessian(q, *elasticity.all, projected)
+        self.resisting, self.projected = resisting, projected
         if len(resisting):
-            add_resistance_hessian(q, resisting, *self.cells[1:], projected, v, product)
+            self.q, self.law = q.copy(), elasticity.cells[1:]
+
+    def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
+        """Add Hessian v [N] to ``product`` (l, 3)."""
+        add_elastic_product(self.springs, self.blocks, v, product)
+        if len(self.resisting):
+            add_resistance_hessian(self.q, self.resisting, *self.law, self.projected, v, product)

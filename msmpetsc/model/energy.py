@@ -88,28 +88,24 @@ def add_elastic_gradient(
 
 
 @numba.njit(cache=True)
-def add_elastic_hessian(
+def elastic_hessian(
     q: np.ndarray,
     springs: np.ndarray,
     rest_length: np.ndarray,
     stiffness: np.ndarray,
     stiffening: float,
     projected: bool,
-    v: np.ndarray,
-    product: np.ndarray,
-) -> None:
-    """Add (Hessian of E at q) v [N] to ``product`` (l, 3).
+) -> np.ndarray:
+    """Hessian of E at q as (s, 4) numbers c, e [N/m], [sqrt(N/m)]: the block of a spring is c I + e e^T.
 
-    A spring's block is k ((1 + 3 b s^2) d d^T + (1 - r/l) (1 + b s^2) (I - d d^T)), d its direction and l its
-    length; ``projected`` leaves out the negative part that a compressed spring has across its direction,
-    so that the whole is positive semidefinite.
+    It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length; ``projected``
+    leaves out the negative part that a compressed spring has across, so that the whole is positive semidefinite.
     """
+    blocks = np.empty((len(springs), 4))
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
-        u, v_, w = v[a, 0] - v[b, 0], v[a, 1] - v[b, 1], v[a, 2] - v[b, 2]
-        squared = max(x * x + y * y + z * z, TINY)
-        length, tangent = np.sqrt(squared), 1.0
+        length, tangent = np.sqrt(max(x * x + y * y + z * z, TINY)), 1.0
         across = 1.0 - rest_length[s] / length
         if stiffening > 0.0:
             strain = length / rest_length[s] - 1.0
@@ -117,13 +113,38 @@ def add_elastic_hessian(
             across *= 1.0 + stiffening * strain * strain
         if projected:
             across = max(across, 0.0)
-        along = (tangent - across) * (x * u + y * v_ + z * w) / squared
-        fx = stiffness[s] * (across * u + along * x)
-        fy = stiffness[s] * (across * v_ + along * y)
-        fz = stiffness[s] * (across * w + along * z)
-        product[a, 0] += fx
-        product[a, 1] += fy
-        product[a, 2] += fz
+        along = np.sqrt(stiffness[s] * (tangent - across)) / length  # across is never the greater
+        blocks[s, 0] = stiffness[s] * across
+        blocks[s, 1], blocks[s, 2], blocks[s, 3] = along * x, along * y, along * z
+    return blocks
+
+
+@numba.njit(cache=True)
+def add_elastic_product(springs: np.ndarray, blocks: np.ndarray, v: np.ndarray, product: np.ndarray) -> None:
+    """Add (Hessian of E) v [N] to ``product`` (l, 3), its ``blocks`` those of elastic_hessian.
+
+    Springs of the same first end follow each other: what they have in common is read and written once.
+    """
+    first, x, y, z, sx, sy, sz = -1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(len(springs)):
+        a, b = springs[s, 0], springs[s, 1]
+        if a != first:
+            if first >= 0:
+                product[first, 0] += sx
+                product[first, 1] += sy
+                product[first, 2] += sz
+            first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], 0.0, 0.0, 0.0
+        dx, dy, dz = x - v[b, 0], y - v[b, 1], z - v[b, 2]
+        c, ex, ey, ez = blocks[s, 0], blocks[s, 1], blocks[s, 2], blocks[s, 3]
+        along = ex * dx + ey * dy + ez * dz
+        fx, fy, fz = c * dx + along * ex, c * dy + along * ey, c * dz + along * ez
+        sx += fx
+        sy += fy
+        sz += fz
         product[b, 0] -= fx
         product[b, 1] -= fy
         product[b, 2] -= fz
+    if first >= 0:
+        product[first, 0] += sx
+        product[first, 1] += sy
+        product[first, 2] += sz

@@ -69,30 +69,26 @@ class ThreeColumns:
 
 
 class TrueHessian:
-    """M + t^2 (Hessian of E) at the positions last linearised about, applied spring by spring.
-
-    ``projected`` leaves out its negative parts, as of compressed springs (model.energy).
-    """
+    """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring."""
 
     def __init__(
         self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, contact: ContactBlocks | None = None
     ):
         self.unknowns, self.elasticity, self.t2, self.contact = unknowns, elasticity, time_step**2, contact
         lattice = unknowns.lattice
-        self.q = np.empty_like(lattice.nodes)
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
-        self.projected = False
 
-    def linearise(self, q: np.ndarray) -> None:
-        """Take the Hessian at positions q (l, 3)."""
-        self.q[:] = q
-        self.resisting = self.elasticity.resisting(q)
+    def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool = False) -> None:
+        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.energy)."""
+        self.elastic = self.elasticity.hessian_at(q, projected)
+        if self.contact:
+            self.contact.linearise(contact, q, True)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
-        self.elasticity.add_hessian(self.q, self.resisting, self.projected, self.v, self.product)
+        self.elastic.add_product(self.v, self.product)
         lattice, free = self.unknowns.lattice, self.unknowns.free
         scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
         if self.contact:
@@ -107,17 +103,20 @@ def scaled_sum(rows, mass, a, t2, b, columns):
             columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]
 
 
-class ScalarPreconditioner:
-    """Any PETSc preconditioner of the scalar A, applied to the three columns in one call (a PCPYTHON context).
+class Preconditioner:
+    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
 
-    It is this inner one that the options -pc_... set, for every preset: A is also what the true
-    Hessian is preconditioned with. MUMPS solves for all three right-hand sides at once.
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
+    preconditioned with.
+
+    matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
     """
 
-    def __init__(self, matrix: PETSc.Mat):
+    def __init__(self, matrix: PETSc.Mat, columns: int, prefix: str):
         self.pc = PETSc.PC().create(matrix.comm)
+        self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
-        self.input, self.output = Block(matrix), Block(matrix)
+        self.blocks = [Block(matrix), Block(matrix)] if columns > 1 else []
 
     def setFromOptions(self, _: PETSc.PC) -> None:  # noqa: N802 (PETSc's name)
         self.pc.setFromOptions()
@@ -126,15 +125,19 @@ class ScalarPreconditioner:
         self.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.input.values[:] = x.array_r
-        self.pc.matApply(self.input.mat, self.output.mat)
-        y.array[:] = self.output.values
+        if not self.blocks:
+            self.pc.apply(x, y)
+            return
+        given, found = self.blocks
+        given.values[:] = x.array_r
+        self.pc.matApply(given.mat, found.mat)
+        y.array[:] = found.values
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.pc.view(viewer)
 
     def destroy(self, _: PETSc.PC) -> None:
-        for part in (self.input, self.output, self.pc):
+        for part in (*self.blocks, self.pc):
             part.destroy()
 
 

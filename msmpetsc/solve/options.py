@@ -16,6 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.solve.library import Integer, petsc_library
 
 READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view)$")
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
@@ -49,16 +50,11 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False) -> None:
         raise InputError(message)
 
 
-def _library() -> ctypes.CDLL:
-    return ctypes.CDLL(PETSc.__file__)  # petsc4py's extension; its symbols include those of libpetsc
-
-
 def _left() -> list[str]:
     """Names of the options that have not been looked at (PetscOptionsLeftGet, which petsc4py lacks)."""
-    library = _library()
-    integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
+    library = petsc_library()
     strings = ctypes.POINTER(ctypes.c_char_p)
-    count, names, values = integer(), strings(), strings()
+    count, names, values = Integer(), strings(), strings()
     library.PetscOptionsLeftGet(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
     left = [names[i].decode() for i in range(count.value)]
     library.PetscOptionsLeftRestore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))

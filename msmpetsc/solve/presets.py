@@ -20,6 +20,8 @@ class Preset:
     start_from_b : CG starts from x = b, as in the paper's Algorithm 1
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None iterates to the error target
+    inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
+    kronecker    : A is factored as A (x) I_3, 3m x 3m
     """
 
     about: str
@@ -28,6 +30,8 @@ class Preset:
     start_from_b: bool = False
     extrapolate: bool = True
     iterations: int | None = None
+    inexact: bool = False
+    kronecker: bool = False
 
 
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
@@ -44,6 +48,16 @@ NEWTON = {
     "ksp_rtol": "1e-1",
 }
 
+LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
+    "npc_snes_type": "newtonls",
+    "npc_snes_linesearch_type": "basic",
+    "npc_snes_max_it": "1",
+    "npc_snes_norm_schedule": "none",
+    "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
+    **JACOBI_CG,
+    "ksp_rtol": "1e-1",
+}
+
 PRESETS = {
     "anderson": Preset(
         "Anderson-accelerated local/global steps with loose CG solves: the default",
@@ -52,30 +66,73 @@ PRESETS = {
             "snes_anderson_m": "5",
             "snes_npc_side": "left",
             "snes_max_it": "300",
-            "npc_snes_type": "newtonls",
-            "npc_snes_linesearch_type": "basic",
-            "npc_snes_max_it": "1",
-            "npc_snes_norm_schedule": "none",
-            "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
+            **LOCAL_GLOBAL,
+        },
+        inexact=True,
+    ),
+    "ngmres": Preset(
+        "Nonlinear GMRES over the same steps, its own line search: where anderson runs astray",
+        {
+            "snes_type": "ngmres",
+            "snes_ngmres_m": "5",
+            "snes_max_it": "300",
+            **NO_STOP_BY_SIZE,
+            **LOCAL_GLOBAL,
+        },
+        inexact=True,
+    ),
+    "lbfgs": Preset(
+        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search",
+        {
+            "snes_type": "qn",
+            "snes_qn_type": "lbfgs",
+            "snes_qn_scale_type": "jacobian",
+            "snes_qn_restart_type": "none",
+            "snes_qn_m": "5",
+            "snes_linesearch_type": "bt",
+            "snes_max_it": "300",
+            **NO_STOP_BY_SIZE,
             **JACOBI_CG,
             "ksp_rtol": "1e-1",
         },
+        inexact=True,
+    ),
+    "chebyshev": Preset(
+        "Wang 2015: local/global steps with Chebyshev's weights, no inner products: for many cores or a GPU",
+        {
+            "snes_type": "python",
+            "snes_python_type": "msmpetsc.solve.chebyshev.Chebyshev",
+            "snes_max_it": "1000",
+            **NO_STOP_BY_SIZE,
+            **JACOBI_CG,
+            "ksp_rtol": "1e-1",
+        },
+        inexact=True,
     ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the reference, the most accurate, the most robust",
         NEWTON,
         true_hessian=True,
+        inexact=True,
     ),
     "newton-multigrid": Preset(
         "The same with algebraic multigrid for A: long steps, stiff bodies, fine lattices",
         {**NEWTON, "pc_type": "gamg"},
         true_hessian=True,
+        inexact=True,
     ),
     "fast-msm": Preset(
         "Liu et al. 2013: ten local/global steps, each one solve with a prefactored Cholesky",
         {**PLAIN, **CHOLESKY},
         extrapolate=False,
         iterations=10,
+    ),
+    "fast-msm-kronecker": Preset(
+        "The same as the seed paper must have had it: the factor of A (x) I_3, 3m x 3m; only to compare with",
+        {**PLAIN, **CHOLESKY},
+        extrapolate=False,
+        iterations=10,
+        kronecker=True,
     ),
     "paper": Preset(
         "Zheng et al.: the same ten steps with plain CG from x = b to a fixed tolerance",
@@ -105,17 +162,17 @@ def find_preset(name: str) -> Preset:
     return PRESETS[name]
 
 
-def set_defaults(preset: Preset) -> set[str]:
+def set_defaults(preset: Preset, prefix: str = "") -> set[str]:
     """Put the preset's options into PETSc's database where the user has set none; returns their names."""
     database = PETSc.Options()
-    given = database.getAll()
-    ours = preset.options.keys() - given.keys()
+    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix)}
+    ours = preset.options.keys() - given
     for chosen, bound in BOUND_TO_TYPE.items():
         if chosen in given:
             ours -= bound
     for name in ours:
-        database.setValue(name, preset.options[name] or None)
-    return ours
+        database.setValue(prefix + name, preset.options[name] or None)
+    return {prefix + name for name in ours}
 
 
 def forget_defaults(names: set[str]) -> None:

@@ -1,9 +1,6 @@
-"""One implicit Euler step as one PETSc SNES (design: one step, many methods).
+"""One implicit Euler step as one PETSc SNES (design: one step, many methods): it solves F(x) = grad g(x) = 0."""
 
-A step minimises g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), y = 2 q_n - q_(n-1)
-(paper Eq. 10-12), so it solves F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext) = 0.
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +11,10 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
-from msmpetsc.solve.operators import (
-    ContactBlocks,
-    ScalarPreconditioner,
-    ThreeColumns,
-    TrueHessian,
-    python_matrix,
-    scaled_sum,
-)
+from msmpetsc.solve.estimate import ErrorEstimate
+from msmpetsc.solve.functional import StepFunctional
+from msmpetsc.solve.library import total_iterations
+from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
@@ -30,6 +23,11 @@ DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell
 ROUNDINGS = 3  # of a row of F: in free fall one was passed now and then
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
+FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
+EARLY = 2.0  # a step is first looked at closely when its error is thought to be this many times what would do
+LOOSEST = 0.3  # ksp_rtol
+SHARE = 0.3  # of the error that would do, left to the linear solve
+LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
@@ -37,8 +35,8 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 @dataclass(frozen=True)
 class StepResult:
     """position (l, 3) [m], ghosts included; previous (l, 3) [m]: q_(n-1) for the next step, so that the velocity
-    is (position - previous) / t; error: bound on the relative error of the step; iterations of SNES; ksp_its, the
-    KSP iterations of all of them."""
+    is (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
+    the KSP iterations of all of them, and of the estimates."""
 
     position: np.ndarray
     previous: np.ndarray
@@ -53,11 +51,14 @@ class Stepper:
     error          : relative error at which a step is done; None for the preset's own rule
     max_iterations : a budget instead of a promise: the step is taken as it is then
     touches        : whether steps may be given a ``contact``
+    prefix         : of its PETSc options
 
-    The error of x is measured as |F(x)|_(M^-1) / |x - y|_M. It bounds the relative position error
-    |x - x*|_M / |x - y|_M wherever E is convex between x and x*, for there the Hessian of g is at
-    least M.
+    The error of x is |x - x*|_M / |x - y|_M, estimated (solve.estimate). |F(x)|_(M^-1) / |x - y|_M bounds it
+    wherever E is convex between x and x*; where that will do already, or no estimate can be had, it is what is said.
+    ``observer`` is called at each iterate, when its error is known.
     """
+
+    observer: Callable[["Stepper"], None] | None = None
 
     def __init__(
         self,
@@ -68,21 +69,22 @@ class Stepper:
         error: float | None = None,
         max_iterations: int | None = None,
         touches: bool = False,
+        prefix: str = "",
     ):
-        self.comm, self.lattice, self.preset = comm, lattice, preset
+        self.comm, self.lattice, self.preset, self.prefix = comm, lattice, preset, prefix
         self.elasticity = Elasticity(comm, lattice)
         self.t2 = time_step**2
         published = preset.iterations if error is None else None
         self.budget = max_iterations or published
         self.error = error if error is not None or self.budget else DEFAULT_ERROR
         self.unknowns = Unknowns(comm, lattice)
-        self.q, self.y, self.base = (np.empty_like(lattice.nodes) for _ in range(3))
-        self.gradient = np.empty_like(lattice.nodes)
-        self.load = np.zeros((lattice.owned, 3))
+        self.functional = StepFunctional(comm, self.unknowns, self.elasticity, time_step)
+        self.base = np.empty_like(lattice.nodes)
         self.corrections = []  # x - y of the last steps, at most two, the newest first
-        self.inverse_mass = np.tile(1 / lattice.mass[self.unknowns.free], 3)
+        self.ratio, self.its = FIRST_RATIO, 0
+        self.local = PETSc.Log.Event(LOCAL_EVENT)
         self.owned_objects = [self.unknowns]
-        self.defaults = set_defaults(preset)
+        self.defaults = set_defaults(preset, prefix)
         try:
             self._create_solver(time_step, touches)
             self.rounding = self._rounding_of_residual()
@@ -91,31 +93,30 @@ class Stepper:
             raise InputError(f"PETSc refuses its options: {last_words(error)}") from None
 
     def _create_solver(self, time_step: float, touches: bool) -> None:
-        self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step))
+        self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step, prefix=self.prefix))
         self.contact_blocks = ContactBlocks(self.unknowns, time_step) if touches else None
-        # contact changes what A is preconditioned with, but not A
-        self.preconditioner = self._keep(self.matrix.copy()) if touches else self.matrix
-        self.scalar = self._keep(self.matrix.createVecLeft())
-        self.matrix.getDiagonal(self.scalar)
-        self.diagonal = self.scalar.array_r.copy()
-        self.added = np.zeros(self.unknowns.size)  # to the preconditioner's diagonal
-        if self.preset.true_hessian:
-            context = self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self.contact_blocks)
-        else:
-            context, self.hessian = ThreeColumns(self.matrix, self.contact_blocks), None
+        self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self.contact_blocks)
+        self.projected = False  # whether newton's is, at the moment
+        context = self.hessian
+        if not self.preset.true_hessian:
+            context = ThreeColumns(self.matrix, ContactBlocks(self.unknowns, time_step) if touches else None)
+        self.linear = context
         self.operator = self._keep(python_matrix(self.unknowns, context, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
-        self.ksp = self._keep(PETSc.KSP().create(self.comm))
-        pc = self.ksp.getPC()
-        pc.setOptionsPrefix("three_columns_")  # leaves the bare -pc_ to the scalar preconditioner
-        pc.setType(PETSc.PC.Type.PYTHON)
-        pc.setPythonContext(ScalarPreconditioner(self.preconditioner))
+        preconditioner = self._create_preconditioner(time_step, touches)
         self.snes = self._keep(PETSc.SNES().create(self.comm))
+        self.snes.setOptionsPrefix(self.prefix)
         self.inner = self.snes
-        if "npc_snes_type" in PETSc.Options().getAll():
+        if f"{self.prefix}npc_snes_type" in PETSc.Options().getAll():
             self.inner = self._keep(self.snes.getNPC())
-        self.inner.setKSP(self.ksp)
+        self.ksp = self._keep(self.inner.getKSP())
+        self.ksp.setOptionsPrefix(self.prefix)
+        pc = self.ksp.getPC()
+        pc.setOptionsPrefix(f"{self.prefix}three_columns_")  # leaves the bare -pc_ to the preconditioner of A
+        pc.setType(PETSc.PC.Type.PYTHON)
+        pc.setPythonContext(preconditioner)
+        self.estimate = self._keep(ErrorEstimate(self.functional, self.hessian, preconditioner, self.prefix))
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.operator, self.operator)
         self.snes.setObjective(self._objective)
@@ -123,6 +124,23 @@ class Stepper:
         if self.preset.start_from_b:
             self.ksp.setInitialGuessNonzero(True)
         self.snes.setFromOptions()
+        # the user's own tolerance is left alone
+        self.adapts = self.preset.inexact and f"{self.prefix}ksp_rtol" in self.defaults
+        self.tightest = self.ksp.getTolerances()[0]
+
+    def _create_preconditioner(self, time_step: float, touches: bool) -> Preconditioner:
+        """Of A, or of A (x) I_3; contact changes what A is preconditioned with, but not A."""
+        self.preconditioned, columns = self.matrix, 1
+        if self.preset.kronecker:
+            columns = 3
+            self.preconditioned = self._keep(assemble(self.comm, self.unknowns, time_step, columns, self.prefix))
+        elif touches:
+            self.preconditioned = self._keep(self.matrix.copy())
+        self.scalar = self._keep(self.preconditioned.createVecLeft())
+        self.preconditioned.getDiagonal(self.scalar)
+        self.diagonal = self.scalar.array_r.copy()
+        self.added = np.zeros_like(self.diagonal)  # to the preconditioner's diagonal
+        return Preconditioner(self.preconditioned, 3 // columns, self.prefix)
 
     def _keep(self, owned: PETSc.Object) -> PETSc.Object:
         self.owned_objects.append(owned)
@@ -146,25 +164,34 @@ class Stepper:
         load: np.ndarray,
         contact: Contact | None = None,
         led: np.ndarray | None = None,
+        start: np.ndarray | None = None,
     ) -> StepResult:
         """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included.
 
         load    : force (owned, 3) [N]
         contact : what presses on the nodes in this step
         led     : q_n with the held nodes where they will be, (l, 3) [m]; q_n itself if they stay
+        start   : a first guess (l, 3) [m]; the best of several if None
 
         Raises StepFailed on all ranks.
         """
-        self.y = 2 * q - q_previous
-        self.load, self.contact = load, contact
-        self.q[:] = self.base[:] = q if led is None else led  # held nodes stay there
-        self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
-        self.last_error = self.residual = np.inf
-        self._first_guess(q)
-        iterations, ksp_its = (0, 0) if self._is_solved() else self._solve()
-        self.unknowns.to_nodes(self.x, self.q)
-        self.corrections = [self.q - self.y, *self.corrections[:1]]
-        return StepResult(self.q.copy(), q, self.last_error, iterations, ksp_its)
+        self.functional.begin(q, q_previous, load, contact, led)
+        self.base[:] = self.functional.q
+        self.bound = self.last_error = self.residual = np.inf
+        self.early, self.corrected = EARLY, False
+        if start is None:
+            self._first_guess(q)
+        else:
+            self.unknowns.from_nodes(start, self.x)
+        iterations = 0 if self._is_solved() else self._solve()
+        functional, its_before, self.its = self.functional, self.its, self._all_its()
+        self.unknowns.to_nodes(self.x, functional.q)
+        self.corrections = [functional.q - functional.y, *self.corrections[:1]]
+        return StepResult(functional.q.copy(), q, self.last_error, iterations, self.its - its_before)
+
+    def _all_its(self) -> int:
+        """KSP iterations of all steps so far, and of their estimates."""
+        return total_iterations(self.ksp) + total_iterations(self.estimate.ksp)
 
     def _is_solved(self) -> bool:
         """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
@@ -174,32 +201,28 @@ class Stepper:
         self.last_error = self._error_of(self.work)
         return self.last_error <= (self.error or 0.0)
 
-    def _solve(self) -> tuple[int, int]:
-        """SNES iterations and KSP iterations that took x to the solution. Raises StepFailed.
+    def _solve(self) -> int:
+        """SNES iterations that took x to the solution. Raises StepFailed.
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
         if its very first direction has negative curvature it climbs, and the line search says so: the
         projected Hessian takes over for some iterations (_linearise).
         """
-        its_before = 0 if self.inner is self.snes else self.inner.getLinearSolveIterations()
         self.snes.solve(None, self.x)
-        # an NPC goes on counting
-        iterations, ksp_its = self.snes.its, self.inner.getLinearSolveIterations() - its_before
-        most = self.snes.getTolerances()[3]
+        iterations, most = self.snes.its, self.snes.getTolerances()[3]
         while self._climbs() and iterations < most:
-            self.hessian.projected = True
+            self.projected = True
             self.snes.solve(None, self.x)
-            iterations, ksp_its = iterations + self.snes.its, ksp_its + self.inner.getLinearSolveIterations()
+            iterations += self.snes.its
             if self.snes.its == 0:  # neither Hessian leads on
                 break
-        if self.hessian:
-            self.hessian.projected = False
+        self.projected = False
         if self.snes.reason < 0:
             raise StepFailed(self._failure())
-        return iterations, ksp_its
+        return iterations
 
     def _climbs(self) -> bool:
-        return self.hessian is not None and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
+        return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
 
     def _first_guess(self, q: np.ndarray) -> None:
         """Put the start of least g into x.
@@ -209,13 +232,14 @@ class Stepper:
         q_n, which after an impact is not folded over as y may be, moved by what the free flight moves on average
         where nothing is held, so that a step that stops early keeps the momentum.
         """
-        guesses = [self.y]
+        y = self.functional.y
+        guesses = [y]
         if self.preset.extrapolate:
-            flight = self.y.copy()
-            flight[: self.lattice.owned] += self.t2 * self.load / self.lattice.mass[:, None]
+            flight = y.copy()
+            flight[: self.lattice.owned] += self.t2 * self.functional.load / self.lattice.mass[:, None]
             guesses += [flight, q + self._drift(flight - q)]
             if self.corrections:
-                guesses.append(self.y + 2 * self.corrections[0] - self.corrections[-1])
+                guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         values = []
         for guess in guesses:
             self.unknowns.from_nodes(guess, self.x)
@@ -231,22 +255,9 @@ class Stepper:
         return sums[:3] / sums[3]
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """F(x) = M (x - y) + t^2 (grad E(x) - f_ext)."""
-        self.unknowns.to_nodes(x, self.q)
-        self.gradient[:] = 0
-        self.elasticity.add_gradient(self.q, self.gradient)
-        owned = self.lattice.owned
-        self.gradient[:owned] -= self.load
-        if self.contact:
-            self.contact.add_gradient(self.q, self.gradient)
-        scaled_sum(
-            self.unknowns.free,
-            self.lattice.mass,
-            self.q[:owned] - self.y[:owned],
-            self.t2,
-            self.gradient,
-            f.array.reshape(3, -1),
-        )
+        self.local.begin()
+        self.functional.gradient_at(x, f)
+        self.local.end()
 
     def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
         """g(x) - g(base): a line search compares values, and their difference must keep its digits.
@@ -254,43 +265,44 @@ class Stepper:
         Close to the solution g falls by less than the rounding of x changes it: then any move is called
         a fall, so that Newton's full step is taken.
         """
-        self.unknowns.to_nodes(x, self.q)
-        owned = slice(self.lattice.owned)
-        moved = self.q[owned] - self.base[owned]
-        inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + self.base[owned] - 2 * self.y[owned])).sum(axis=1)
-        elastic = self.elasticity.change(self.q, self.base) - (moved * self.load).sum()
-        if self.contact:
-            elastic += self.contact.change(self.q, self.base)
-        change, distance = self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()]))
-        return -1.0 if self.last_error < FULL_STEP_ERROR and distance > 0 else change
+        self.local.begin()
+        change, distance = self.functional.change(x, self.base)
+        self.local.end()
+        return -1.0 if self.bound < FULL_STEP_ERROR and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: A is constant, only the true Hessian and contact depend on x."""
         if self.preset.start_from_b:
             self._start_from_b(snes, x)
-        changed = False
-        if self.hessian or self.contact_blocks:
-            self.unknowns.to_nodes(x, self.base)
-        if self.contact_blocks:
-            self.contact_blocks.linearise(self.contact, self.base, self.preset.true_hessian)
-            changed = self._precondition_contact()
-        if self.hessian:
-            self.hessian.linearise(self.base)
-            self.hessian.projected = self.hessian.projected and snes.its < PROJECTED
-        if self.hessian or changed:
+        self.local.begin()
+        self.unknowns.to_nodes(x, self.base)
+        contact = self.functional.contact
+        if self.preset.true_hessian:
+            self.projected = self.projected and snes.its < PROJECTED
+            given = self.corrected and not self.projected  # the estimate has linearised at this very x
+            if not given:
+                self.hessian.linearise(self.base, contact, self.projected)
+            self._start_from_estimate(snes, given)
+        elif self.contact_blocks:
+            self.linear.contact.linearise(contact, self.base, False)
+        changed = self.contact_blocks is not None and self._precondition_contact()
+        if self.preset.true_hessian or changed:
             self.operator.assemble()
+        self.local.end()
 
     def _precondition_contact(self) -> bool:
         """Add to the preconditioner's diagonal what bounds the contact blocks; whether that changed it.
 
         A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
         """
-        bound = self.contact.bound(self.base)[self.unknowns.free] if self.contact else np.zeros(self.unknowns.size)
+        contact = self.functional.contact
+        bound = contact.bound(self.base)[self.unknowns.free] if contact else np.zeros(self.unknowns.size)
+        bound = np.tile(bound, len(self.diagonal) // max(len(bound), 1))
         changed = self.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR)
         if changed:
             self.added = bound
             self.scalar.array[:] = self.diagonal + self.t2 * bound
-            self.preconditioner.setDiagonal(self.scalar)
+            self.preconditioned.setDiagonal(self.scalar)
         return changed
 
     def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
@@ -300,34 +312,62 @@ class Stepper:
         z.aypx(-1.0, x)
         z.axpy(1.0, f)
 
+    def _start_from_estimate(self, snes: PETSc.SNES, given: bool) -> None:
+        """CG goes on from what the estimate at this x, if it was ``given``, found of the same correction."""
+        if given:
+            self.estimate.correction.copy(snes.getSolutionUpdate())
+        self.ksp.setInitialGuessNonzero(given)
+
     def _error_of(self, f: PETSc.Vec) -> float:
-        """|F|_(M^-1) / |x - y|_M at the positions self.q; 0 where F is nothing but rounding."""
-        f = f.array_r
-        free = self.unknowns.free
-        away = ((self.q[free] - self.y[free]) ** 2).sum(axis=1) @ self.lattice.mass[free]
-        residual, away = np.sqrt(self.comm.allreduce(np.array([f * self.inverse_mass @ f, away])))
-        self.residual = residual
-        if residual <= self.rounding * self.reach:
+        """Relative error at the positions functional.q, where F is f; the bound on it while that is far too much."""
+        functional, enough = self.functional, self.error or 0.0
+        self.corrected = False
+        self.residual, away = functional.dual_norm(f), functional.away()
+        if self.residual <= self.rounding * functional.reach:  # F is nothing but rounding
+            self.bound = 0.0
             return 0.0
-        return residual / away if away > 0 else np.inf  # the start x = y tells nothing yet
+        if not away > 0 or not np.isfinite(self.residual):  # the start x = y tells nothing yet
+            return np.inf
+        self.bound = self.residual / away
+        if self.bound <= enough or self.bound > self.ratio * self.early * enough:
+            return self.bound
+        return self._estimated(f, away, enough)
+
+    def _estimated(self, f: PETSc.Vec, away: float, enough: float) -> float:
+        error = self.estimate(f, EARLY * enough * away if enough else np.inf) / away
+        if not np.isfinite(error):
+            return self.bound
+        self.ratio, self.early, self.corrected = max(self.bound / error, 1.0), 1.0, True
+        return error
 
     def _rounding_of_residual(self) -> float:
         """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: some eps of each row's diagonal."""
-        rows = 3 * (ROUNDINGS * np.finfo(float).eps * self.diagonal) ** 2 @ self.inverse_mass[: self.unknowns.size]
-        return np.sqrt(self.comm.allreduce(rows))
+        self.work.array[:] = np.tile(ROUNDINGS * np.finfo(float).eps * self.diagonal[: self.unknowns.size], 3)
+        return self.functional.dual_norm(self.work)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         reasons = PETSc.SNES.ConvergedReason
         # with an NPC on the left SNES's own function is not F
         self._residual(snes, snes.getSolution(), self.work)
         self.last_error = self._error_of(self.work)
+        if self.observer:
+            self.observer(self)
         if not np.isfinite(self.residual):
             return reasons.DIVERGED_FNORM_NAN
         if self.last_error <= (self.error or 0.0):
             return reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
+            self.last_error = self._estimated(self.work, self.functional.away(), 0.0)
             return reasons.CONVERGED_ITS
+        if self.adapts:
+            self._loosen()
         return reasons.ITERATING
+
+    def _loosen(self) -> None:
+        """Let the next linear solve leave what the step can do with: it need not gain more digits than are missing."""
+        missing = self.bound / self.ratio
+        rtol = SHARE * (self.error or 0.0) / missing
+        self.ksp.setTolerances(rtol=min(max(rtol, self.tightest), LOOSEST))
 
     def _failure(self) -> str:
         advice = "a smaller time.step, another preset (newton), or a looser solver.error"

@@ -11,8 +11,13 @@ from scipy.sparse import coo_array
 from msmpetsc.solve.unknowns import Unknowns
 
 
-def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float) -> PETSc.Mat:
-    """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective)."""
+def assemble(
+    comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int = 1, prefix: str = ""
+) -> PETSc.Mat:
+    """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
+
+    columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A
+    """
     lattice = unknowns.lattice
     row = np.full(len(lattice.nodes), -1)
     row[unknowns.free] = np.arange(unknowns.size)
@@ -22,12 +27,15 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float) -> PETSc.Mat:
     diagonal += lattice.mass[unknowns.free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
-    columns = np.concatenate([unknowns.numbers[unknowns.free], unknowns.numbers[ends[kept, 1]]])
+    nodes = np.concatenate([unknowns.free, ends[kept, 1]])
     values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])
-    csr = coo_array((values, (rows, columns)), shape=(unknowns.size, unknowns.total)).tocsr()
+    places = unknowns.numbers[:, None] if columns == 1 else unknowns.places
+    sizes = (columns * unknowns.size, columns * unknowns.total)
+    rows = (rows + unknowns.size * np.arange(columns)[:, None]).ravel()
+    csr = coo_array((np.tile(values, columns), (rows, places[nodes].T.ravel())), shape=sizes).tocsr()
 
-    sizes = (unknowns.size, unknowns.total)
     matrix = PETSc.Mat().create(comm=comm)
+    matrix.setOptionsPrefix(prefix)
     matrix.setSizes((sizes, sizes))
     matrix.setType(PETSc.Mat.Type.AIJ)
     matrix.setOption(PETSc.Mat.Option.SPD, True)

@@ -19,6 +19,7 @@ class Unknowns:
 
     free    : (m,) local numbers of the free owned nodes
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
+    places  : (l, 3) where its x, y and z stand in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
     """
 
@@ -33,15 +34,14 @@ class Unknowns:
         to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
         asked = to_owner.send(lattice.ghosts) - lattice.table.first
         self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
-        # where the x, y, z of a ghost stand in its owner's part of a vector
         place = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        ghost_places = to_owner.answer(place[asked])
-        self._scatter_ghosts(comm, ghost_places)
+        self.places = np.concatenate([place, to_owner.answer(place[asked])])
+        self._scatter_ghosts(comm)
 
-    def _scatter_ghosts(self, comm: MPI.Comm, places: np.ndarray) -> None:
+    def _scatter_ghosts(self, comm: MPI.Comm) -> None:
         owned = self.lattice.owned
         self.free_ghosts = owned + np.flatnonzero(self.numbers[owned:] >= 0)
-        sources = places[self.free_ghosts - owned].ravel().astype(PETSc.IntType)
+        sources = self.places[self.free_ghosts].ravel().astype(PETSc.IntType)
         self.ghost_values = PETSc.Vec().createSeq(len(sources), comm=PETSc.COMM_SELF)
         vector = self.create_vector(comm)
         index = PETSc.IS().createGeneral(sources, comm=comm)

@@ -1,0 +1,74 @@
+"""What one implicit Euler step minimises, its gradient, and how far a gradient is from none.
+
+g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), y = 2 q_n - q_(n-1) (paper Eq. 10-12);
+F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
+"""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.penalty import Contact
+from msmpetsc.solve.operators import scaled_sum
+from msmpetsc.solve.unknowns import Unknowns
+
+
+class StepFunctional:
+    """g of the step that ``begin`` was last told of, at vectors of unknowns. All methods are collective.
+
+    q : (l, 3) [m] positions last looked at, ghosts included
+    y : (l, 3) [m]
+    """
+
+    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
+        self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
+        self.lattice = unknowns.lattice
+        self.q, self.y, self.gradient = (np.empty_like(self.lattice.nodes) for _ in range(3))
+        self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
+
+    def begin(
+        self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
+    ) -> None:
+        """A new step, as Stepper.step takes it."""
+        self.y = 2 * q - q_previous
+        self.load, self.contact = load, contact
+        self.q[:] = q if led is None else led  # held nodes stay there
+        self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
+
+    def gradient_at(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """f = F(x) [kg m]."""
+        self.unknowns.to_nodes(x, self.q)
+        self.gradient[:] = 0
+        self.elasticity.add_gradient(self.q, self.gradient)
+        owned = self.lattice.owned
+        self.gradient[:owned] -= self.load
+        if self.contact:
+            self.contact.add_gradient(self.q, self.gradient)
+        moved = self.q[:owned] - self.y[:owned]
+        scaled_sum(self.unknowns.free, self.lattice.mass, moved, self.t2, self.gradient, f.array.reshape(3, -1))
+
+    def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
+        """g(x) - g(base) [kg m^2] and |x - base|^2 [m^2], base (l, 3): summed so that the difference keeps its digits."""
+        self.unknowns.to_nodes(x, self.q)
+        owned = slice(self.lattice.owned)
+        moved = self.q[owned] - base[owned]
+        inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + base[owned] - 2 * self.y[owned])).sum(axis=1)
+        elastic = self.elasticity.change(self.q, base) - (moved * self.load).sum()
+        if self.contact:
+            elastic += self.contact.change(self.q, base)
+        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()])))
+
+    def norm(self, displacement: PETSc.Vec) -> float:
+        """|v|_M = sqrt(v^T M v)."""
+        return np.sqrt(self.comm.allreduce(displacement.array_r**2 @ self.mass))
+
+    def dual_norm(self, f: PETSc.Vec) -> float:
+        """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
+        return np.sqrt(self.comm.allreduce(f.array_r**2 @ (1 / self.mass)))
+
+    def away(self) -> float:
+        """|q - y|_M over the free nodes: what errors of the step are relative to."""
+        free = self.unknowns.free
+        squared = ((self.q[free] - self.y[free]) ** 2).sum(axis=1) @ self.lattice.mass[free]
+        return np.sqrt(self.comm.allreduce(squared))

@@ -1,0 +1,90 @@
+"""A chart: a figure, the numbers of every point in it, and what it says in plain words."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from msmpetsc.study.charts.look import Look
+from msmpetsc.study.rows import Row
+
+WIDTH = 12.2  # [in], 72 points each: 1171 pixels of the page
+PANEL = 4.3  # [in]: height of the axes with their labels
+LEGEND_ROW = 0.235  # [in]
+EDGE = {"markeredgecolor": "white", "markeredgewidth": 0.6}
+LABEL_WIDTH = 62  # [characters]: a longer label goes on in a second line
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measured point: its curve, its numbers by heading, and the command that repeats it."""
+
+    label: str
+    numbers: dict[str, str]
+    command: str
+
+    def __str__(self) -> str:
+        lines = [self.label, *(f"{name}: {text}" for name, text in self.numbers.items() if text), self.command]
+        return "\n".join(filter(None, lines))
+
+
+@dataclass
+class Chart:
+    """name: of its file; kind: the heading it stands under; points: by panel, then by the id of
+    the group of marks in the SVG that stands for them, in its order;
+    findings: lines in plain words by their heading."""
+
+    name: str
+    kind: str
+    title: str
+    caption: str
+    figure: Figure
+    points: dict[str, dict[str, list[Point]]] = field(default_factory=dict)
+    findings: dict[str, list[str]] = field(default_factory=dict)
+    failed: list[Row] = field(default_factory=list)
+
+    def mark(self, axes: Axes, x: Sequence[float], y: Sequence[float], points: list[Point], look: Look, **style) -> None:
+        """Draws measured points; panels are told apart by their titles."""
+        if not points:
+            return
+        panel = self.points.setdefault(axes.get_title(loc="left"), {})
+        group = f"{self.name}-{sum(map(len, self.points.values()))}"
+        panel[group] = points
+        shape = {"marker": look.marker, "markersize": look.size, "markerfacecolor": look.color} | EDGE | style
+        axes.plot(x, y, linestyle="none", zorder=4, clip_on=False, gid=group, **shape)
+
+
+def new_figure(panels: int, legend: Sequence[str]) -> tuple[Figure, Sequence[Axes]]:
+    """A row of panels with room below for a legend of these labels."""
+    rows, _ = legend_shape(legend)
+    figure = Figure(figsize=(WIDTH, PANEL + 0.35 + rows * LEGEND_ROW), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.06, wspace=0.02)
+    return figure, figure.subplots(1, panels, squeeze=False)[0]
+
+
+def legend_shape(labels: Sequence[str]) -> tuple[int, int]:
+    """Lines and columns of a legend as wide as the figure."""
+    wrapped = [wrap(label) for label in labels]
+    longest = max((len(line) for lines in wrapped for line in lines), default=1)
+    columns = max(1, min(5, len(labels), int(WIDTH / (0.088 * longest + 0.65))))
+    deepest = max(map(len, wrapped), default=1)
+    return -(-len(labels) // columns) * deepest, columns
+
+
+def wrap(label: str) -> list[str]:
+    return textwrap.wrap(label, LABEL_WIDTH, break_on_hyphens=False) or [""]
+
+
+def legend_below(figure: Figure, handles: dict[str, Line2D]) -> None:
+    """One legend for all panels, outside the axes."""
+    _, columns = legend_shape(list(handles))
+    labels = ["\n".join(wrap(label)) for label in handles]
+    figure.legend(handles.values(), labels, loc="outside lower center", ncols=columns, handlelength=2.2)
+
+
+def handle(look: Look, line: str = "-") -> Line2D:
+    """What stands for a curve in a legend."""
+    return Line2D([], [], color=look.color, marker=look.marker, linestyle=line, markersize=look.size, **EDGE)

@@ -1,0 +1,95 @@
+"""Convergence within one step: the error over the iterations, and over the seconds."""
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+
+from msmpetsc.study import wording
+from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
+from msmpetsc.study.charts.look import COUNT, ERROR, SECONDS, Look, around, log_ticks
+from msmpetsc.study.rows import grouped
+
+CAPTION = (
+    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their first mark on."
+)
+MANY = 40  # iterates: where there are more, their marks are smaller
+Iterate = dict[str, float | None]
+
+
+def iterates(trace: dict) -> list[Iterate]:
+    """A trace as one dict an iterate; those without a positive error are left out."""
+    names = ("iteration", "ksp_its", "seconds", "position_error", "energy_error")
+    length = len(trace.get("position_error") or [])
+    full = {name: (trace.get(name) or [None] * length)[:length] for name in names}
+    rows = [dict(zip(full, values)) for values in zip(*full.values())]
+    return [row for row in rows if isinstance(row["position_error"], int | float) and 0 < row["position_error"] < 1e300]
+
+
+def convergence_charts(traces: list[dict], looks: dict[str, Look]) -> list[Chart]:
+    """One chart for each scene with traces."""
+    charts = []
+    for scene, entries in grouped(traces, lambda entry: entry["scene"]).items():
+        curves = {entry["label"]: iterates(entry["trace"]) for entry in entries}
+        curves = {label: rows for label, rows in curves.items() if rows}
+        frames = {entry["trace"].get("frame") for entry in entries}
+        if curves:
+            charts.append(convergence_chart(scene, frames, curves, looks))
+    return charts
+
+
+def convergence_chart(scene: str, frames: set, curves: dict[str, list[Iterate]], looks: dict[str, Look]) -> Chart:
+    """Two panels with one vertical scale."""
+    handles = {label: handle(looks[label]) for label in curves}
+    figure, axes = new_figure(2, list(handles))
+    step = f", step {frames.pop()}" if len(frames) == 1 else ""
+    chart = Chart(
+        f"convergence_{scene}", "Convergence within one step", f"Convergence within one step: {scene}{step}", CAPTION, figure
+    )
+    draw(chart, axes[0], "iteration", "over the iterations", "iteration", curves, looks)
+    draw(chart, axes[1], "seconds", "over the computing time", "computing time within the step", curves, looks)
+    legend_below(figure, handles)
+    return chart
+
+
+def draw(chart: Chart, axes: Axes, column: str, title: str, x_label: str, curves: dict, looks: dict[str, Look]) -> None:
+    """One panel."""
+    axes.set_title(title)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel("true step error |x − x*| / |y − x*|")
+    shown = {label: [row for row in rows if row[column] is not None] for label, rows in curves.items()}
+    error_axis(axes, [row["position_error"] for rows in shown.values() for row in rows])
+    axis_from_zero(axes, [row[column] for rows in shown.values() for row in rows], COUNT if column == "iteration" else SECONDS)
+    for label, rows in shown.items():
+        look = looks[label]
+        x, y = [row[column] for row in rows], [row["position_error"] for row in rows]
+        size = look.size if len(rows) <= MANY else look.size / 2
+        axes.plot(x, y, color=look.color, linewidth=1.4)
+        chart.mark(axes, x, y, [point(label, row) for row in rows], look, markersize=size)
+
+
+def error_axis(axes: Axes, errors: Sequence[float]) -> None:
+    axes.set_yscale("log")
+    if errors:
+        axes.set_ylim(around(errors))
+        log_ticks(axes.yaxis, around(errors), ERROR)
+
+
+def axis_from_zero(axes: Axes, values: Sequence[float], formatter) -> None:
+    """0 at the left, logarithmic from the least positive value on: methods differ by powers of ten in their steps."""
+    positive = [value for value in values if value > 0]
+    if positive:
+        axes.set_xscale("symlog", linthresh=min(positive), linscale=0.4)
+        axes.set_xlim(-0.15 * min(positive), 1.3 * max(positive))
+    axes.xaxis.set_major_formatter(formatter)
+
+
+def point(label: str, row: Iterate) -> Point:
+    """The numbers of one iterate."""
+    numbers = {
+        "iteration": wording.count(row["iteration"]),
+        "computing time": wording.seconds(row["seconds"]),
+        "step error": wording.error(row["position_error"]),
+        "energy error": wording.error(row["energy_error"]),
+        "KSP iterations": wording.count(row["ksp_its"]),
+    }
+    return Point(label, numbers, "")

@@ -1,0 +1,179 @@
+"""Speed against accuracy: computing time over the step error, and over the trajectory error, in two panels.
+
+The two errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods
+can be compared by it where the time step is the same. The trajectory error says how far the run is from the true motion
+of the lattice: explicit and implicit runs of any time step can be compared by it.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from msmpetsc.study import wording
+from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
+from msmpetsc.study.charts.look import ERROR, FAINT, INK, SECONDS, Look, log_axes
+from msmpetsc.study.rows import Row, failed, grouped, measured, succeeded
+
+LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
+FRONT = "Pareto front"
+CAPTION = (
+    "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
+    "small and hollow. Ringed points on the grey stair are the Pareto front: nothing measured is both cheaper and more "
+    "exact. The step error is that of solving a step; the trajectory error is that of the whole motion, time step "
+    "included."
+)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One panel: which error, and what it costs."""
+
+    error: str
+    cost: str
+    name: str
+    x_label: str
+    y_label: str
+    unit: str
+
+
+STEP = Measure(
+    "true_error", "time_frame", "step error",
+    "true step error |x − x*| / |y − x*|, rms over steps", "computing time a frame", "a frame",
+)  # fmt: skip
+TRAJECTORY = Measure(
+    "trajectory_error", "time_second", "trajectory error",
+    "trajectory error against a reference with a tiny step", "computing time a simulated second",
+    "a simulated second",
+)  # fmt: skip
+
+
+def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
+    """Indices of the points that no other beats: none is at most as great in both and smaller in one. By rising x."""
+    best, lowest = [], float("inf")
+    for index in sorted(range(len(x)), key=lambda i: (x[i], y[i])):
+        twin = bool(best) and (x[best[-1]], y[best[-1]]) == (x[index], y[index])
+        if y[index] < lowest or twin:
+            best.append(index)
+            lowest = y[index]
+    return best
+
+
+def front_rows(rows: list[Row], measure: Measure) -> list[Row]:
+    """The front of measured rows, by rising error."""
+    return [rows[i] for i in front([row[measure.error] for row in rows], [row[measure.cost] for row in rows])]
+
+
+def cheapest(rows: list[Row], measure: Measure, level: float) -> Row | None:
+    """The row of least cost among those whose measured error is at most this level; nothing is interpolated."""
+    reached = [row for row in measured(rows, measure.error, measure.cost) if row[measure.error] <= level]
+    return min(reached, key=lambda row: row[measure.cost], default=None)
+
+
+def pareto_charts(rows: list[Row], looks: dict[str, Look]) -> list[Chart]:
+    """One chart for each scene, and for each of its cell counts where a method was swept over errors or time steps."""
+    charts = []
+    for scene, here in grouped(rows, lambda row: row["scene"]).items():
+        sizes = grouped(succeeded(here), lambda row: row["cells"])
+        swept = {cells: group for cells, group in sizes.items() if len(sizes) == 1 or is_swept(group)}
+        for cells, group in swept.items():
+            name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{wording.plain(cells)}"
+            chart = pareto_chart(name, scene, cells, group, looks)
+            if chart:
+                chart.failed = failed(here)
+                charts.append(chart)
+    return charts
+
+
+def is_swept(rows: list[Row]) -> bool:
+    """Some method was measured more than once."""
+    return max(Counter(row["label"] for row in rows).values()) > 1
+
+
+def pareto_chart(name: str, scene: str, cells: float | None, rows: list[Row], looks: dict[str, Look]) -> Chart | None:
+    """The panels that have data; None where neither has."""
+    step = common_time_step(measured(rows, STEP.error, STEP.cost))
+    trajectory = measured(rows, TRAJECTORY.error, TRAJECTORY.cost)
+    panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if shown]
+    if not panels:
+        return None
+    labels = dict.fromkeys(row["label"] for _, shown in panels for row in shown)
+    handles = {label: handle(looks[label]) for label in labels}
+    handles[FRONT] = Line2D([], [], color=FAINT, marker="o", markersize=10, markerfacecolor="none", markeredgecolor=INK)
+    figure, axes = new_figure(len(panels), list(handles))
+    where = f"{scene}, {wording.count(cells)} cells" if cells else scene
+    chart = Chart(name, "Speed against accuracy", f"Speed against accuracy: {where}", CAPTION, figure)
+    for ax, (measure, shown) in zip(axes, panels):
+        draw(chart, ax, measure, shown, looks)
+        chart.findings[f"The cheapest by {measure.name}"] = findings(shown, measure)
+    legend_below(figure, handles)
+    return chart
+
+
+def common_time_step(rows: list[Row]) -> list[Row]:
+    """The rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
+    steps = grouped(rows, lambda row: row["time_step"])
+    return max(steps.values(), key=lambda group: (len(group), group[0]["time_step"] or 0), default=[])
+
+
+def draw(chart: Chart, axes: Axes, measure: Measure, rows: list[Row], looks: dict[str, Look]) -> None:
+    """One panel: the front first, the methods over it."""
+    step = wording.seconds(rows[0]["time_step"])
+    axes.set_title(f"over the {measure.name}" + (f", time step {step}" if measure is STEP and step else ""))
+    axes.set_xlabel(measure.x_label)
+    axes.set_ylabel(measure.y_label)
+    log_axes(axes, [row[measure.error] for row in rows], [row[measure.cost] for row in rows], ERROR, SECONDS)
+    draw_front(axes, front_rows(rows, measure), measure)
+    for label, group in grouped(rows, lambda row: row["label"]).items():
+        best = front_rows(group, measure)
+        axes.plot(*columns(best, measure), color=looks[label].color, linewidth=1.6, zorder=3)
+        others = [row for row in group if not any(row is one for one in best)]
+        hollow = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": looks[label].color}
+        for chosen, style in ((best, {}), (others, hollow)):
+            points = [point(row, measure) for row in chosen]
+            chart.mark(axes, *columns(chosen, measure), points, looks[label], **style)
+
+
+def columns(rows: list[Row], measure: Measure) -> tuple[list[float], list[float]]:
+    return [row[measure.error] for row in rows], [row[measure.cost] for row in rows]
+
+
+def draw_front(axes: Axes, rows: list[Row], measure: Measure) -> None:
+    """A grey stair through the front, and a ring around each of its points."""
+    x, y = columns(rows, measure)
+    right, top = axes.get_xlim()[1], axes.get_ylim()[1]
+    stair = {"drawstyle": "steps-post", "color": FAINT, "linewidth": 1.2, "zorder": 2}
+    axes.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
+    ring = {"markersize": 12, "markerfacecolor": "none", "markeredgecolor": INK, "markeredgewidth": 1.1, "zorder": 5}
+    axes.plot(x, y, "o", clip_on=False, **ring)
+
+
+def point(row: Row, measure: Measure) -> Point:
+    """The numbers of one point."""
+    numbers = {
+        measure.name: wording.error(row[measure.error]),
+        measure.y_label: wording.seconds(row[measure.cost]),
+        "time step": wording.seconds(row["time_step"]),
+        "error asked for": wording.error(row["error"]),
+        "most iterations": wording.count(row["max_iterations"]),
+        "iterations a step": wording.count(row["iterations"]),
+        "ranks": wording.count(row["ranks"]),
+    }
+    return Point(row["label"], numbers, row["command"])
+
+
+def findings(rows: list[Row], measure: Measure) -> list[str]:
+    """For each level of error the cheapest method that reached it, in plain words."""
+    return [finding(measure, level, cheapest(rows, measure, level)) for level in LEVELS]
+
+
+def finding(measure: Measure, level: float, row: Row | None) -> str:
+    start = f"{wording.error(level)} or less:"
+    if row is None:
+        return f"{start} nothing measured reaches it."
+    cost, reached = wording.seconds(row[measure.cost]), wording.error(row[measure.error])
+    step = f", time step {wording.seconds(row['time_step'])}" if measure is TRAJECTORY and row["time_step"] else ""
+    asked = f"asked for {wording.error(row['error'])}, " if row["error"] else ""
+    return f"{start} {row['label']}, {cost} {measure.unit} ({asked}reached {reached}{step})."

@@ -1,0 +1,212 @@
+"""The report of a study: one page with its charts, its numbers and the commands that repeat them, from its table alone."""
+
+import json
+import re
+import tomllib
+from collections.abc import Iterable
+from datetime import datetime
+from html import escape
+from importlib.resources import files
+from itertools import chain
+from pathlib import Path
+
+from matplotlib import rc_context
+
+from msmpetsc.study import wording
+from msmpetsc.study.charts.chart import Chart, Point
+from msmpetsc.study.charts.convergence import convergence_charts
+from msmpetsc.study.charts.figure6 import figure6_charts
+from msmpetsc.study.charts.growth import growth_charts
+from msmpetsc.study.charts.look import RC, looks
+from msmpetsc.study.charts.pareto import pareto_charts
+from msmpetsc.study.charts.svg import save_png, svg_text
+from msmpetsc.study.rows import TEXT, Row, failed, grouped, read_rows, read_traces
+
+ALWAYS = ("label", "status", "command")  # columns of the whole table even where all cases agree in them
+PAGE = "<!DOCTYPE html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n"
+
+
+def write_report(folder: Path) -> Path:
+    """Draws everything that table.csv and traces.json in this folder hold; PNG files and report.html stand beside them.
+
+    Returns the path of report.html. Raises InputError where there is no table.
+    """
+    rows, traces = read_rows(folder), read_traces(folder)
+    charts = draw_charts(rows, traces)
+    for chart in charts:
+        save_png(chart, folder)
+    path = folder / "report.html"
+    path.write_text(page(title(folder, rows), measured_on(folder), rows, charts), encoding="utf-8")
+    return path
+
+
+def draw_charts(rows: list[Row], traces: list[dict]) -> list[Chart]:
+    """All charts that there are numbers for; a method looks the same in each."""
+    named = looks([row["label"] for row in rows] + [entry["label"] for entry in traces])
+    with rc_context(RC):
+        charts = pareto_charts(rows, named) + figure6_charts(rows, named) + growth_charts(rows, named)
+        return charts + convergence_charts(traces, named)
+
+
+def title(folder: Path, rows: list[Row]) -> str:
+    """The title in study.toml, else the name in the table, else that of the folder."""
+    file = folder / "study.toml"
+    given = tomllib.loads(file.read_text(encoding="utf-8")).get("title") if file.is_file() else None
+    return str(given or next((row["study"] for row in rows if row["study"]), "") or folder.resolve().name)
+
+
+def measured_on(folder: Path) -> str:
+    """When the table was last written, UTC offset included."""
+    return datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone().strftime("%d %B %Y, %H:%M %z")
+
+
+def page(title: str, date: str, rows: list[Row], charts: list[Chart]) -> str:
+    """The whole page; it needs nothing beside itself."""
+    body = [f"<h1>{escape(title)}</h1>", facts(date, rows), contents(charts), *sections(charts), failures(rows), table(rows)]
+    here = files("msmpetsc.study")
+    style, script = ((here / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
+    head = f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
+    return PAGE + head + "\n".join(body) + f"\n</main>\n<script>\n{script}</script>\n</body>\n</html>\n"
+
+
+def facts(date: str, rows: list[Row]) -> str:
+    """Date, machine, versions and how many cases there are."""
+    lost = len(failed(rows))
+    count = f"{len(rows)}, " + (f"{lost} of them <a href='#failed'>failed</a>" if lost else "none failed")
+    entries = [("Date", escape(date)), ("Cases", count)]
+    for name in ("machine", "versions"):
+        texts = dict.fromkeys(readable(str(row[name])) for row in rows if row[name])
+        entries += [(name.capitalize(), "<br>".join(map(escape, texts)))] if texts else []
+    return "<dl class='facts'>" + "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in entries) + "</dl>"
+
+
+def readable(text: str) -> str:
+    """JSON objects as words: {"cores": 2} -> cores 2."""
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        return text
+    if not isinstance(value, dict):
+        return text
+    return ", ".join(f"{name} {wording.size(entry) if name == 'memory' else entry}" for name, entry in value.items())
+
+
+def contents(charts: list[Chart]) -> str:
+    """Links to the charts."""
+    links = [f"<a href='#{escape(anchor(chart))}'>{escape(chart.title)}</a>" for chart in charts]
+    return f"<nav>{''.join(f'<span>{link}</span>' for link in [*links, '<a href=#all>All cases</a>'])}</nav>"
+
+
+def anchor(chart: Chart) -> str:
+    return "chart-" + "".join(letter if letter.isalnum() else "-" for letter in chart.name)
+
+
+def sections(charts: Iterable[Chart]) -> list[str]:
+    """Charts under their headings."""
+    parts, kind = [], None
+    for chart in charts:
+        if chart.kind != kind:
+            kind = chart.kind
+            parts.append(f"<h2>{escape(kind)}</h2>\n<p class='caption'>{escape(chart.caption)}</p>")
+        parts.append(figure(chart))
+    return parts
+
+
+def figure(chart: Chart) -> str:
+    """A chart, what it shows, which cases are missing from it, and its numbers."""
+    parts = [f"<figure id='{escape(anchor(chart))}'>", f"<h3>{escape(chart.title)}</h3>", svg_text(chart)]
+    if chart.findings:
+        parts.append("<div class='findings'>" + "".join(map(listed, *zip(*chart.findings.items()))) + "</div>")
+    if chart.failed:
+        reasons = grouped(chart.failed, reason_of)
+        lines = [f"{reason}: {'; '.join(map(name_of, lost))}" for reason, lost in reasons.items()]
+        state = " open" if len(lines) <= 4 else ""
+        heading = f"Not in the chart, for they failed: {len(chart.failed)} of this scene's cases"
+        parts.append(f"<details class='failed'{state}><summary>{heading}</summary>{bullets(lines)}</details>")
+    tables = [f"<h4>{escape(panel)}</h4>" * bool(panel) + points_table(chain(*points.values())) for panel, points in chart.points.items()]
+    parts.append("<details><summary>The numbers of this chart</summary>" + "".join(tables) + "</details>")
+    return "\n".join([*parts, "</figure>"])
+
+
+def listed(heading: str, lines: Iterable[str]) -> str:
+    """A short list under its heading."""
+    return f"<div><h4>{escape(heading)}</h4>{bullets(lines)}</div>"
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A list; options such as -pc_type are not torn at their hyphen."""
+    whole = (re.sub(r"(?<!\S)(--?\w\S*)", r"<span class='option'>\1</span>", escape(line)) for line in lines)
+    return "<ul>" + "".join(f"<li>{line}</li>" for line in whole) + "</ul>"
+
+
+def name_of(row: Row) -> str:
+    """A failed case in words."""
+    settings = [
+        f"time step {wording.seconds(row['time_step'])}" if row["time_step"] else "",
+        f"error {wording.error(row['error'])}" if row["error"] else "",
+        f"{wording.count(row['max_iterations'])} iterations" if row["max_iterations"] else "",
+        f"{wording.count(row['cells'])} cells" if row["cells"] else "",
+        f"{wording.count(row['ranks'])} ranks" if (row["ranks"] or 1) > 1 else "",
+    ]
+    return ", ".join(filter(None, [row["label"] or row["case"], *settings]))
+
+
+def reason_of(row: Row) -> str:
+    return str(row["reason"] or row["status"] or "no reason given")
+
+
+def points_table(points: Iterable[Point]) -> str:
+    """The points of a panel; columns that are empty in all are left out."""
+    points = list(points)
+    names = [name for name in points[0].numbers if any(point.numbers[name] for point in points)]
+    commands = any(point.command for point in points)
+    head = ["curve", *names, *(["command"] if commands else [])]
+    lines = [[point.label, *(point.numbers[name] for name in names)] + [point.command] * commands for point in points]
+    return html_table(head, [[(text, text) for text in line] for line in lines])
+
+
+def failures(rows: list[Row]) -> str:
+    """All failed cases with their commands."""
+    lost = failed(rows)
+    if not lost:
+        return ""
+    lines = [[row["scene"], name_of(row), row["status"], reason_of(row), row["command"]] for row in lost]
+    cells = [[(str(text), str(text)) for text in line] for line in lines]
+    return "<h2 id='failed'>Failed cases</h2>" + html_table(["scene", "case", "status", "reason", "command"], cells)
+
+
+def table(rows: list[Row]) -> str:
+    """The whole table; what all cases share stands above it."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    columns = [name for name in columns if any(row.get(name) not in (None, "") for row in rows)]
+    shared = [name for name in columns if name not in ALWAYS and len(rows) > 1 and is_shared(name, rows)]
+    numbers_first = sorted(columns, key=lambda name: name in TEXT and name != "scene")
+    shown = [*ALWAYS[:2], *(name for name in numbers_first if name not in (*shared, *ALWAYS)), ALWAYS[2]]
+    same = "".join(f"<dt>{escape(name)}</dt><dd>{escape(readable(wording.plain(rows[0][name])))}</dd>" for name in shared)
+    lines = [[(wording.plain(row.get(name)), sort_key(row.get(name))) for name in shown] for row in rows]
+    above = f"<details><summary>The same in all cases</summary><dl class='facts'>{same}</dl></details>" if same else ""
+    note = "<p class='caption'>SI units; a heading sorts. The same numbers to all digits are in table.csv.</p>"
+    return "<h2 id='all'>All cases</h2>" + note + above + html_table(shown, lines)
+
+
+def is_shared(name: str, rows: list[Row]) -> bool:
+    return len({row.get(name) for row in rows}) == 1
+
+
+def sort_key(value: float | str | None) -> str:
+    return "" if value is None else str(value)
+
+
+def html_table(head: list[str], lines: list[list[tuple[str, str]]]) -> str:
+    """Lines of (text, what to sort by)."""
+    top = "".join(f"<th scope='col'>{escape(name)}</th>" for name in head)
+    body = "".join("<tr>" + "".join(map(html_cell, line, head)) + "</tr>\n" for line in lines)
+    return f"<div class='wide'><table class='sortable'><thead><tr>{top}</tr></thead><tbody>\n{body}</tbody></table></div>"
+
+
+def html_cell(entry: tuple[str, str], column: str) -> str:
+    text, key = entry
+    sort = f' data-key="{escape(key)}"' if key != text else ""
+    content = f"<code>{escape(text)}</code>" if column == "command" and text else escape(text)
+    kind = " class='text'" if column == "reason" else ""
+    return f"<td{sort}{kind}>{content}</td>"

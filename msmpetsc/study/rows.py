@@ -1,0 +1,77 @@
+"""What a study measured, as the charts and the report read it: the rows of table.csv, and the traces beside it."""
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from msmpetsc.errors import InputError
+
+Row = dict[str, str | float | None]  # column -> text, or a finite number, or None where nothing was measured
+
+TEXT = (
+    "study", "case", "scene", "integrator", "preset", "options", "label", "status", "reason", "machine", "versions",
+    "command",
+)  # fmt: skip
+NUMBERS = (
+    "ranks", "repeats", "time_step", "error", "max_iterations", "cells", "nodes", "unknowns", "springs", "frames",
+    "steps", "time_frame", "fps", "time_second", "time_setup", "time_factor", "time_local", "time_ksp", "time_output",
+    "iterations", "ksp_its", "memory", "estimated_error", "true_error", "energy_error", "trajectory_error",
+)  # fmt: skip
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Rows of table.csv, one a case. A column that is missing reads as empty. Raises InputError without a table."""
+    path = folder / "table.csv"
+    if not path.is_file():
+        raise InputError(f"no table.csv in {folder}: it is no folder of a study")
+    with path.open(newline="", encoding="utf-8") as stream:
+        return [typed(record) for record in csv.DictReader(stream)]
+
+
+def typed(record: dict[str, str]) -> Row:
+    """A row with numbers for numbers; not a number, infinite and unreadable all mean: not measured."""
+    row: Row = dict.fromkeys(TEXT, "") | dict.fromkeys(NUMBERS)
+    for name, text in record.items():
+        row[name] = number(text) if name in NUMBERS else (text or "").strip()
+    return row
+
+
+def number(text: str | None) -> float | None:
+    """A finite number, or None."""
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def read_traces(folder: Path) -> list[dict]:
+    """The traces {"scene", "label", "trace"} of traces.json that have a trace; none where there is no such file."""
+    path = folder / "traces.json"
+    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    return [entry for entry in entries if entry.get("trace")]
+
+
+def succeeded(rows: Iterable[Row]) -> list[Row]:
+    """Rows of cases that ran to their end."""
+    return [row for row in rows if row["status"] == "ok"]
+
+
+def failed(rows: Iterable[Row]) -> list[Row]:
+    """All other rows."""
+    return [row for row in rows if row["status"] != "ok"]
+
+
+def measured(rows: Iterable[Row], *columns: str) -> list[Row]:
+    """Rows with a positive number in each of these columns: what a logarithmic axis can show."""
+    return [row for row in rows if all(isinstance(row[name], float) and row[name] > 0 for name in columns)]
+
+
+def grouped(items: Iterable, key: Callable) -> dict[object, list]:
+    """Items by key, both in their order of first appearance."""
+    groups: dict = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups

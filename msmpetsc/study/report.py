@@ -10,7 +10,7 @@ from importlib.resources import files
 from itertools import chain
 from pathlib import Path
 
-from matplotlib import rc_context
+from matplotlib import style
 
 from msmpetsc.study import wording
 from msmpetsc.study.charts.chart import Chart, Point
@@ -18,7 +18,7 @@ from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.figure6 import figure6_charts
 from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import RC, looks
-from msmpetsc.study.charts.pareto import pareto_charts
+from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, pareto_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
 from msmpetsc.study.rows import TEXT, Row, failed, grouped, read_rows, read_traces
 
@@ -43,7 +43,7 @@ def write_report(folder: Path) -> Path:
 def draw_charts(rows: list[Row], traces: list[dict]) -> list[Chart]:
     """All charts that there are numbers for; a method looks the same in each."""
     named = looks([row["label"] for row in rows] + [entry["label"] for entry in traces])
-    with rc_context(RC):
+    with style.context(["default", RC]):
         charts = pareto_charts(rows, named) + figure6_charts(rows, named) + growth_charts(rows, named)
         return charts + convergence_charts(traces, named)
 
@@ -62,10 +62,11 @@ def measured_on(folder: Path) -> str:
 
 def page(title: str, date: str, rows: list[Row], charts: list[Chart]) -> str:
     """The whole page; it needs nothing beside itself."""
-    body = [f"<h1>{escape(title)}</h1>", facts(date, rows), contents(charts), *sections(charts), failures(rows), table(rows)]
+    body = [f"<h1>{escape(title)}</h1>", facts(date, rows), contents(charts), overview(charts)]
+    body += [*sections(charts), failures(rows), table(rows)]
     here = files("msmpetsc.study")
-    style, script = ((here / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
-    head = f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
+    css, script = ((here / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
+    head = f"<title>{escape(title)}</title>\n<style>\n{css}</style>\n</head>\n<body>\n<main>\n"
     return PAGE + head + "\n".join(body) + f"\n</main>\n<script>\n{script}</script>\n</body>\n</html>\n"
 
 
@@ -99,6 +100,29 @@ def contents(charts: list[Chart]) -> str:
 
 def anchor(chart: Chart) -> str:
     return "chart-" + "".join(letter if letter.isalnum() else "-" for letter in chart.name)
+
+
+def overview(charts: list[Chart]) -> str:
+    """Who wins at each level of error, scene by scene, where there are several."""
+    charts = [chart for chart in charts if chart.cheapest]
+    if len(charts) < 2:
+        return ""
+    head = ["", "error", *(f"{wording.error(level)} or less" for level in LEVELS)]
+    lines = [
+        [chart.title.partition(": ")[2], name, *(winner(name, row) for row in best)]
+        for chart in charts for name, best in chart.cheapest.items()
+    ]  # fmt: skip
+    note = "The cheapest measured method; for the step error with its time a frame, for the trajectory error with its "
+    caption = f"<p class='caption'>{note}time step and its time a simulated second.</p>"
+    return f"<h2>At a glance</h2>{caption}" + html_table(head, [[(text, text) for text in line] for line in lines])
+
+
+def winner(name: str, row: Row | None) -> str:
+    """The label of a row and what it costs."""
+    if row is None:
+        return "none"
+    step = f" ({wording.seconds(row['time_step'])})" if name == TRAJECTORY.name else ""
+    return f"{row['label']}{step}: {wording.seconds(row[MEASURES[name].cost])}"
 
 
 def sections(charts: Iterable[Chart]) -> list[str]:

@@ -4,8 +4,10 @@ from matplotlib.ticker import EngFormatter
 
 
 def seconds(value: float | None) -> str:
-    """A time with its prefix: 0.0341 -> 34.1 ms."""
-    return "" if value is None else EngFormatter("s")(float(f"{value:.3g}"))
+    """A time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
+    if value is None:
+        return ""
+    return EngFormatter("s")(float(f"{value:.3g}")) if value < 1000 else f"{float(f'{value:.3g}'):,.0f} s"
 
 
 def error(value: float | None) -> str:

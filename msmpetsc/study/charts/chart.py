@@ -35,7 +35,7 @@ class Point:
 class Chart:
     """name: of its file; kind: the heading it stands under; points: by panel, then by the id of
     the group of marks in the SVG that stands for them, in its order;
-    findings: lines in plain words by their heading."""
+    findings: lines in plain words by their heading; cheapest: by kind of error, the row that wins each level of it."""
 
     name: str
     kind: str
@@ -45,6 +45,7 @@ class Chart:
     points: dict[str, dict[str, list[Point]]] = field(default_factory=dict)
     findings: dict[str, list[str]] = field(default_factory=dict)
     failed: list[Row] = field(default_factory=list)
+    cheapest: dict[str, list[Row | None]] = field(default_factory=dict)
 
     def mark(self, axes: Axes, x: Sequence[float], y: Sequence[float], points: list[Point], look: Look, **style) -> None:
         """Draws measured points; panels are told apart by their titles."""
@@ -69,9 +70,9 @@ def legend_shape(labels: Sequence[str]) -> tuple[int, int]:
     """Lines and columns of a legend as wide as the figure."""
     wrapped = [wrap(label) for label in labels]
     longest = max((len(line) for lines in wrapped for line in lines), default=1)
-    columns = max(1, min(5, len(labels), int(WIDTH / (0.088 * longest + 0.65))))
-    deepest = max(map(len, wrapped), default=1)
-    return -(-len(labels) // columns) * deepest, columns
+    fit = max(1, min(6, len(labels), int(WIDTH / (0.088 * longest + 0.65))))
+    lines = -(-len(labels) // fit)
+    return lines * max(map(len, wrapped), default=1), -(-len(labels) // lines)  # as even as can be
 
 
 def wrap(label: str) -> list[str]:

@@ -1,5 +1,6 @@
 """Convergence within one step: the error over the iterations, and over the seconds."""
 
+import math
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from msmpetsc.study.charts.look import COUNT, ERROR, SECONDS, Look, around, log_
 from msmpetsc.study.rows import grouped
 
 CAPTION = (
-    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their first mark on."
+    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second number on."
 )
 MANY = 40  # iterates: where there are more, their marks are smaller
 Iterate = dict[str, float | None]
@@ -53,7 +54,7 @@ def convergence_chart(scene: str, frames: set, curves: dict[str, list[Iterate]],
 
 def draw(chart: Chart, axes: Axes, column: str, title: str, x_label: str, curves: dict, looks: dict[str, Look]) -> None:
     """One panel."""
-    axes.set_title(title)
+    axes.set_title(title, loc="left")
     axes.set_xlabel(x_label)
     axes.set_ylabel("true step error |x − x*| / |y − x*|")
     shown = {label: [row for row in rows if row[column] is not None] for label, rows in curves.items()}
@@ -75,11 +76,12 @@ def error_axis(axes: Axes, errors: Sequence[float]) -> None:
 
 
 def axis_from_zero(axes: Axes, values: Sequence[float], formatter) -> None:
-    """0 at the left, logarithmic from the least positive value on: methods differ by powers of ten in their steps."""
+    """0 at the left, logarithmic from the decade of the least positive value on: methods differ by powers of ten."""
     positive = [value for value in values if value > 0]
     if positive:
-        axes.set_xscale("symlog", linthresh=min(positive), linscale=0.4)
-        axes.set_xlim(-0.15 * min(positive), 1.3 * max(positive))
+        first = 10.0 ** math.floor(math.log10(min(positive)))
+        axes.set_xscale("symlog", linthresh=first, linscale=0.6)
+        axes.set_xlim(-0.15 * first, 1.3 * max(positive))
     axes.xaxis.set_major_formatter(formatter)
 
 

@@ -63,7 +63,7 @@ def growth_chart(
     figure, axes = new_figure(len(panels), list(handles))
     chart = Chart(name, "Growth with the number of cells", titled("Growth with cells", scene, time_step), CAPTION, figure)
     for ax, (quantity, shown) in zip(axes, panels):
-        ax.set_title(quantity.title)
+        ax.set_title(quantity.title, loc="left")
         ax.set_xlabel("valid cells (k: thousand, M: million)")
         log_axes(ax, [row["cells"] for row in shown], [quantity.value(row) for row in shown], COUNT, quantity.tick)
         for curve, group in by_curve.items():

@@ -19,11 +19,11 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "p", "*", ">", "h")  # twelve and eleven: a pair is back after 132
 WIDER = {"P": 9, "X": 9, "*": 11, "^": 8, "v": 8, "<": 8, ">": 8, "p": 8, "D": 6.5}  # [points]: marks of like weight
 
-RC = {
-    "font.family": ["DejaVu Sans"],
+RC = {  # on matplotlib's own defaults
+    "font.family": ["sans-serif"],
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],  # the first comes with matplotlib, a browser may need others
     "font.size": 10,
     "axes.titlesize": 11,
-    "axes.titlelocation": "left",
     "axes.labelcolor": INK,
     "axes.edgecolor": FAINT,
     "axes.spines.top": False,
@@ -61,18 +61,14 @@ def looks(labels: Iterable[str]) -> dict[str, Look]:
     return {label: Look(*pair) for label, pair in zip(labels, pairs)}
 
 
-def error_tick(value: float, _position: int | None = None) -> str:
-    return wording.error(value)
-
-
-def count_tick(value: float, _position: int | None = None) -> str:
+def short(value: float) -> str:
     """2, 2k, 2M; below 1 as it is."""
     return EngFormatter("", sep="")(value) if abs(value) >= 1 else f"{value:g}"
 
 
-ERROR = FuncFormatter(error_tick)
-SECONDS = EngFormatter("s")
-COUNT = FuncFormatter(count_tick)
+ERROR = FuncFormatter(lambda value, _position: wording.error(value))
+SECONDS = FuncFormatter(lambda value, _position: wording.seconds(value))
+COUNT = FuncFormatter(lambda value, _position: short(value))
 BYTES = EngFormatter("B")
 
 

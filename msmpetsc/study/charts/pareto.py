@@ -48,6 +48,7 @@ TRAJECTORY = Measure(
     "trajectory error against a reference with a tiny step", "computing time a simulated second",
     "a simulated second",
 )  # fmt: skip
+MEASURES = {measure.name: measure for measure in (STEP, TRAJECTORY)}
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
@@ -107,7 +108,9 @@ def pareto_chart(name: str, scene: str, cells: float | None, rows: list[Row], lo
     chart = Chart(name, "Speed against accuracy", f"Speed against accuracy: {where}", CAPTION, figure)
     for ax, (measure, shown) in zip(axes, panels):
         draw(chart, ax, measure, shown, looks)
-        chart.findings[f"The cheapest by {measure.name}"] = findings(shown, measure)
+        chart.cheapest[measure.name] = [cheapest(shown, measure, level) for level in LEVELS]
+        pairs = zip(LEVELS, chart.cheapest[measure.name])
+        chart.findings[f"The cheapest by {measure.name}"] = [finding(measure, level, row) for level, row in pairs]
     legend_below(figure, handles)
     return chart
 
@@ -121,7 +124,8 @@ def common_time_step(rows: list[Row]) -> list[Row]:
 def draw(chart: Chart, axes: Axes, measure: Measure, rows: list[Row], looks: dict[str, Look]) -> None:
     """One panel: the front first, the methods over it."""
     step = wording.seconds(rows[0]["time_step"])
-    axes.set_title(f"over the {measure.name}" + (f", time step {step}" if measure is STEP and step else ""))
+    where = f", time step {step}" if measure is STEP and step else ""
+    axes.set_title(f"over the {measure.name}{where}", loc="left")
     axes.set_xlabel(measure.x_label)
     axes.set_ylabel(measure.y_label)
     log_axes(axes, [row[measure.error] for row in rows], [row[measure.cost] for row in rows], ERROR, SECONDS)
@@ -164,12 +168,8 @@ def point(row: Row, measure: Measure) -> Point:
     return Point(row["label"], numbers, row["command"])
 
 
-def findings(rows: list[Row], measure: Measure) -> list[str]:
-    """For each level of error the cheapest method that reached it, in plain words."""
-    return [finding(measure, level, cheapest(rows, measure, level)) for level in LEVELS]
-
-
 def finding(measure: Measure, level: float, row: Row | None) -> str:
+    """Which method is the cheapest that reached this level, in plain words."""
     start = f"{wording.error(level)} or less:"
     if row is None:
         return f"{start} nothing measured reaches it."

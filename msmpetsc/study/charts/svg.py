@@ -5,7 +5,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from matplotlib import rc_context
+from matplotlib import style
 
 from msmpetsc.study.charts.chart import Chart
 from msmpetsc.study.charts.look import RC
@@ -18,7 +18,7 @@ ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
 def save_png(chart: Chart, folder: Path) -> Path:
     """The chart with its title, in a file of its name."""
     path = folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png"
-    with rc_context(RC):
+    with style.context(["default", RC]):
         chart.figure.suptitle(chart.title, x=0.01, ha="left", weight="bold")
         chart.figure.savefig(path)
         chart.figure.suptitle("")
@@ -28,7 +28,7 @@ def save_png(chart: Chart, folder: Path) -> Path:
 def svg_text(chart: Chart) -> str:
     """The chart as an <svg> element: every point has a <title>, which browsers show where the mouse is."""
     stream = io.BytesIO()
-    with rc_context(RC | {"svg.hashsalt": chart.name}):  # ids that do not meet those of other charts in one page
+    with style.context(["default", RC | {"svg.hashsalt": chart.name}]):  # ids that do not meet those of other charts in one page
         chart.figure.savefig(stream, format="svg", transparent=True)
     root = ElementTree.fromstring(stream.getvalue())
     root.remove(root.find(f"{{{SVG}}}metadata"))
@@ -41,8 +41,8 @@ def svg_text(chart: Chart) -> str:
 
 
 def add_titles(root: ElementTree.Element, chart: Chart) -> None:
-    """Puts the numbers of each point into the mark that draws it."""
-    groups = {group.get("id"): group for group in root.iter(f"{{{SVG}}}g")}
+    """Puts the numbers of each point into the mark that draws it; ids, which a page may hold but once, go."""
+    groups = {group.attrib.pop("id", None): group for group in root.iter(f"{{{SVG}}}g")}
     for points in chart.points.values():
         for name, of_group in points.items():
             for mark, point in zip(groups[name].iter(f"{{{SVG}}}use"), of_group, strict=True):

@@ -1,0 +1,291 @@
+"""The report of a study: charts and page from the table alone."""
+
+import csv
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msmpetsc.errors import InputError
+from msmpetsc.study.charts.cell_sweep import curves
+from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
+from msmpetsc.study.charts.look import looks
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, pareto_charts
+from msmpetsc.study.report import write_report
+from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, typed
+
+VOID = {"meta", "br"}  # elements of HTML that need no end
+
+
+def case(label: str, **given) -> dict[str, str]:
+    """A row of the table as text; frames a second and seconds a simulated second follow from the time a frame."""
+    row = {"label": label, "preset": label, "scene": "block", "integrator": "implicit-euler", "status": "ok"}
+    row |= {"study": "try", "time_step": 0.01, "cells": 1000, "ranks": 1} | given
+    if row.get("time_frame"):
+        row |= {"fps": 1 / row["time_frame"], "time_second": row["time_frame"] / row["time_step"]}
+    row.setdefault("command", "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()))
+    return {name: str(value) for name, value in row.items()}
+
+
+def write_table(folder: Path, rows: list[dict[str, str]], columns: tuple[str, ...] = TEXT + NUMBERS) -> Path:
+    with (folder / "table.csv").open("w", newline="") as stream:
+        table = csv.DictWriter(stream, columns, extrasaction="ignore")
+        table.writeheader()
+        table.writerows(rows)
+    return folder
+
+
+def typed_rows(*rows: dict[str, str]) -> list:
+    return [typed(row) for row in rows]
+
+
+ERRORS = [
+    case("newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
+    case("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
+    case("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    case("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
+    case("verlet", integrator="verlet", preset="", time_frame=0.002, trajectory_error=4e-4, time_step=0.001),
+    case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, cells=""),
+]
+SWEEP = [
+    case(label, scene="bunny", preset=preset, cells=cells, time_frame=time, true_error=5e-4, ksp_its=its, memory=1e6 * cells)
+    for label, preset, times, its in (
+        ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
+        ("cg", "anderson", (0.02, 0.09, 0.5), 40),
+    )
+    for cells, time in zip((1000, 10000, 100000), times)
+]
+TRACES = [
+    {
+        "scene": "block",
+        "label": label,
+        "trace": {
+            "frame": 7,
+            "iteration": [0, 1, 2],
+            "ksp_its": [0, 5, 9],
+            "seconds": [0.0, 0.011, 0.023],
+            "position_error": [0.3, rate, rate**2],
+            "energy_error": [0.1, None, rate**4],
+        },
+    }
+    for label, rate in (("newton", 0.012), ("anderson", 0.17))
+]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory) -> Path:
+    """A folder with a report that has all four charts."""
+    folder = write_table(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
+    (folder / "traces.json").write_text(json.dumps(TRACES))
+    (folder / "study.toml").write_text('title = "Fast & exact"\n')
+    assert write_report(folder) == folder / "report.html"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def text(study: Path) -> str:
+    return (study / "report.html").read_text()
+
+
+def svgs(text: str) -> list[ElementTree.Element]:
+    return [ElementTree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", text, re.DOTALL)]
+
+
+def tooltips(text: str) -> list[str]:
+    return [title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")]
+
+
+class Balance(HTMLParser):
+    """Fails where an element ends that is not open."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, _attributes):
+        self.open += [tag] if tag not in VOID else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+# The Pareto front
+
+COSTS = st.integers(0, 6).map(float)  # few values, so that ties are common
+
+
+@given(st.lists(st.tuples(COSTS, COSTS), max_size=12))
+def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
+    def beaten(a: tuple[float, float]) -> bool:
+        return any(b[0] <= a[0] and b[1] <= a[1] and b != a for b in points)
+
+    found = front([x for x, _ in points], [y for _, y in points])
+    assert set(found) == {index for index, point in enumerate(points) if not beaten(point)}
+    assert len(set(found)) == len(found) and [points[i][0] for i in found] == sorted(points[i][0] for i in found)
+
+
+# What the charts show
+
+def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
+    rows = typed_rows(*ERRORS)
+    assert [(row["label"], row["error"]) for row in (cheapest(rows, STEP, e) for e in (1e-1, 5e-3, 1e-4))] == [
+        ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
+    ]  # fmt: skip
+    assert cheapest(rows, STEP, 1e-6) is None
+    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.002 s a step of 0.001 s: 2 s a simulated second"
+    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    step, trajectory = chart.findings.values()
+    assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
+    assert step[3] == "1e-6 or less: nothing measured reaches it."
+    assert trajectory[2] == "1e-3 or less: verlet, 2 s a simulated second (reached 4e-4, time step 1 ms)."
+
+
+def test_only_equal_time_steps_are_compared_by_the_step_error():
+    longer = case("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
+    rows = typed_rows(*ERRORS, longer)
+    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    shown = {panel: {p.label for group in groups.values() for p in group} for panel, groups in chart.points.items()}
+    assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
+    assert shown["over the trajectory error"] == {"newton", "anderson", "verlet", "lbfgs"}
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ((0.02, 0.09, 0.5), "cg is faster than cholesky from 10,000 cells on"),
+        ((0.001, 0.09, 0.5), "cg is faster than cholesky at every cell count measured, from 1,000 cells on"),
+        ((0.001, 0.2, 0.5), "cg is faster than cholesky from 100,000 cells on"),
+        ((0.001, 0.2, 5.0), "cholesky is still faster at 100,000 cells"),
+    ],
+)
+def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
+    cg = [case("cg", scene="bunny", cells=c, time_frame=t, true_error=5e-4) for c, t in zip((1000, 10000, 100000), times)]
+    rows = typed_rows(*SWEEP[:3], *cg)
+    (chart,) = figure6_charts(rows, looks(["cholesky", "cg"]))
+    ((line,),) = chart.findings.values()
+    assert line.startswith(expected)
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "expected"),
+    [
+        ("fast-msm", "", True),
+        ("fast-msm", "-ksp_type cg -pc_type icc", False),
+        ("newton", "-pc_type cholesky -pc_factor_mat_solver_type mumps", True),
+        ("newton", "", False),
+    ],
+)
+def test_what_counts_as_cholesky(preset: str, options: str, expected: bool):
+    assert is_cholesky(typed({"preset": preset, "options": options})) is expected
+
+
+def test_curves_of_one_label_are_told_apart_by_what_varies():
+    rows = typed_rows(*(case("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000)))
+    assert {name: [row["cells"] for row in rows] for name, rows in curves(rows).items()} == {
+        "cg, error 1e-2": [1000, 2000],
+        "cg, error 1e-4": [1000, 2000],
+    }
+
+
+def test_every_method_has_its_own_look():
+    assert len(set(looks(map(str, range(40))).values())) == 40
+    assert looks(["a", "b", "a"])["b"] == looks(["a", "b"])["b"]
+
+
+# The page
+
+def test_the_report_needs_nothing_beside_itself(text: str):
+    assert not re.search(r"(src|href)\s*=\s*.?\s*(https?:)?//", text)
+    assert not re.search(r"@import|url\(\s*.?https?:|<link|<img|fetch\(|<script src", text)
+
+
+def test_the_page_is_well_formed(text: str):
+    assert Balance(text).open == []
+    assert len(svgs(text)) == 4
+    for name in ("pareto_block", "figure6", "growth", "convergence_block"):
+        assert f"chart-{name.replace('_', '-')}" in text
+
+
+def test_an_id_is_that_of_one_element(text: str):
+    ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
+    assert len(ids) > 20 and len(set(ids)) == len(ids)
+    used = {link for svg in svgs(text) for link in re.findall(r"(?:href=\"|url\()#([\w-]+)", ElementTree.tostring(svg, "unicode"))}
+    assert used and used <= set(ids)
+
+
+def test_png_files_stand_beside_it(study: Path):
+    names = {"pareto_block.png", "figure6.png", "growth.png", "convergence_block.png"}
+    assert {path.name for path in study.glob("*.png")} == names
+    assert all((study / name).read_bytes().startswith(b"\x89PNG") for name in names)
+
+
+def test_every_point_tells_its_numbers(text: str):
+    tips = tooltips(text)
+    points = (4 + 5) + 6 + 3 * 6 + 2 * 6  # pareto's panels, figure 6, growth's panels, two traces in two panels
+    assert len(tips) == points
+    for row in (row for row in ERRORS + SWEEP if row["status"] == "ok"):
+        assert any(row["label"] in tip and row["command"] in tip for tip in tips), row
+    assert "newton\nstep error: 3e-5\ncomputing time a frame: 80 ms\ntime step: 10 ms\nerror asked for: 1e-4" in "\n".join(tips)
+    assert "cg\nvalid cells: 10,000\ntime a frame and cell: 9 µs" in "\n".join(tips)
+    assert "anderson\niteration: 1\ncomputing time: 11 ms\nstep error: 1.7e-1\nKSP iterations: 5" in tips
+
+
+def test_the_whole_table_and_every_command_are_in_it(text: str):
+    for row in ERRORS + SWEEP:
+        assert text.count(row["command"]) >= 1
+        assert row["true_error" if row.get("true_error") else "label"].replace("e-0", "e-") in text.replace("e-0", "e-")
+    assert "<h1>Fast &amp; exact</h1>" in text
+    assert "frame 3 did not converge: paper, time step 10 ms, error 1e-4" in text
+
+
+def test_labels_are_escaped(tmp_path: Path):
+    label = 'a<b>&"c\''
+    rows = [case(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
+    rows.append(case(label, status="failed", reason=label, scene=label))
+    text = write_report(write_table(tmp_path, rows)).read_text()
+    assert Balance(text).open == []
+    assert "<b>" not in text and label in unescape(text)
+    assert tooltips(text)[0].startswith(label)
+    assert [path.name for path in tmp_path.glob("*.png")] == ["pareto_a_b_c_.png"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "charts"),
+    [
+        ([], 0),
+        (ERRORS[:1], 1),
+        (ERRORS[-1:] * 3, 0),
+        ([case("a", true_error=bad, trajectory_error="", time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
+        ([case("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
+    ],
+    ids=["no case", "one case", "all failed", "no number", "no cells"],
+)
+def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
+    text = write_report(write_table(tmp_path, rows)).read_text()
+    assert Balance(text).open == [] and len(svgs(text)) == charts
+
+
+def test_a_table_without_some_columns_is_read(tmp_path: Path):
+    write_table(tmp_path, ERRORS, ("label", "status", "command"))
+    assert read_rows(tmp_path)[0]["true_error"] is None
+    assert "newton" in write_report(tmp_path).read_text()
+
+
+def test_a_folder_without_a_table_is_named(tmp_path: Path):
+    with pytest.raises(InputError, match="no table.csv"):
+        write_report(tmp_path)
+
+
+def test_a_trace_without_errors_is_left_out(tmp_path: Path):
+    write_table(tmp_path, [])
+    traces = [{"scene": "a", "label": "b", "trace": None}, {"scene": "a", "label": "c", "trace": {"position_error": [None]}}]
+    (tmp_path / "traces.json").write_text(json.dumps(traces))
+    assert svgs(write_report(tmp_path).read_text()) == []

@@ -16,7 +16,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cell_sweep import curves
 from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
 from msmpetsc.study.charts.look import looks
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, pareto_charts
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts
 from msmpetsc.study.report import write_report
 from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, typed
 
@@ -54,12 +54,12 @@ ERRORS = [
     case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, cells=""),
 ]
 SWEEP = [
-    case(label, scene="bunny", preset=preset, cells=cells, time_frame=time, true_error=5e-4, ksp_its=its, memory=1e6 * cells)
+    case(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
     for label, preset, times, its in (
         ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
         ("cg", "anderson", (0.02, 0.09, 0.5), 40),
     )
-    for cells, time in zip((1000, 10000, 100000), times)
+    for n, time in zip((1000, 10000, 100000), times)
 ]
 TRACES = [
     {
@@ -132,7 +132,13 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
     assert len(set(found)) == len(found) and [points[i][0] for i in found] == sorted(points[i][0] for i in found)
 
 
+def test_errors_that_read_alike_are_no_reason_to_pay_more():
+    rows = typed_rows(*(case("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))))
+    assert [row["time_frame"] for row in front_rows(rows, STEP)] == [3, 1]
+
+
 # What the charts show
+
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
     rows = typed_rows(*ERRORS)
@@ -167,7 +173,8 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
     ],
 )
 def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
-    cg = [case("cg", scene="bunny", cells=c, time_frame=t, true_error=5e-4) for c, t in zip((1000, 10000, 100000), times)]
+    counts = (1000, 10000, 100000)
+    cg = [case("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4) for n, time in zip(counts, times)]
     rows = typed_rows(*SWEEP[:3], *cg)
     (chart,) = figure6_charts(rows, looks(["cholesky", "cg"]))
     ((line,),) = chart.findings.values()
@@ -202,6 +209,7 @@ def test_every_method_has_its_own_look():
 
 # The page
 
+
 def test_the_report_needs_nothing_beside_itself(text: str):
     assert not re.search(r"(src|href)\s*=\s*.?\s*(https?:)?//", text)
     assert not re.search(r"@import|url\(\s*.?https?:|<link|<img|fetch\(|<script src", text)
@@ -217,7 +225,7 @@ def test_the_page_is_well_formed(text: str):
 def test_an_id_is_that_of_one_element(text: str):
     ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
     assert len(ids) > 20 and len(set(ids)) == len(ids)
-    used = {link for svg in svgs(text) for link in re.findall(r"(?:href=\"|url\()#([\w-]+)", ElementTree.tostring(svg, "unicode"))}
+    used = set(re.findall(r"""(?:xlink:href="|url\()#([\w-]+)""", text))
     assert used and used <= set(ids)
 
 
@@ -233,7 +241,8 @@ def test_every_point_tells_its_numbers(text: str):
     assert len(tips) == points
     for row in (row for row in ERRORS + SWEEP if row["status"] == "ok"):
         assert any(row["label"] in tip and row["command"] in tip for tip in tips), row
-    assert "newton\nstep error: 3e-5\ncomputing time a frame: 80 ms\ntime step: 10 ms\nerror asked for: 1e-4" in "\n".join(tips)
+    newton = "newton\nstep error: 3e-5\ncomputing time a frame: 80 ms\ntime step: 10 ms\nerror asked for: 1e-4\n"
+    assert any(tip.startswith(newton) for tip in tips)
     assert "cg\nvalid cells: 10,000\ntime a frame and cell: 9 µs" in "\n".join(tips)
     assert "anderson\niteration: 1\ncomputing time: 11 ms\nstep error: 1.7e-1\nKSP iterations: 5" in tips
 
@@ -263,7 +272,7 @@ def test_labels_are_escaped(tmp_path: Path):
         ([], 0),
         (ERRORS[:1], 1),
         (ERRORS[-1:] * 3, 0),
-        ([case("a", true_error=bad, trajectory_error="", time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
+        ([case("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
         ([case("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
     ],
     ids=["no case", "one case", "all failed", "no number", "no cells"],
@@ -286,6 +295,6 @@ def test_a_folder_without_a_table_is_named(tmp_path: Path):
 
 def test_a_trace_without_errors_is_left_out(tmp_path: Path):
     write_table(tmp_path, [])
-    traces = [{"scene": "a", "label": "b", "trace": None}, {"scene": "a", "label": "c", "trace": {"position_error": [None]}}]
+    traces = [{"scene": "a", "label": "b", "trace": trace} for trace in (None, {}, {"position_error": [None]})]
     (tmp_path / "traces.json").write_text(json.dumps(traces))
     assert svgs(write_report(tmp_path).read_text()) == []

@@ -1,4 +1,4 @@
-"""The report of a study: one page with its charts, its numbers and the commands that repeat them, from its table alone."""
+"""The report of a study, from its table alone: one page with charts, numbers and the commands that repeat them."""
 
 import json
 import re
@@ -20,8 +20,13 @@ from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import RC, looks
 from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, pareto_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
-from msmpetsc.study.rows import TEXT, Row, failed, grouped, read_rows, read_traces
+from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, read_rows, read_traces
 
+PRINTED = {
+    "label", "scene", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_second",
+    "ksp_its", "memory", "true_error", "trajectory_error",
+}  # fmt: skip
+NOT_PRINTED = {*TEXT, *NUMBERS} - PRINTED
 ALWAYS = ("label", "status", "command")  # columns of the whole table even where all cases agree in them
 PAGE = "<!DOCTYPE html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n"
 
@@ -147,8 +152,8 @@ def figure(chart: Chart) -> str:
         state = " open" if len(lines) <= 4 else ""
         heading = f"Not in the chart, for they failed: {len(chart.failed)} of this scene's cases"
         parts.append(f"<details class='failed'{state}><summary>{heading}</summary>{bullets(lines)}</details>")
-    tables = [f"<h4>{escape(panel)}</h4>" * bool(panel) + points_table(chain(*points.values())) for panel, points in chart.points.items()]
-    parts.append("<details><summary>The numbers of this chart</summary>" + "".join(tables) + "</details>")
+    tables = "".join(panel_table(panel, chain(*groups.values())) for panel, groups in chart.points.items())
+    parts.append(f"<details><summary>The numbers of this chart</summary>{tables}</details>")
     return "\n".join([*parts, "</figure>"])
 
 
@@ -179,14 +184,15 @@ def reason_of(row: Row) -> str:
     return str(row["reason"] or row["status"] or "no reason given")
 
 
-def points_table(points: Iterable[Point]) -> str:
-    """The points of a panel; columns that are empty in all are left out."""
+def panel_table(panel: str, points: Iterable[Point]) -> str:
+    """The points of a panel under its title; columns that are empty in all are left out."""
     points = list(points)
     names = [name for name in points[0].numbers if any(point.numbers[name] for point in points)]
     commands = any(point.command for point in points)
     head = ["curve", *names, *(["command"] if commands else [])]
     lines = [[point.label, *(point.numbers[name] for name in names)] + [point.command] * commands for point in points]
-    return html_table(head, [[(text, text) for text in line] for line in lines])
+    heading = f"<h4>{escape(panel)}</h4>" if panel else ""
+    return heading + html_table(head, [[(text, text) for text in line] for line in lines])
 
 
 def failures(rows: list[Row]) -> str:
@@ -196,7 +202,7 @@ def failures(rows: list[Row]) -> str:
         return ""
     lines = [[row["scene"], name_of(row), row["status"], reason_of(row), row["command"]] for row in lost]
     cells = [[(str(text), str(text)) for text in line] for line in lines]
-    return "<h2 id='failed'>Failed cases</h2>" + html_table(["scene", "case", "status", "reason", "command"], cells)
+    return "<h2 id='failed'>Failed cases</h2>" + html_table(["scene", "what", "status", "reason", "command"], cells)
 
 
 def table(rows: list[Row]) -> str:
@@ -206,11 +212,16 @@ def table(rows: list[Row]) -> str:
     shared = [name for name in columns if name not in ALWAYS and len(rows) > 1 and is_shared(name, rows)]
     numbers_first = sorted(columns, key=lambda name: name in TEXT and name != "scene")
     shown = [*ALWAYS[:2], *(name for name in numbers_first if name not in (*shared, *ALWAYS)), ALWAYS[2]]
-    same = "".join(f"<dt>{escape(name)}</dt><dd>{escape(readable(wording.plain(rows[0][name])))}</dd>" for name in shared)
+    same = "".join(map(shared_entry, shared, (rows[0][name] for name in shared)))
     lines = [[(wording.plain(row.get(name)), sort_key(row.get(name))) for name in shown] for row in rows]
     above = f"<details><summary>The same in all cases</summary><dl class='facts'>{same}</dl></details>" if same else ""
-    note = "<p class='caption'>SI units; a heading sorts. The same numbers to all digits are in table.csv.</p>"
+    note = "<p class='caption'>SI units; a heading sorts. The same numbers to all digits are in table.csv; "
+    note += "on paper stand the main columns only.</p>"
     return "<h2 id='all'>All cases</h2>" + note + above + html_table(shown, lines)
+
+
+def shared_entry(name: str, value: float | str | None) -> str:
+    return f"<dt>{escape(name)}</dt><dd>{escape(readable(wording.plain(value)))}</dd>"
 
 
 def is_shared(name: str, rows: list[Row]) -> bool:
@@ -223,14 +234,20 @@ def sort_key(value: float | str | None) -> str:
 
 def html_table(head: list[str], lines: list[list[tuple[str, str]]]) -> str:
     """Lines of (text, what to sort by)."""
-    top = "".join(f"<th scope='col'>{escape(name)}</th>" for name in head)
+    top = "".join(f"<th scope='col'{kind(name)}>{escape(name)}</th>" for name in head)
     body = "".join("<tr>" + "".join(map(html_cell, line, head)) + "</tr>\n" for line in lines)
-    return f"<div class='wide'><table class='sortable'><thead><tr>{top}</tr></thead><tbody>\n{body}</tbody></table></div>"
+    inside = f"<thead><tr>{top}</tr></thead><tbody>\n{body}</tbody>"
+    return f"<div class='wide'><table class='sortable'>{inside}</table></div>"
+
+
+def kind(column: str) -> str:
+    """Class of a column: the reason may take several lines, and paper has no room for what is not asked for most."""
+    name = "text" if column == "reason" else "more" if column in NOT_PRINTED else ""
+    return f" class='{name}'" if name else ""
 
 
 def html_cell(entry: tuple[str, str], column: str) -> str:
     text, key = entry
     sort = f' data-key="{escape(key)}"' if key != text else ""
     content = f"<code>{escape(text)}</code>" if column == "command" and text else escape(text)
-    kind = " class='text'" if column == "reason" else ""
-    return f"<td{sort}{kind}>{content}</td>"
+    return f"<td{sort}{kind(column)}>{content}</td>"

@@ -47,7 +47,7 @@ class Chart:
     failed: list[Row] = field(default_factory=list)
     cheapest: dict[str, list[Row | None]] = field(default_factory=dict)
 
-    def mark(self, axes: Axes, x: Sequence[float], y: Sequence[float], points: list[Point], look: Look, **style) -> None:
+    def mark(self, axes: Axes, x: list[float], y: list[float], points: list[Point], look: Look, **style) -> None:
         """Draws measured points; panels are told apart by their titles."""
         if not points:
             return

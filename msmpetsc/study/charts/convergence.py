@@ -10,8 +10,10 @@ from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_
 from msmpetsc.study.charts.look import COUNT, ERROR, SECONDS, Look, around, log_ticks
 from msmpetsc.study.rows import grouped
 
+KIND = "Convergence within one step"
 CAPTION = (
-    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second number on."
+    "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "
+    "number on."
 )
 MANY = 40  # iterates: where there are more, their marks are smaller
 Iterate = dict[str, float | None]
@@ -43,9 +45,7 @@ def convergence_chart(scene: str, frames: set, curves: dict[str, list[Iterate]],
     handles = {label: handle(looks[label]) for label in curves}
     figure, axes = new_figure(2, list(handles))
     step = f", step {frames.pop()}" if len(frames) == 1 else ""
-    chart = Chart(
-        f"convergence_{scene}", "Convergence within one step", f"Convergence within one step: {scene}{step}", CAPTION, figure
-    )
+    chart = Chart(f"convergence_{scene}", KIND, f"{KIND}: {scene}{step}", CAPTION, figure)
     draw(chart, axes[0], "iteration", "over the iterations", "iteration", curves, looks)
     draw(chart, axes[1], "seconds", "over the computing time", "computing time within the step", curves, looks)
     legend_below(figure, handles)
@@ -59,7 +59,8 @@ def draw(chart: Chart, axes: Axes, column: str, title: str, x_label: str, curves
     axes.set_ylabel("true step error |x − x*| / |y − x*|")
     shown = {label: [row for row in rows if row[column] is not None] for label, rows in curves.items()}
     error_axis(axes, [row["position_error"] for rows in shown.values() for row in rows])
-    axis_from_zero(axes, [row[column] for rows in shown.values() for row in rows], COUNT if column == "iteration" else SECONDS)
+    tick = COUNT if column == "iteration" else SECONDS
+    axis_from_zero(axes, [row[column] for rows in shown.values() for row in rows], tick)
     for label, rows in shown.items():
         look = looks[label]
         x, y = [row[column] for row in rows], [row["position_error"] for row in rows]

@@ -44,17 +44,17 @@ def figure6_chart(name: str, scene: str, time_step: float | None, rows: list[Row
     """One panel, log-log."""
     by_curve = curves(rows)
     lines = line_styles(by_curve)
-    handles = {f"{curve} ({errors(group)})": handle(looks[group[0]["label"]], lines[curve]) for curve, group in by_curve.items()}
+    look_of = {curve: looks[group[0]["label"]] for curve, group in by_curve.items()}
+    handles = {f"{name} ({errors(group)})": handle(look_of[name], lines[name]) for name, group in by_curve.items()}
     figure, (axes,) = new_figure(1, list(handles))
     chart = Chart(name, KIND, titled("Frames a second over cells", scene, time_step), CAPTION, figure)
     axes.set_xlabel("valid cells (k: thousand, M: million)")
     axes.set_ylabel("frames a second")
     log_axes(axes, [row["cells"] for row in rows], [row["fps"] for row in rows], COUNT, COUNT)
     for curve, group in by_curve.items():
-        look = looks[group[0]["label"]]
-        axes.plot([row["cells"] for row in group], [row["fps"] for row in group], lines[curve], color=look.color)
-        points = [point(row, curve) for row in group]
-        chart.mark(axes, [row["cells"] for row in group], [row["fps"] for row in group], points, look)
+        cells, fps = [row["cells"] for row in group], [row["fps"] for row in group]
+        axes.plot(cells, fps, lines[curve], color=look_of[curve].color)
+        chart.mark(axes, cells, fps, [point(row, curve) for row in group], look_of[curve])
     legend_below(figure, handles)
     lines_found = overtaking(by_curve)
     if lines_found:
@@ -100,7 +100,8 @@ def point(row: Row, curve: str) -> Point:
 
 def overtaking(by_curve: dict[str, list[Row]]) -> list[str]:
     """For each Cholesky curve, from which measured cell count on the fastest CG is faster; a GPU is no fair rival."""
-    named = [row | {"curve": curve} for curve, group in by_curve.items() for row in group if row["integrator"] != "verlet"]
+    implicit = {curve: [row for row in group if row["integrator"] != "verlet"] for curve, group in by_curve.items()}
+    named = [row | {"curve": curve} for curve, group in implicit.items() for row in group]
     factored = grouped(filter(is_cholesky, named), lambda row: row["curve"])
     rivals = grouped((row for row in named if not is_cholesky(row)), is_on_gpu)
     return [overtaken(curve, group, iterative) for iterative in rivals.values() for curve, group in factored.items()]
@@ -116,10 +117,11 @@ def overtaken(curve: str, group: list[Row], iterative: list[Row]) -> str:
     won = [(row, rival) for row, rival in pairs if row["cells"] > max(slower, default=0)]
     if not won:
         row, rival = pairs[-1]
-        return f"{curve} is still faster at {wording.count(row['cells'])} cells, the most measured ({duel(row, rival)})."
+        cells = wording.count(row["cells"])
+        return f"{curve} is still faster at {cells} cells, the most measured ({duel(row, rival)})."
     row, rival = won[0]
-    where = "at every cell count measured, from" if not slower else "from"
-    return f"{rival['curve']} is faster than {curve} {where} {wording.count(row['cells'])} cells on ({duel(row, rival)})."
+    start = f"{'' if slower else 'at every cell count measured, '}from {wording.count(row['cells'])} cells on"
+    return f"{rival['curve']} is faster than {curve} {start} ({duel(row, rival)})."
 
 
 def fastest(rows: list[Row], cells: float) -> Row | None:

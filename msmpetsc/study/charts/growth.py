@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter
@@ -13,9 +14,10 @@ from msmpetsc.study.charts.figure6 import line_styles
 from msmpetsc.study.charts.look import BYTES, COUNT, SECONDS, Look, log_axes
 from msmpetsc.study.rows import Row, failed, measured
 
+KIND = "Growth with the number of cells"
 CAPTION = (
-    "A level curve means a cost in proportion to the cells; a rising one grows faster than the body. Memory is the peak "
-    "of all ranks, the program itself and the surface mesh included."
+    "A level curve means a cost in proportion to the cells; a rising one grows faster than the body. Memory is the "
+    "peak of all ranks, the program itself and the surface mesh included."
 )
 
 
@@ -30,10 +32,14 @@ class Quantity:
     word: Callable[[float], str]
 
 
+def a_cell(column: str) -> Callable[[Row], float]:
+    return lambda row: row[column] / row["cells"]
+
+
 QUANTITIES = (
-    Quantity("time a frame and cell", "time_frame", lambda row: row["time_frame"] / row["cells"], SECONDS, wording.seconds),
-    Quantity("memory a cell", "memory", lambda row: row["memory"] / row["cells"], BYTES, wording.size),
-    Quantity("KSP iterations a step", "ksp_its", lambda row: row["ksp_its"], COUNT, wording.count),
+    Quantity("time a frame and cell", "time_frame", a_cell("time_frame"), SECONDS, wording.seconds),
+    Quantity("memory a cell", "memory", a_cell("memory"), BYTES, wording.size),
+    Quantity("KSP iterations a step", "ksp_its", itemgetter("ksp_its"), COUNT, wording.count),
 )
 
 
@@ -61,13 +67,14 @@ def growth_chart(
     lines = line_styles(by_curve)
     handles = {curve: handle(looks[group[0]["label"]], lines[curve]) for curve, group in by_curve.items()}
     figure, axes = new_figure(len(panels), list(handles))
-    chart = Chart(name, "Growth with the number of cells", titled("Growth with cells", scene, time_step), CAPTION, figure)
+    chart = Chart(name, KIND, titled("Growth with cells", scene, time_step), CAPTION, figure)
     for ax, (quantity, shown) in zip(axes, panels):
         ax.set_title(quantity.title, loc="left")
         ax.set_xlabel("valid cells (k: thousand, M: million)")
         log_axes(ax, [row["cells"] for row in shown], [quantity.value(row) for row in shown], COUNT, quantity.tick)
         for curve, group in by_curve.items():
-            draw_curve(chart, ax, quantity, curve, measured(group, quantity.column), looks[group[0]["label"]], lines[curve])
+            known = measured(group, quantity.column)
+            draw_curve(chart, ax, quantity, curve, known, looks[group[0]["label"]], lines[curve])
     legend_below(figure, handles)
     return chart
 

@@ -21,7 +21,7 @@ WIDER = {"P": 9, "X": 9, "*": 11, "^": 8, "v": 8, "<": 8, ">": 8, "p": 8, "D": 6
 
 RC = {  # on matplotlib's own defaults
     "font.family": ["sans-serif"],
-    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],  # the first comes with matplotlib, a browser may need others
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],  # the first is matplotlib's own
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.labelcolor": INK,

@@ -22,8 +22,8 @@ FRONT = "Pareto front"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
     "small and hollow. Ringed points on the grey stair are the Pareto front: nothing measured is both cheaper and more "
-    "exact. The step error is that of solving a step; the trajectory error is that of the whole motion, time step "
-    "included."
+    "exact, errors taken to two digits. The step error is that of solving a step; the trajectory error is that of the "
+    "whole motion, time step included."
 )
 
 
@@ -63,8 +63,10 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
 
 
 def front_rows(rows: list[Row], measure: Measure) -> list[Row]:
-    """The front of measured rows, by rising error."""
-    return [rows[i] for i in front([row[measure.error] for row in rows], [row[measure.cost] for row in rows])]
+    """The front of measured rows, by rising error. Errors that read alike, to two digits, count as equal: no step can
+    better the trajectory error of its time step but in the last digits, and those are no reason to pay more."""
+    errors, costs = columns(rows, measure)
+    return [rows[i] for i in front([float(f"{error:.1e}") for error in errors], costs)]
 
 
 def cheapest(rows: list[Row], measure: Measure, level: float) -> Row | None:

@@ -28,7 +28,8 @@ def save_png(chart: Chart, folder: Path) -> Path:
 def svg_text(chart: Chart) -> str:
     """The chart as an <svg> element: every point has a <title>, which browsers show where the mouse is."""
     stream = io.BytesIO()
-    with style.context(["default", RC | {"svg.hashsalt": chart.name}]):  # ids that do not meet those of other charts in one page
+    own_ids = {"svg.hashsalt": chart.name}  # that do not meet those of other charts in one page
+    with style.context(["default", RC | own_ids]):
         chart.figure.savefig(stream, format="svg", transparent=True)
     root = ElementTree.fromstring(stream.getvalue())
     root.remove(root.find(f"{{{SVG}}}metadata"))

@@ -18,7 +18,7 @@ from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
 from msmpetsc.study.charts.look import looks
 from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts
 from msmpetsc.study.report import write_report
-from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, typed
+from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, succeeded, typed
 
 VOID = {"meta", "br"}  # elements of HTML that need no end
 
@@ -51,7 +51,7 @@ ERRORS = [
     case("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
     case("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
     case("verlet", integrator="verlet", preset="", time_frame=0.002, trajectory_error=4e-4, time_step=0.001),
-    case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, cells=""),
+    case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
 ]
 SWEEP = [
     case(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
@@ -141,7 +141,7 @@ def test_errors_that_read_alike_are_no_reason_to_pay_more():
 
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
-    rows = typed_rows(*ERRORS)
+    rows = succeeded(typed_rows(*ERRORS))
     assert [(row["label"], row["error"]) for row in (cheapest(rows, STEP, e) for e in (1e-1, 5e-3, 1e-4))] == [
         ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
     ]  # fmt: skip
@@ -152,6 +152,14 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
     assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
     assert step[3] == "1e-6 or less: nothing measured reaches it."
     assert trajectory[2] == "1e-3 or less: verlet, 2 s a simulated second (reached 4e-4, time step 1 ms)."
+
+
+def test_what_failed_is_listed_and_counts_nowhere():
+    rows = typed_rows(*ERRORS)
+    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    assert [row["label"] for row in chart.failed] == ["paper"]
+    shown = {point.label for groups in chart.points.values() for group in groups.values() for point in group}
+    assert shown == {"newton", "anderson", "verlet"}
 
 
 def test_only_equal_time_steps_are_compared_by_the_step_error():

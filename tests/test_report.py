@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cell_sweep import curves
+from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
 from msmpetsc.study.charts.look import looks
 from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts
@@ -46,11 +47,11 @@ def typed_rows(*rows: dict[str, str]) -> list:
 
 
 ERRORS = [
-    case("newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
+    case("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
     case("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
     case("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
     case("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
-    case("verlet", integrator="verlet", preset="", time_frame=0.002, trajectory_error=4e-4, time_step=0.001),
+    case("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
     case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
 ]
 SWEEP = [
@@ -65,6 +66,7 @@ TRACES = [
     {
         "scene": "block",
         "label": label,
+        "case": label,
         "trace": {
             "frame": 7,
             "iteration": [0, 1, 2],
@@ -146,12 +148,12 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
         ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
     ]  # fmt: skip
     assert cheapest(rows, STEP, 1e-6) is None
-    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.002 s a step of 0.001 s: 2 s a simulated second"
+    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
     (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
     step, trajectory = chart.findings.values()
     assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
     assert step[3] == "1e-6 or less: nothing measured reaches it."
-    assert trajectory[2] == "1e-3 or less: verlet, 2 s a simulated second (reached 4e-4, time step 1 ms)."
+    assert trajectory[2] == "1e-3 or less: verlet, 2 s a simulated second (reached 4e-4, substeps of 1 ms)."
 
 
 def test_what_failed_is_listed_and_counts_nowhere():
@@ -253,6 +255,7 @@ def test_every_point_tells_its_numbers(text: str):
     assert any(tip.startswith(newton) for tip in tips)
     assert "cg\nvalid cells: 10,000\ntime a frame and cell: 9 µs" in "\n".join(tips)
     assert "anderson\niteration: 1\ncomputing time: 11 ms\nstep error: 1.7e-1\nKSP iterations: 5" in tips
+    assert any(tip.startswith("newton\niteration: 1\n") and tip.endswith("\n" + ERRORS[0]["command"]) for tip in tips)
 
 
 def test_the_whole_table_and_every_command_are_in_it(text: str):
@@ -299,6 +302,16 @@ def test_a_table_without_some_columns_is_read(tmp_path: Path):
 def test_a_folder_without_a_table_is_named(tmp_path: Path):
     with pytest.raises(InputError, match="no table.csv"):
         write_report(tmp_path)
+
+
+def test_of_several_traces_of_a_method_the_furthest_is_shown():
+    def entry(*errors: float) -> dict:
+        return {"scene": "a", "label": "b", "trace": {"iteration": [0, 1], "seconds": [0, 1], "position_error": errors}}
+
+    traces = [entry(0.5, 0.1), entry(0.5, 1e-6), entry(0.5, 1e-3)]
+    (chart,) = convergence_charts(traces, looks(["b"]), {})
+    points = chart.points["over the iterations"].values()
+    assert [[point.numbers["step error"][1] for point in group] for group in points] == [[0.5, 1e-6]]
 
 
 def test_a_trace_without_errors_is_left_out(tmp_path: Path):

@@ -20,7 +20,7 @@ from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import RC, looks
 from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, pareto_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
-from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, read_rows, read_traces
+from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, read_rows, read_traces, stepping
 
 PRINTED = {
     "label", "scene", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_second",
@@ -50,7 +50,7 @@ def draw_charts(rows: list[Row], traces: list[dict]) -> list[Chart]:
     named = looks([row["label"] for row in rows] + [entry["label"] for entry in traces])
     with style.context(["default", RC]):
         charts = pareto_charts(rows, named) + figure6_charts(rows, named) + growth_charts(rows, named)
-        return charts + convergence_charts(traces, named)
+        return charts + convergence_charts(traces, named, {row["case"]: row["command"] for row in rows if row["case"]})
 
 
 def title(folder: Path, rows: list[Row]) -> str:
@@ -126,7 +126,7 @@ def winner(name: str, row: Row | None) -> str:
     """The label of a row and what it costs."""
     if row is None:
         return "none"
-    step = f" ({wording.seconds(row['time_step'])})" if name == TRAJECTORY.name else ""
+    step = f", {stepping(row)}" if name == TRAJECTORY.name else ""
     return f"{row['label']}{step}: {wording.seconds(row[MEASURES[name].cost])}"
 
 
@@ -171,7 +171,7 @@ def bullets(lines: Iterable[str]) -> str:
 def name_of(row: Row) -> str:
     """A failed case in words."""
     settings = [
-        f"time step {wording.seconds(row['time_step'])}" if row["time_step"] else "",
+        stepping(row),
         f"error {wording.error(row['error'])}" if row["error"] else "",
         f"{wording.count(row['max_iterations'])} iterations" if row["max_iterations"] else "",
         f"{wording.count(row['cells'])} cells" if row["cells"] else "",
@@ -187,12 +187,16 @@ def reason_of(row: Row) -> str:
 def panel_table(panel: str, points: Iterable[Point]) -> str:
     """The points of a panel under its title; columns that are empty in all are left out."""
     points = list(points)
-    names = [name for name in points[0].numbers if any(point.numbers[name] for point in points)]
-    commands = any(point.command for point in points)
-    head = ["curve", *names, *(["command"] if commands else [])]
-    lines = [[point.label, *(point.numbers[name] for name in names)] + [point.command] * commands for point in points]
+    names = [name for name in points[0].numbers if any(point.texts()[name] for point in points)]
+    last = ["command"] if any(point.command for point in points) else []
     heading = f"<h4>{escape(panel)}</h4>" if panel else ""
-    return heading + html_table(head, [[(text, text) for text in line] for line in lines])
+    return heading + html_table(["curve", *names, *last], [point_line(point, names, bool(last)) for point in points])
+
+
+def point_line(point: Point, names: list[str], with_command: bool) -> list[tuple[str, str]]:
+    """One line of a panel's table: texts, and numbers to sort them by."""
+    numbers = [(point.texts()[name], sort_key(point.numbers[name][1])) for name in names]
+    return [(point.label, point.label), *numbers, *([(point.command, point.command)] if with_command else [])]
 
 
 def failures(rows: list[Row]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from msmpetsc.errors import InputError
+from msmpetsc.study import wording
 
 Row = dict[str, str | float | None]  # column -> text, or a finite number, or None where nothing was measured
 
@@ -15,9 +16,10 @@ TEXT = (
     "command",
 )  # fmt: skip
 NUMBERS = (
-    "ranks", "repeats", "time_step", "error", "max_iterations", "cells", "nodes", "unknowns", "springs", "frames",
-    "steps", "time_frame", "fps", "time_second", "time_setup", "time_factor", "time_local", "time_ksp", "time_output",
-    "iterations", "ksp_its", "memory", "estimated_error", "true_error", "energy_error", "trajectory_error",
+    "ranks", "repeats", "time_step", "substep", "error", "max_iterations", "cells", "nodes", "unknowns", "springs",
+    "frames", "steps", "time_frame", "fps", "time_second", "time_setup", "time_factor", "time_local", "time_ksp",
+    "time_output", "iterations", "ksp_its", "memory", "estimated_error", "true_error", "energy_error",
+    "trajectory_error",
 )  # fmt: skip
 
 
@@ -67,6 +69,13 @@ def failed(rows: Iterable[Row]) -> list[Row]:
 def measured(rows: Iterable[Row], *columns: str) -> list[Row]:
     """Rows with a positive number in each of these columns: what a logarithmic axis can show."""
     return [row for row in rows if all(isinstance(row[name], float) and row[name] > 0 for name in columns)]
+
+
+def stepping(row: Row) -> str:
+    """How a case steps, in words; an explicit run has substeps within its time step, the time between its frames."""
+    if row["integrator"] == "verlet":
+        return f"substeps of {wording.seconds(row['substep'])}" if row["substep"] else "longest stable substeps"
+    return f"time step {wording.seconds(row['time_step'])}" if row["time_step"] else ""
 
 
 def grouped(items: Iterable, key: Callable) -> dict[object, list]:

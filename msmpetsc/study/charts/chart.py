@@ -1,7 +1,7 @@
 """A chart: a figure, the numbers of every point in it, and what it says in plain words."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from matplotlib.axes import Axes
@@ -20,14 +20,18 @@ LABEL_WIDTH = 62  # [characters]: a longer label goes on in a second line
 
 @dataclass(frozen=True)
 class Point:
-    """One measured point: its curve, its numbers by heading, and the command that repeats it."""
+    """One measured point: its curve, its numbers by heading with how to word them, and the command that repeats it."""
 
     label: str
-    numbers: dict[str, str]
+    numbers: dict[str, tuple[Callable[[float | None], str], float | None]]
     command: str
 
+    def texts(self) -> dict[str, str]:
+        """The numbers in words; empty where there is none."""
+        return {name: word(value) for name, (word, value) in self.numbers.items()}
+
     def __str__(self) -> str:
-        lines = [self.label, *(f"{name}: {text}" for name, text in self.numbers.items() if text), self.command]
+        lines = [self.label, *(f"{name}: {text}" for name, text in self.texts().items() if text), self.command]
         return "\n".join(filter(None, lines))
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
 
@@ -13,10 +14,18 @@ from msmpetsc.study.rows import grouped
 KIND = "Convergence within one step"
 CAPTION = (
     "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "
-    "number on."
+    "number on. Of several cases of a method the one that went furthest is shown."
 )
 MANY = 40  # iterates: where there are more, their marks are smaller
 Iterate = dict[str, float | None]
+
+
+class Curve(NamedTuple):
+    """One trace; command: empty where its case is not known."""
+
+    label: str
+    iterates: list[Iterate]
+    command: str
 
 
 def iterates(trace: dict) -> list[Iterate]:
@@ -28,21 +37,30 @@ def iterates(trace: dict) -> list[Iterate]:
     return [row for row in rows if isinstance(row["position_error"], int | float) and 0 < row["position_error"] < 1e300]
 
 
-def convergence_charts(traces: list[dict], looks: dict[str, Look]) -> list[Chart]:
-    """One chart for each scene with traces."""
+def convergence_charts(traces: list[dict], looks: dict[str, Look], commands: dict[str, str]) -> list[Chart]:
+    """One chart for each scene with traces; commands: by case, for traces that name theirs."""
     charts = []
     for scene, entries in grouped(traces, lambda entry: entry["scene"]).items():
-        curves = {entry["label"]: iterates(entry["trace"]) for entry in entries}
-        curves = {label: rows for label, rows in curves.items() if rows}
+        curves = furthest([curve_of(entry, commands) for entry in entries])
         frames = {entry["trace"].get("frame") for entry in entries}
         if curves:
             charts.append(convergence_chart(scene, frames, curves, looks))
     return charts
 
 
-def convergence_chart(scene: str, frames: set, curves: dict[str, list[Iterate]], looks: dict[str, Look]) -> Chart:
+def curve_of(entry: dict, commands: dict[str, str]) -> Curve:
+    return Curve(entry["label"], iterates(entry["trace"]), commands.get(entry.get("case", ""), ""))
+
+
+def furthest(curves: list[Curve]) -> list[Curve]:
+    """Of each method the trace that ends with the least error: cases of other targets are parts of it."""
+    by_label = grouped((curve for curve in curves if curve.iterates), lambda curve: curve.label)
+    return [min(group, key=lambda curve: curve.iterates[-1]["position_error"]) for group in by_label.values()]
+
+
+def convergence_chart(scene: str, frames: set, curves: list[Curve], looks: dict[str, Look]) -> Chart:
     """Two panels with one vertical scale."""
-    handles = {label: handle(looks[label]) for label in curves}
+    handles = {curve.label: handle(looks[curve.label]) for curve in curves}
     figure, axes = new_figure(2, list(handles))
     step = f", step {frames.pop()}" if len(frames) == 1 else ""
     chart = Chart(f"convergence_{scene}", KIND, f"{KIND}: {scene}{step}", CAPTION, figure)
@@ -52,21 +70,23 @@ def convergence_chart(scene: str, frames: set, curves: dict[str, list[Iterate]],
     return chart
 
 
-def draw(chart: Chart, axes: Axes, column: str, title: str, x_label: str, curves: dict, looks: dict[str, Look]) -> None:
+def draw(
+    chart: Chart, axes: Axes, column: str, title: str, x_label: str, curves: list[Curve], looks: dict[str, Look]
+) -> None:
     """One panel."""
     axes.set_title(title, loc="left")
     axes.set_xlabel(x_label)
     axes.set_ylabel("true step error |x − x*| / |y − x*|")
-    shown = {label: [row for row in rows if row[column] is not None] for label, rows in curves.items()}
-    error_axis(axes, [row["position_error"] for rows in shown.values() for row in rows])
+    shown = [(curve, [row for row in curve.iterates if row[column] is not None]) for curve in curves]
+    error_axis(axes, [row["position_error"] for _, rows in shown for row in rows])
     tick = COUNT if column == "iteration" else SECONDS
-    axis_from_zero(axes, [row[column] for rows in shown.values() for row in rows], tick)
-    for label, rows in shown.items():
-        look = looks[label]
+    axis_from_zero(axes, [row[column] for _, rows in shown for row in rows], tick)
+    for curve, rows in shown:
+        look = looks[curve.label]
         x, y = [row[column] for row in rows], [row["position_error"] for row in rows]
         size = look.size if len(rows) <= MANY else look.size / 2
         axes.plot(x, y, color=look.color, linewidth=1.4)
-        chart.mark(axes, x, y, [point(label, row) for row in rows], look, markersize=size)
+        chart.mark(axes, x, y, [point(curve, row) for row in rows], look, markersize=size)
 
 
 def error_axis(axes: Axes, errors: Sequence[float]) -> None:
@@ -86,13 +106,13 @@ def axis_from_zero(axes: Axes, values: Sequence[float], formatter) -> None:
     axes.xaxis.set_major_formatter(formatter)
 
 
-def point(label: str, row: Iterate) -> Point:
+def point(curve: Curve, row: Iterate) -> Point:
     """The numbers of one iterate."""
     numbers = {
-        "iteration": wording.count(row["iteration"]),
-        "computing time": wording.seconds(row["seconds"]),
-        "step error": wording.error(row["position_error"]),
-        "energy error": wording.error(row["energy_error"]),
-        "KSP iterations": wording.count(row["ksp_its"]),
+        "iteration": (wording.count, row["iteration"]),
+        "computing time": (wording.seconds, row["seconds"]),
+        "step error": (wording.error, row["position_error"]),
+        "energy error": (wording.error, row["energy_error"]),
+        "KSP iterations": (wording.count, row["ksp_its"]),
     }
-    return Point(label, numbers, "")
+    return Point(curve.label, numbers, curve.command)

@@ -85,15 +85,15 @@ def errors(rows: list[Row]) -> str:
 def point(row: Row, curve: str) -> Point:
     """The numbers of one point."""
     numbers = {
-        "valid cells": wording.count(row["cells"]),
-        "frames a second": wording.plain(row["fps"]),
-        "computing time a frame": wording.seconds(row["time_frame"]),
-        "true step error": wording.error(row["true_error"]),
-        "iterations a step": wording.count(row["iterations"]),
-        "KSP iterations a step": wording.count(row["ksp_its"]),
-        "factorisation": wording.seconds(row["time_factor"]),
-        "memory": wording.size(row["memory"]),
-        "ranks": wording.count(row["ranks"]),
+        "valid cells": (wording.count, row["cells"]),
+        "frames a second": (wording.plain, row["fps"]),
+        "computing time a frame": (wording.seconds, row["time_frame"]),
+        "true step error": (wording.error, row["true_error"]),
+        "iterations a step": (wording.count, row["iterations"]),
+        "KSP iterations a step": (wording.count, row["ksp_its"]),
+        "factorisation": (wording.seconds, row["time_factor"]),
+        "memory": (wording.size, row["memory"]),
+        "ranks": (wording.count, row["ranks"]),
     }
     return Point(curve, numbers, row["command"])
 

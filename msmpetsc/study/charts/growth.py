@@ -91,14 +91,14 @@ def draw_curve(
 def point(row: Row, curve: str, quantity: Quantity, value: float) -> Point:
     """The numbers of one point."""
     numbers = {
-        "valid cells": wording.count(row["cells"]),
-        quantity.title: quantity.word(value),
-        "computing time a frame": wording.seconds(row["time_frame"]),
-        "memory": wording.size(row["memory"]),
-        "KSP iterations a step": wording.count(row["ksp_its"]),
-        "true step error": wording.error(row["true_error"]),
-        "set-up": wording.seconds(row["time_setup"]),
-        "factorisation": wording.seconds(row["time_factor"]),
-        "ranks": wording.count(row["ranks"]),
+        "valid cells": (wording.count, row["cells"]),
+        quantity.title: (quantity.word, value),
+        "computing time a frame": (wording.seconds, row["time_frame"]),
+        "memory": (wording.size, row["memory"]),
+        "KSP iterations a step": (wording.count, row["ksp_its"]),
+        "true step error": (wording.error, row["true_error"]),
+        "set-up": (wording.seconds, row["time_setup"]),
+        "factorisation": (wording.seconds, row["time_factor"]),
+        "ranks": (wording.count, row["ranks"]),
     }
     return Point(curve, numbers, row["command"])

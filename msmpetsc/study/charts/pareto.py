@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from msmpetsc.study import wording
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
 from msmpetsc.study.charts.look import ERROR, FAINT, INK, SECONDS, Look, log_axes
-from msmpetsc.study.rows import Row, failed, grouped, measured, succeeded
+from msmpetsc.study.rows import Row, failed, grouped, measured, stepping, succeeded
 
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front"
@@ -159,13 +159,14 @@ def draw_front(axes: Axes, rows: list[Row], measure: Measure) -> None:
 def point(row: Row, measure: Measure) -> Point:
     """The numbers of one point."""
     numbers = {
-        measure.name: wording.error(row[measure.error]),
-        measure.y_label: wording.seconds(row[measure.cost]),
-        "time step": wording.seconds(row["time_step"]),
-        "error asked for": wording.error(row["error"]),
-        "most iterations": wording.count(row["max_iterations"]),
-        "iterations a step": wording.count(row["iterations"]),
-        "ranks": wording.count(row["ranks"]),
+        measure.name: (wording.error, row[measure.error]),
+        measure.y_label: (wording.seconds, row[measure.cost]),
+        "time step": (wording.seconds, row["time_step"]),
+        "substep": (wording.seconds, row["substep"]),
+        "error asked for": (wording.error, row["error"]),
+        "most iterations": (wording.count, row["max_iterations"]),
+        "iterations a step": (wording.count, row["iterations"]),
+        "ranks": (wording.count, row["ranks"]),
     }
     return Point(row["label"], numbers, row["command"])
 
@@ -176,6 +177,6 @@ def finding(measure: Measure, level: float, row: Row | None) -> str:
     if row is None:
         return f"{start} nothing measured reaches it."
     cost, reached = wording.seconds(row[measure.cost]), wording.error(row[measure.error])
-    step = f", time step {wording.seconds(row['time_step'])}" if measure is TRAJECTORY and row["time_step"] else ""
+    step = f", {stepping(row)}" if measure is TRAJECTORY else ""
     asked = f"asked for {wording.error(row['error'])}, " if row["error"] else ""
     return f"{start} {row['label']}, {cost} {measure.unit} ({asked}reached {reached}{step})."

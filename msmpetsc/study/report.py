@@ -118,8 +118,9 @@ def overview(charts: list[Chart]) -> str:
         for chart in charts for name, best in chart.cheapest.items()
     ]  # fmt: skip
     note = "The cheapest measured method; for the step error with its time a frame, for the trajectory error with its "
-    caption = f"<p class='caption'>{note}time step and its time a simulated second.</p>"
-    return f"<h2>At a glance</h2>{caption}" + html_table(head, [[(text, text) for text in line] for line in lines])
+    caption = f"<p class='caption'>{note}time a simulated second and its time step.</p>"
+    cells = [[(text, text) for text in line] for line in lines]
+    return f"<section class='overview'><h2>At a glance</h2>{caption}{html_table(head, cells)}</section>"
 
 
 def winner(name: str, row: Row | None) -> str:
@@ -127,7 +128,7 @@ def winner(name: str, row: Row | None) -> str:
     if row is None:
         return "none"
     step = f", {stepping(row)}" if name == TRAJECTORY.name else ""
-    return f"{row['label']}{step}: {wording.seconds(row[MEASURES[name].cost])}"
+    return f"{row['label']}: {wording.seconds(row[MEASURES[name].cost])}{step}"
 
 
 def sections(charts: Iterable[Chart]) -> list[str]:

@@ -2,12 +2,15 @@
 
 from matplotlib.ticker import EngFormatter
 
+GAP = "\N{NO-BREAK SPACE}"  # a unit stays with its number
+
 
 def seconds(value: float | None) -> str:
     """A time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
     if value is None:
         return ""
-    return EngFormatter("s")(float(f"{value:.3g}")) if value < 1000 else f"{float(f'{value:.3g}'):,.0f} s"
+    rounded = float(f"{value:.3g}")
+    return EngFormatter("s", sep=GAP)(rounded) if rounded < 1000 else f"{rounded:,.0f}{GAP}s"
 
 
 def error(value: float | None) -> str:
@@ -25,7 +28,7 @@ def count(value: float | None) -> str:
 
 def size(value: float | None) -> str:
     """Bytes with their prefix: 2.5e8 -> 250 MB."""
-    return "" if value is None else EngFormatter("B")(float(f"{value:.3g}"))
+    return "" if value is None else EngFormatter("B", sep=GAP)(float(f"{value:.3g}"))
 
 
 def plain(value: float | str | None) -> str:

@@ -165,7 +165,8 @@ def listed(heading: str, lines: Iterable[str]) -> str:
 
 def bullets(lines: Iterable[str]) -> str:
     """A list; words such as -pc_type, fast-msm and 1e-3 are not torn at their hyphen."""
-    whole = (re.sub(r"(?<!\S)(\S{0,40}-\S{1,40})(?!\S)", r"<span class='whole'>\1</span>", escape(line)) for line in lines)
+    hyphenated = re.compile(r"(?<!\S)(\S{0,40}-\S{1,40})(?!\S)")
+    whole = (hyphenated.sub(r"<span class='whole'>\1</span>", escape(line)) for line in lines)
     return "<ul>" + "".join(f"<li>{line}</li>" for line in whole) + "</ul>"
 
 

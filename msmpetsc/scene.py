@@ -193,6 +193,14 @@ class Time(Table):
 
     step: Positive = Field(description="time step [s]")
     duration: Positive = Field(description="simulated time [s]")
+    integrator: Literal["implicit-euler", "verlet"] = Field(
+        "implicit-euler", description="how a step is taken: solved at once, or in explicit substeps"
+    )
+    substep: Positive | None = Field(
+        None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
+    )
+
+    _has_a_use = field_validator("substep")(_only_for("integrator", "verlet"))
 
     @field_validator("duration")
     @classmethod

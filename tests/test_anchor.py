@@ -124,9 +124,10 @@ def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path:
     database.setValue("ksp_rtol", "1e-8")
     try:
         with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-            first = simulation.stepper
+            first = simulation.integrator.stepper
             assert len(list(simulation.frames())) == 4
-            assert simulation.stepper is not first and simulation.stepper.ksp.getTolerances()[0] == 1e-8
+            second = simulation.integrator.stepper
+            assert second is not first and second.ksp.getTolerances()[0] == 1e-8
             simulation.refuse_unused_options(at_end=True)
             database.setValue("ksp_tpye", "cg")
             with capsys.disabled(), pytest.raises(InputError, match="-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout

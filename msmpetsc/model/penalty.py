@@ -24,11 +24,15 @@ class Penalty:
     friction: float
     stick: float
 
+    def at(self, time: float) -> "Press":
+        """The obstacle at a time, without friction."""
+        return Press(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None)
+
     def during(self, q: np.ndarray, time: float, time_step: float) -> "Press":
         """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
-        points, normals = self.obstacle.points_at(time), self.obstacle.normals
         if self.friction == 0:
-            return Press(points, normals, self.stiffness, None)
+            return self.at(time)
+        points, normals = self.obstacle.points_at(time), self.obstacle.normals
         before = self.obstacle.points_at(time - time_step)
         inside, face = depths(q, before, normals)
         nodes = np.flatnonzero(inside > 0)
@@ -199,3 +203,35 @@ def _add_gradient(q, points, normals, stiffness, gradient):
         if d > 0.0:
             for c in range(3):
                 gradient[i, c] -= stiffness * d * normals[face, c]
+
+
+@numba.njit(cache=True)
+def rub(
+    rows: np.ndarray,
+    q: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    carried: np.ndarray,
+    impulse: float,
+    per_mass: np.ndarray,
+    v: np.ndarray,
+) -> None:
+    """Coulomb friction as a change of velocity: at the rows that are inside, v along the face, as seen from an obstacle
+    that moves at ``carried`` (3,) [m/s], falls by no more than the friction's impulse a mass, mu N dt / m, and not
+    below nothing: so what holds does not creep, however long the substep.
+
+    impulse : mu k dt [kg/s], times the depth the impulse
+    """
+    for i in rows:
+        d, face = depth(q[i], points, normals)
+        if d > 0.0:
+            along, speed = 0.0, 0.0
+            for c in range(3):
+                along += (v[i, c] - carried[c]) * normals[face, c]
+            for c in range(3):
+                speed += (v[i, c] - carried[c] - along * normals[face, c]) ** 2
+            speed = np.sqrt(speed)
+            if speed > 0.0:
+                lost = min(1.0, impulse * d * per_mass[i] / speed)
+                for c in range(3):
+                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])

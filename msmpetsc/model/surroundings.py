@@ -1,12 +1,14 @@
 """What acts on a body from outside at a time: loads, what leads its nodes, obstacles."""
 
 from functools import reduce
+from itertools import compress
 
 import numpy as np
 
 from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
-from msmpetsc.model.penalty import Contact
+from msmpetsc.model.obstacle import depths
+from msmpetsc.model.penalty import Contact, Penalty, rub
 
 
 class Surroundings:
@@ -19,14 +21,16 @@ class Surroundings:
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
         self.penalties, self.reflections = model.penalties, model.reflections
+        self._acting = self._load = None
 
     def load(self, time: float) -> np.ndarray:
-        """External force f_ext (owned, 3) [N]."""
-        total = np.zeros((self.lattice.owned, 3))
-        for load in self.loads:
-            if load.acts_at(time):
-                total += load.force
-        return total
+        """External force f_ext (owned, 3) [N], not to be written to."""
+        acting = [load.acts_at(time) for load in self.loads]
+        if acting != self._acting:
+            self._acting, self._load = acting, np.zeros((self.lattice.owned, 3))
+            for load in compress(self.loads, acting):
+                self._load += load.force
+        return self._load
 
     def held_at(self, time: float) -> list[Anchor]:
         """The anchors that have not let go."""
@@ -50,8 +54,54 @@ class Surroundings:
         """What presses in the step that starts from q."""
         owned = self.lattice.owned
         q = q[:owned]
-        presses = [p.during(q, time, time_step) for p in self.penalties if p.obstacle.acts_at(time)]
+        presses = [penalty.during(q, time, time_step) for penalty in self._pressing(time)]
         return Contact(presses, owned) if presses else None
+
+    def push(self, time: float) -> Contact | None:
+        """What presses at a time, without friction."""
+        presses = [penalty.at(time) for penalty in self._pressing(time)]
+        return Contact(presses, self.lattice.owned) if presses else None
+
+    def rub(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        rows: np.ndarray,
+        per_mass: np.ndarray,
+        time: float,
+        duration: float,
+        begin: float,
+        end: float,
+    ) -> None:
+        """Friction of obstacles as they stand at ``time``, for a ``duration``, on velocities v (owned, 3) [m/s].
+
+        q, rows, per_mass : (owned, 3) [m]; the nodes that move; (owned,) [1/kg]
+        begin, end        : the substep [s] in which an obstacle carries along what it holds
+        """
+        for p in self._pressing(time):
+            if p.friction > 0:
+                path, points = p.obstacle.path, p.obstacle.points_at(time)
+                carried = (path.at(end) - path.at(begin)) / (end - begin)
+                impulse = p.friction * p.stiffness * duration
+                rub(rows, q, points, p.obstacle.normals, carried, impulse, per_mass, v)
+
+    def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float) -> np.ndarray:
+        """(owned,) [N/m]: no less than what obstacles add to a node's stiffness from start to ``time``.
+
+        q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
+            makes good is counted as inside already
+        """
+        stiffness = np.zeros(len(q))
+        for p in self.penalties:
+            if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
+                way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
+                reach = 2 * (speed * (time - start) + np.linalg.norm(way))
+                inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals)
+                stiffness[inside > -reach] += p.stiffness
+        return stiffness
+
+    def _pressing(self, time: float) -> list[Penalty]:
+        return [penalty for penalty in self.penalties if penalty.obstacle.acts_at(time)]
 
     def reflect(
         self, q: np.ndarray, q_previous: np.ndarray, time: float, time_step: float, held: np.ndarray

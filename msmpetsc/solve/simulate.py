@@ -1,4 +1,4 @@
-"""The run: one implicit Euler step after another, those that are stored yielded as frames."""
+"""The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,23 +9,17 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
+from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.frame import Frame
-from msmpetsc.model.penalty import Contact
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Scene
-from msmpetsc.solve.options import refuse_unused
-from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.step import Stepper, StepResult
+from msmpetsc.solve.implicit_euler import ImplicitEuler
+from msmpetsc.solve.state import State
+from msmpetsc.solve.step import StepResult
 from msmpetsc.solve.surface import SurfaceMotion
+from msmpetsc.solve.verlet import Verlet
 
-
-@dataclass(frozen=True)
-class State:
-    """q_n and q_(n-1), (l, 3) [m], ghosts included: what the next step starts from. After contact they are
-    not what the frame shows, which is the step as it was solved."""
-
-    q: np.ndarray
-    q_previous: np.ndarray
+INTEGRATORS = {"implicit-euler": ImplicitEuler, "verlet": Verlet}
 
 
 @dataclass
@@ -49,10 +43,10 @@ class Simulation:
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model):
         self.comm, self.model, self.time_step = comm, model, scene.time.step
-        self.steps, self.every, self.solver = scene.time.steps, scene.output.every, scene.solver
-        self.surroundings = Surroundings(model)
-        self.held = self.surroundings.held_at(self.time_step)
-        self.stepper = self._new_stepper(self.time_step)
+        self.steps, self.every = scene.time.steps, scene.output.every
+        self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
+        integrator = INTEGRATORS[scene.time.integrator]
+        self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
 
@@ -72,63 +66,35 @@ class Simulation:
         effort = Effort()
         for index in range(1, self.steps + 1):
             begin = perf_counter()
-            result, contact = self._step(index)
+            result = self._step(index)
             effort.add(result, perf_counter() - begin)
             if index % self.every == 0 or index == self.steps:
-                yield self._frame(index, result, effort, contact)
+                yield self._frame(index, result, effort)
                 effort = Effort()
 
-    def _step(self, index: int) -> tuple[StepResult, Contact | None]:
-        """The step that ends at index * t, and what pressed in it; ``state`` moves on (collective)."""
-        around, state, time = self.surroundings, self.state, index * self.time_step
-        self._let_go(time)
-        contact = around.contact(state.q, time, self.time_step)
+    def _step(self, index: int) -> StepResult:
+        """The step that ends at index * t; ``state`` moves on (collective)."""
+        time = index * self.time_step
         try:
-            result = self.stepper.step(
-                state.q, state.q_previous, around.load(time), contact, around.led(state.q, time)
-            )
+            result, self.state = self.integrator.advance(self.state, time)
         except StepFailed as failure:
             raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}") from None
-        held = self.stepper.lattice.pinned
-        self.state = State(*around.reflect(result.position, result.previous, time, self.time_step, held))
-        return result, contact
-
-    def _new_stepper(self, time: float) -> Stepper:
-        """The solver while the same nodes are held as at ``time``: these are no unknowns."""
-        solver = self.solver
-        return Stepper(
-            self.comm,
-            self.model.lattice.pin(self.surroundings.pinned_at(time)),
-            self.time_step,
-            find_preset(solver.preset),
-            solver.error,
-            solver.max_iterations,
-            touches=bool(self.model.penalties),
-        )
-
-    def _let_go(self, time: float) -> None:
-        """Another solver where an anchor's time has come (collective)."""
-        held = self.surroundings.held_at(time)
-        if len(held) < len(self.held):
-            self.held = held
-            self.stepper.destroy()
-            self.stepper = self._new_stepper(time)
-            self.stepper.set_up()
+        return result
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        refuse_unused(self.comm, self.stepper.defaults, at_end)
+        self.integrator.refuse_unused_options(at_end)
 
-    def _frame(self, index: int, result: StepResult, effort: Effort, contact: Contact | None = None) -> Frame:
+    def _frame(self, index: int, result: StepResult, effort: Effort) -> Frame:
         lattice, time = self.model.lattice, index * self.time_step
-        owned = slice(lattice.owned)
+        owned, contact = slice(lattice.owned), self.surroundings.push(time)
         position = result.position[owned]
         velocity = (position - result.previous[owned]) / self.time_step
         sums = self.comm.allreduce(
             np.array(
                 [
                     0.5 * lattice.mass @ (velocity**2).sum(axis=1),
-                    self.stepper.elasticity.energy(result.position),
+                    self.elasticity.energy(result.position),
                     -(self.surroundings.load(time) * position).sum(),
                     contact.energy(position) if contact else 0.0,
                     *(lattice.mass @ velocity),
@@ -150,7 +116,7 @@ class Simulation:
 
     def __enter__(self) -> "Simulation":
         try:
-            self.stepper.set_up()
+            self.integrator.set_up()
         except InputError:
             self.destroy()
             raise
@@ -160,6 +126,6 @@ class Simulation:
         self.destroy()
 
     def destroy(self) -> None:
-        self.stepper.destroy()
+        self.integrator.destroy()
         if self.surface:
             self.surface.destroy()

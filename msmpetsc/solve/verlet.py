@@ -1,0 +1,207 @@
+"""Velocity Verlet: a step t of the scene in N substeps dt under the stability limit, with nothing to solve.
+
+Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact included:
+
+    v_(n+1/2) = v_n + dt/2 a(q_n),    q_(n+1) = q_n + dt v_(n+1/2),    v_(n+1) = v_(n+1/2) + dt/2 a(q_(n+1))
+
+The two half kicks at one time are one, but for a step's first and last: so v is of the same time as q wherever a
+frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
+"""
+
+import numba
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc import scene
+from msmpetsc.comm import log
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.build import Model
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.solve.ghosted import Ghosted
+from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.state import State
+from msmpetsc.solve.step import StepResult
+
+SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
+SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
+MOST_ITERATIONS = 100
+MOST_SUBSTEPS = 1e6  # of a step
+TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
+
+
+class Verlet:
+    """The substeps of one model. ``time.substep`` may only shorten them."""
+
+    def __init__(
+        self, comm: MPI.Comm, model: Model, surroundings: Surroundings, time: scene.Time, _: scene.Solver
+    ):
+        self.comm, self.lattice, self.around = comm, model.lattice, surroundings
+        self.time_step, self.substep = time.step, time.substep or np.inf
+        self.elasticity = Elasticity(comm, self.lattice)
+        self.position, self.velocity, self.mode = (Ghosted(comm, self.lattice) for _ in range(3))
+        owned = self.lattice.owned
+        self.q, self.v, self.before = self.position.values[:owned], self.velocity.values[:owned], np.empty((owned, 3))
+        self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
+        self.known = None  # the positions that ``gradient`` is of
+        self.anchors = None  # how many hold
+        springs = slice(self.lattice.springs_owned)
+        self.crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
+
+    def set_up(self) -> None:
+        """There is no matrix to make ready."""
+
+    def refuse_unused_options(self, at_end: bool = False) -> None:
+        """Raise InputError for PETSc options of the user, which have no use here (collective)."""
+        refuse_unused(self.comm, set(), at_end)
+
+    def advance(self, state: State, time: float) -> tuple[StepResult, State]:
+        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed."""
+        start = time - self.time_step
+        self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
+        self._hold(start)
+        if state.q is not self.known:
+            self.position.values[:] = state.q
+            self._pull(start)
+        times = np.linspace(start, time, 1 + self._count(start, time)).tolist()
+        duration = 0.5 * (times[1] - start)
+        for begin, end in zip(times, times[1:], strict=False):
+            self._kick(begin, duration, begin, end)
+            self._drift(begin, end)
+            self._pull(end)
+            duration = end - begin
+        self._kick(time, 0.5 * duration, begin, time)
+        self._check(duration)
+        self.velocity.update()
+        self.known = self.position.values.copy()
+        previous = self.known - self.time_step * self.velocity.values
+        return StepResult(self.known, previous, 0.0, len(times) - 1, 0), State(self.known, previous)
+
+    def _pull(self, time: float) -> None:
+        """grad E at q, with what obstacles push."""
+        self.gradient[:] = 0
+        self.elasticity.add_gradient(self.position.values, self.gradient)
+        contact = self.around.push(time)
+        if contact:
+            contact.add_gradient(self.q, self.gradient)
+
+    def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
+        """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
+        kick(self.free, self.per_mass, self.around.load(time), self.gradient, duration, self.v)
+        self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end)
+
+    def _drift(self, begin: float, end: float) -> None:
+        """q to the end of a substep: led nodes along their path, nodes that strike something back."""
+        self._hold(end)
+        drift(self.free, self.v, end - begin, self.q)
+        if self.anchors:
+            self._lead(begin, end)
+        if self.around.reflections:
+            self._reflect(begin, end)
+        self.position.update()
+
+    def _lead(self, begin: float, end: float) -> None:
+        led = self.around.led(self.position.values, end)[: self.lattice.owned]
+        where = np.flatnonzero(self.held & ~self.lattice.pinned[: self.lattice.owned])
+        self.v[where] = (led[where] - self.q[where]) / (end - begin)
+        self.q[where] = led[where]
+
+    def _reflect(self, begin: float, end: float) -> None:
+        """A node that strikes is set back, and its velocity is what then led it there."""
+        np.multiply(self.v, begin - end, out=self.before)
+        self.before += self.q
+        after, before = self.around.reflect(self.q, self.before, end, end - begin, self.held)
+        if after is not self.q:
+            struck = np.flatnonzero((after != self.q).any(axis=1))
+            self.v[struck] = (after[struck] - before[struck]) / (end - begin)
+            self.q[struck] = after[struck]
+
+    def _hold(self, time: float) -> None:
+        """Know the free nodes anew where an anchor's time has come."""
+        anchors = len(self.around.held_at(time))
+        if anchors != self.anchors:
+            self.anchors = anchors
+            self.held = self.around.pinned_at(time)[: self.lattice.owned]
+            self.free = np.flatnonzero(~self.held)
+            self._any_mode()
+
+    def _count(self, start: float, time: float) -> int:
+        """The least number of substeps that keeps to the limit (collective). Raises StepFailed where none does."""
+        speed = np.abs(self.v).max(initial=0) + self.time_step * np.abs(
+            self.around.load(start) * self.per_mass[:, None]
+        ).max(initial=0)
+        speed = np.sqrt(3) * self.comm.allreduce(speed, MPI.MAX)
+        pushed = self.around.stiffest_push(self.q, speed, start, time)[self.free] * self.per_mass[self.free]
+        squared = self._elastic_squared() + self.comm.allreduce(pushed.max(initial=0), MPI.MAX)  # no less than both
+        limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
+        if limit < self.substep < np.inf:
+            log.warning(
+                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken", self.substep, limit
+            )
+            self.substep = np.inf  # said once
+        count = self.time_step / min(limit, self.substep)
+        if not count < MOST_SUBSTEPS:
+            raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler")
+        return max(1, int(np.ceil(count * (1 - 1e-12))))
+
+    def _elastic_squared(self) -> float:
+        """omega^2 [1/s^2] of the springs at q: power iterations from the mode found last, |M^(-1) H x|_M of |x|_M = 1."""
+        q, x = self.position.values, self.mode.values
+        resisting, product = self.elasticity.resisting(q), np.empty_like(q)
+        for _ in range(MOST_ITERATIONS):
+            before = self.squared
+            product[:] = 0
+            self.elasticity.add_hessian(q, resisting, False, x, product)
+            np.multiply(product[: len(self.q)], self.per_mass[:, None], out=x[: len(self.q)])
+            x[: len(self.q)][self.held] = 0
+            self.squared = self._normalise()
+            if not abs(self.squared - before) > SETTLED * self.squared:
+                break
+        return self.squared
+
+    def _any_mode(self) -> None:
+        """Something of every mode, whatever the number of ranks."""
+        numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
+        self.mode.values[:] = np.sin(1e4 * np.sin(numbers))
+        self.mode.values[: self.lattice.owned][self.held] = 0
+        self._normalise()
+        self.squared = 0.0
+
+    def _normalise(self) -> float:
+        """Make |x|_M = 1; returns what it was (collective)."""
+        x = self.mode.values[: self.lattice.owned]
+        size = np.sqrt(self.comm.allreduce(self.lattice.mass @ np.einsum("ij,ij->i", x, x)))
+        if size > 0:
+            x /= size
+        self.mode.update()
+        return size
+
+    def _check(self, substep: float) -> None:
+        """Raise StepFailed where the step has run away (collective)."""
+        energy, crushed = self.comm.allreduce(np.array([self.elasticity.energy(self.position.values), self.crushed]))
+        if not energy <= TORN * crushed:
+            raise StepFailed(
+                f"became unstable: elastic energy {energy:.2e} J after substeps of {substep:.2e} s; "
+                f"try time.substep = {0.5 * substep:.1e}, a smaller time.step, or implicit-euler"
+            )
+
+    def destroy(self) -> None:
+        """Collective."""
+        for field in (self.position, self.velocity, self.mode):
+            field.destroy()
+
+
+@numba.njit(cache=True)
+def kick(rows, per_mass, load, gradient, duration, v):
+    """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
+    for i in rows:
+        for c in range(3):
+            v[i, c] += duration * per_mass[i] * (load[i, c] - gradient[i, c])
+
+
+@numba.njit(cache=True)
+def drift(rows, v, duration, q):
+    """q += duration v at the rows of (l, 3) arrays."""
+    for i in rows:
+        for c in range(3):
+            q[i, c] += duration * v[i, c]

@@ -26,6 +26,7 @@ from msmpetsc.solve.step import StepResult
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
 MOST_ITERATIONS = 100
+RETRIES = 4  # of a step
 MOST_SUBSTEPS = 1e6  # of a step
 TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
 
@@ -43,10 +44,11 @@ class Verlet:
         owned = self.lattice.owned
         self.q, self.v, self.before = self.position.values[:owned], self.velocity.values[:owned], np.empty((owned, 3))
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
-        self.known = None  # the positions that ``gradient`` is of
+        self.known = None  # the positions that ``gradient`` is of, and omega^2, 0 if it is not known
         self.anchors = None  # how many hold
         springs = slice(self.lattice.springs_owned)
-        self.crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
+        crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
+        self.most = TORN * comm.allreduce(crushed)  # [J]
 
     def set_up(self) -> None:
         """There is no matrix to make ready."""
@@ -56,14 +58,41 @@ class Verlet:
         refuse_unused(self.comm, set(), at_end)
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed."""
+        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
+
+        Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body.
+        """
         start = time - self.time_step
+        self._begin(state, start)
+        pushed = self._pushed(start, time)
+        squared = pushed + (self.squared or self._elastic_squared())
+        for _ in range(1 + RETRIES):
+            count = self._count(squared)
+            self._take(count, start, time)
+            energy, dt = self._energy(), self.time_step / count
+            after = pushed + self._elastic_squared() if energy <= self.most else np.inf
+            if dt**2 * after <= 4:
+                return self._result(count)
+            squared = np.clip(after, 2 * squared, 16 * squared)
+            self._begin(state, start)
+        raise StepFailed(
+            f"became unstable: elastic energy {energy:.2e} J after substeps of {dt:.2e} s; "
+            "try a smaller time.step, a softer material, or implicit-euler"
+        )
+
+    def _begin(self, state: State, start: float) -> None:
+        """q, v and grad E of a state."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
         if state.q is not self.known:
             self.position.values[:] = state.q
             self._pull(start)
-        times = np.linspace(start, time, 1 + self._count(start, time)).tolist()
+            self.squared = 0.0
+
+    def _take(self, count: int, start: float, time: float) -> None:
+        """All substeps of a step."""
+        self.known = None
+        times = np.linspace(start, time, 1 + count).tolist()
         duration = 0.5 * (times[1] - start)
         for begin, end in zip(times, times[1:], strict=False):
             self._kick(begin, duration, begin, end)
@@ -71,11 +100,12 @@ class Verlet:
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
-        self._check(duration)
+
+    def _result(self, count: int) -> tuple[StepResult, State]:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        return StepResult(self.known, previous, 0.0, len(times) - 1, 0), State(self.known, previous)
+        return StepResult(self.known, previous, 0.0, count, 0), State(self.known, previous)
 
     def _pull(self, time: float) -> None:
         """grad E at q, with what obstacles push."""
@@ -125,19 +155,22 @@ class Verlet:
             self.free = np.flatnonzero(~self.held)
             self._any_mode()
 
-    def _count(self, start: float, time: float) -> int:
-        """The least number of substeps that keeps to the limit (collective). Raises StepFailed where none does."""
-        speed = np.abs(self.v).max(initial=0) + self.time_step * np.abs(
-            self.around.load(start) * self.per_mass[:, None]
-        ).max(initial=0)
-        speed = np.sqrt(3) * self.comm.allreduce(speed, MPI.MAX)
+    def _pushed(self, start: float, time: float) -> float:
+        """omega^2 [1/s^2] that obstacles may add until ``time`` to that of the springs, at the most (Weyl) (collective)."""
+        fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
+        speed = np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1).max(initial=0)
+        speed = self.comm.allreduce(speed, MPI.MAX)
         pushed = self.around.stiffest_push(self.q, speed, start, time)[self.free] * self.per_mass[self.free]
-        squared = self._elastic_squared() + self.comm.allreduce(pushed.max(initial=0), MPI.MAX)  # no less than both
+        return self.comm.allreduce(pushed.max(initial=0), MPI.MAX)
+
+    def _count(self, squared: float) -> int:
+        """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
         limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
         if limit < self.substep < np.inf:
             log.warning(
-                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken", self.substep, limit
-            )
+                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and what the limit asks for later",
+                self.substep, limit,
+            )  # fmt: skip
             self.substep = np.inf  # said once
         count = self.time_step / min(limit, self.substep)
         if not count < MOST_SUBSTEPS:
@@ -145,16 +178,19 @@ class Verlet:
         return max(1, int(np.ceil(count * (1 - 1e-12))))
 
     def _elastic_squared(self) -> float:
-        """omega^2 [1/s^2] of the springs at q: power iterations from the mode found last, |M^(-1) H x|_M of |x|_M = 1."""
-        q, x = self.position.values, self.mode.values
+        """omega^2 [1/s^2] of the springs at q by power iterations from the mode found last (collective).
+
+        Without the negative curvature across pressed springs, which is no oscillation and has no bound.
+        """
+        q, x, owned = self.position.values, self.mode.values, self.lattice.owned
         resisting, product = self.elasticity.resisting(q), np.empty_like(q)
         for _ in range(MOST_ITERATIONS):
             before = self.squared
             product[:] = 0
-            self.elasticity.add_hessian(q, resisting, False, x, product)
-            np.multiply(product[: len(self.q)], self.per_mass[:, None], out=x[: len(self.q)])
-            x[: len(self.q)][self.held] = 0
-            self.squared = self._normalise()
+            self.elasticity.add_hessian(q, resisting, True, x, product)
+            np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
+            x[:owned][self.held] = 0
+            self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
             if not abs(self.squared - before) > SETTLED * self.squared:
                 break
         return self.squared
@@ -176,14 +212,9 @@ class Verlet:
         self.mode.update()
         return size
 
-    def _check(self, substep: float) -> None:
-        """Raise StepFailed where the step has run away (collective)."""
-        energy, crushed = self.comm.allreduce(np.array([self.elasticity.energy(self.position.values), self.crushed]))
-        if not energy <= TORN * crushed:
-            raise StepFailed(
-                f"became unstable: elastic energy {energy:.2e} J after substeps of {substep:.2e} s; "
-                f"try time.substep = {0.5 * substep:.1e}, a smaller time.step, or implicit-euler"
-            )
+    def _energy(self) -> float:
+        """E of the springs [J] (collective)."""
+        return self.comm.allreduce(self.elasticity.energy(self.position.values))
 
     def destroy(self) -> None:
         """Collective."""

@@ -13,7 +13,7 @@ class Frame:
     position   : (n_local, 3) node positions [m]
     surface    : (v_local, 3) surface points [m], or None where the scene does not ask for them
     step_error : bound on the relative error of a step, the greatest since the frame stored before (0 for frame 0)
-    iterations : outer (SNES) iterations of these steps, summed
+    iterations : outer (SNES) iterations of these steps, or their explicit substeps, summed
     ksp_its    : KSP iterations of these steps, summed
     momentum   : (3,) [kg m/s]
     """

@@ -68,7 +68,8 @@ class Verlet:
         squared = pushed + (self.squared or self._elastic_squared())
         for _ in range(1 + RETRIES):
             count = self._count(squared)
-            self._take(count, start, time)
+            with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
+                self._take(count, start, time)
             energy, dt = self._energy(), self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
             if dt**2 * after <= 4:
@@ -156,7 +157,7 @@ class Verlet:
             self._any_mode()
 
     def _pushed(self, start: float, time: float) -> float:
-        """omega^2 [1/s^2] that obstacles may add until ``time`` to that of the springs, at the most (Weyl) (collective)."""
+        """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
         fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
         speed = np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1).max(initial=0)
         speed = self.comm.allreduce(speed, MPI.MAX)
@@ -168,7 +169,7 @@ class Verlet:
         limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
         if limit < self.substep < np.inf:
             log.warning(
-                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and what the limit asks for later",
+                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and under it later",
                 self.substep, limit,
             )  # fmt: skip
             self.substep = np.inf  # said once

@@ -52,7 +52,7 @@ def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> Non
     for name, kind in fields.items():
         stored = file["frames"][name][:count]
         wanted = np.array([getattr(one, name) for one in expected], kind).reshape(stored.shape)
-        assert np.array_equal(stored, wanted), name
+        assert np.array_equal(stored, wanted, equal_nan=True), name
 
 
 @pytest.mark.parametrize("ranks", [1, 3])

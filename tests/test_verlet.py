@@ -158,7 +158,7 @@ def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
     for column in range(len(H)):
         v, product = np.zeros_like(q), np.zeros_like(q)
         v[free[column // 3], column % 3] = 1
-        elasticity.add_hessian(q, elasticity.resisting(q), projected, v, product)
+        elasticity.hessian_at(q, projected).add_product(v, product)
         H[:, column] = product[free].ravel()
     scale = 1 / np.sqrt(np.repeat(lattice.mass[free], 3))
     return np.linalg.eigvalsh(scale[:, None] * H * scale)[-1]

@@ -5,6 +5,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ import petsc4py
 from mpi4py import MPI
 
 from msmpetsc import __version__
+from msmpetsc.cli.cost import Cost, versions
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.frames import ResultFile
@@ -22,6 +24,7 @@ from msmpetsc.scene_reading import load_scene
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
+    from msmpetsc.solve.measured import Measured
     from msmpetsc.solve.simulate import Simulation
 
 
@@ -41,6 +44,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
+    parser.add_argument(
+        "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
+    )
+    parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
+    parser.add_argument("--measure", type=Path, metavar="OUT.json", help="write what the run cost: times, memory")
     parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
 
 
@@ -66,22 +74,43 @@ def run(args: argparse.Namespace) -> int:
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
 
+    began = perf_counter()
+    measured = what_is_measured(args)
     scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
     path = args.output or Path("out") / f"{args.scene.stem}.h5"
     try:
         with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
             model = build_model(comm, scene)
             describe(comm, model)
-            with Simulation(comm, scene, model) as simulation:
+            with Simulation(comm, scene, model, measured) as simulation:
                 simulation.refuse_unused_options()
+                cost = Cost(comm, simulation, perf_counter() - began)
                 write_model(comm, file, model)
-                write_frames(comm, file, simulation)
+                write_frames(comm, file, simulation, cost)
     except StepFailed:
         on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
+        if args.measure:
+            cost.write(args.measure)
         raise
+    if args.measure:
+        cost.write(args.measure)
     on_root(comm, lambda: finish(path, args.picture))
     simulation.refuse_unused_options(at_end=True)
     return 0
+
+
+def what_is_measured(args: argparse.Namespace) -> "Measured":
+    """Raises InputError for numbers of steps that are none."""
+    from msmpetsc.solve.measured import Measured, begin_timing
+
+    for option, number in {"--true-error": args.true_error, "--trace": args.trace}.items():
+        if number is not None and number < 1:
+            raise InputError(f"{option} must be at least 1, not {number}")
+    if args.trace is not None and args.measure is None:
+        raise InputError("--trace needs --measure, the file that it is written to")
+    if args.measure:
+        begin_timing()
+    return Measured(args.true_error, args.trace)
 
 
 def finish(path: Path, picture: bool) -> None:
@@ -118,7 +147,7 @@ def attributes(comm: MPI.Comm, scene: Scene) -> dict:
     given = PETSc.Options().getAll()
     return {
         "msmpetsc_version": __version__,
-        "petsc_version": ".".join(map(str, PETSc.Sys.getVersion())),
+        "petsc_version": versions()["petsc"],
         "petsc_options": " ".join(f"-{name} {value}".strip() for name, value in given.items()),
         "ranks": comm.size,
         "command": shlex.join(["msmpetsc", *sys.argv[1:]]),
@@ -161,7 +190,7 @@ def write_model(comm: MPI.Comm, file: ResultFile, model: "Model") -> None:
     file.write("embedding/weights", embedding.weights)
 
 
-def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
+def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation", cost: Cost) -> None:
     """Run, and store each frame when it is done; those before a failure stay (collective)."""
     lattice, embedding = simulation.model.lattice, simulation.model.embedding
     owned = slice(lattice.owned)
@@ -169,9 +198,11 @@ def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> 
     progress = Progress(simulation.steps, enabled=comm.rank == 0)
     try:
         for frame in simulation.frames():
+            begun = perf_counter()
             file.append(frame)
             state = simulation.state
             file.write_checkpoint(frame.index, state.q[owned], state.q_previous[owned])
+            cost.add(frame.wall_time, begun)
             progress.update(frame)
     finally:
         progress.close()

@@ -1,5 +1,6 @@
 """What is stored of one simulated time."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,8 @@ class Frame:
     index      : number of the step that it shows, 0 for the start
     position   : (n_local, 3) node positions [m]
     surface    : (v_local, 3) surface points [m], or None where the scene does not ask for them
-    step_error : bound on the relative error of a step, the greatest since the frame stored before (0 for frame 0)
+    step_error : estimated relative error of a step, the greatest since the frame stored before (0 for frame 0)
+    true_error, energy_error : true relative errors of such a step, in position and energy; NaN where not measured
     iterations : outer (SNES) iterations of these steps, or their explicit substeps, summed
     ksp_its    : KSP iterations of these steps, summed
     momentum   : (3,) [kg m/s]
@@ -31,3 +33,5 @@ class Frame:
     contact: float  # [J] in the penalty springs of obstacles
     momentum: np.ndarray
     wall_time: float  # [s] that these steps took
+    true_error: float = math.nan
+    energy_error: float = math.nan

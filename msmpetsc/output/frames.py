@@ -46,6 +46,8 @@ SERIES = {
     "contact": ("f8", (), "J"),
     "momentum": ("f8", (3,), "kg m/s"),
     "wall_time": ("f8", (), "s"),
+    "true_error": ("f8", (), "1"),
+    "energy_error": ("f8", (), "1"),
 }
 
 

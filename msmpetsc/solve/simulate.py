@@ -14,6 +14,7 @@ from msmpetsc.model.frame import Frame
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Scene
 from msmpetsc.solve.implicit_euler import ImplicitEuler
+from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 from msmpetsc.solve.surface import SurfaceMotion
@@ -30,6 +31,12 @@ class Effort:
     iterations: int = 0
     ksp_its: int = 0
     wall_time: float = 0.0  # [s]
+    true_error: float = np.nan
+    energy_error: float = np.nan
+
+    def measure(self, errors: np.ndarray) -> None:
+        """Of a step whose true errors were measured."""
+        self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
     def add(self, result: StepResult, wall_time: float) -> None:
         self.step_error = max(self.step_error, result.error)
@@ -41,12 +48,12 @@ class Effort:
 class Simulation:
     """Steps a model from rest. Use as a context manager: its PETSc objects are destroyed on leaving."""
 
-    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model):
+    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, measured: Measured = Measured()):
         self.comm, self.model, self.time_step = comm, model, scene.time.step
-        self.steps, self.every = scene.time.steps, scene.output.every
+        self.steps, self.every, self.measured, self.trace = scene.time.steps, scene.output.every, measured, None
         self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
         integrator = INTEGRATORS[scene.time.integrator]
-        self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver)
+        self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver, measured)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
 
@@ -65,9 +72,15 @@ class Simulation:
         yield self._frame(0, start, Effort())
         effort = Effort()
         for index in range(1, self.steps + 1):
+            if index == self.measured.trace:
+                self.integrator.follow()
             begin = perf_counter()
             result = self._step(index)
             effort.add(result, perf_counter() - begin)
+            if self.measured.asks(index):
+                errors, trace = self.integrator.true_errors(index, result)
+                effort.measure(errors)
+                self.trace = trace or self.trace
             if index % self.every == 0 or index == self.steps:
                 yield self._frame(index, result, effort)
                 effort = Effort()

@@ -184,12 +184,12 @@ class Stepper:
         else:
             self.unknowns.from_nodes(start, self.x)
         iterations = 0 if self._is_solved() else self._solve()
-        functional, its_before, self.its = self.functional, self.its, self._all_its()
+        functional, its_before, self.its = self.functional, self.its, self.all_its()
         self.unknowns.to_nodes(self.x, functional.q)
         self.corrections = [functional.q - functional.y, *self.corrections[:1]]
         return StepResult(functional.q.copy(), q, self.last_error, iterations, self.its - its_before)
 
-    def _all_its(self) -> int:
+    def all_its(self) -> int:
         """KSP iterations of all steps so far, and of their estimates."""
         return total_iterations(self.ksp) + total_iterations(self.estimate.ksp)
 
@@ -199,7 +199,10 @@ class Stepper:
             return False
         self._residual(self.snes, self.x, self.work)
         self.last_error = self._error_of(self.work)
-        return self.last_error <= (self.error or 0.0)
+        solved = self.last_error <= (self.error or 0.0)
+        if solved and self.observer:
+            self.observer(self)
+        return solved
 
     def _solve(self) -> int:
         """SNES iterations that took x to the solution. Raises StepFailed.

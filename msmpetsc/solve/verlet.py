@@ -14,11 +14,12 @@ from mpi4py import MPI
 
 from msmpetsc import scene
 from msmpetsc.comm import log
-from msmpetsc.errors import StepFailed
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.solve.ghosted import Ghosted
+from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
@@ -35,8 +36,16 @@ class Verlet:
     """The substeps of one model. ``time.substep`` may only shorten them."""
 
     def __init__(
-        self, comm: MPI.Comm, model: Model, surroundings: Surroundings, time: scene.Time, _: scene.Solver
+        self,
+        comm: MPI.Comm,
+        model: Model,
+        surroundings: Surroundings,
+        time: scene.Time,
+        _: scene.Solver,
+        measured: Measured = Measured(),
     ):
+        if measured != Measured():
+            raise InputError("the true error and the trace are of a step that is solved: verlet has none")
         self.comm, self.lattice, self.around = comm, model.lattice, surroundings
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
@@ -49,6 +58,11 @@ class Verlet:
         springs = slice(self.lattice.springs_owned)
         crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
         self.most = TORN * comm.allreduce(crushed)  # [J]
+
+    @property
+    def unknowns(self) -> int:
+        """Free nodes of this rank: pinned ones and led ones aside."""
+        return int((~self.around.pinned_at(self.time_step)[: self.lattice.owned]).sum())
 
     def set_up(self) -> None:
         """There is no matrix to make ready."""
@@ -184,11 +198,11 @@ class Verlet:
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.
         """
         q, x, owned = self.position.values, self.mode.values, self.lattice.owned
-        resisting, product = self.elasticity.resisting(q), np.empty_like(q)
+        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
         for _ in range(MOST_ITERATIONS):
             before = self.squared
             product[:] = 0
-            self.elasticity.add_hessian(q, resisting, True, x, product)
+            hessian.add_product(x, product)
             np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
             x[:owned][self.held] = 0
             self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1

@@ -1,0 +1,74 @@
+"""What a run cost, as `--measure` writes it: where the time went, memory, and on what machine."""
+
+import json
+import os
+import platform
+import resource
+import shlex
+import sys
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+from msmpetsc import __version__
+from msmpetsc.comm import on_root
+from msmpetsc.errors import InputError
+
+if TYPE_CHECKING:  # imports PETSc, which must first be given its options
+    from msmpetsc.solve.simulate import Simulation
+
+
+class Cost:
+    """Of one run: ``setup`` [s] until its first step, then summed as frames come."""
+
+    def __init__(self, comm: MPI.Comm, simulation: "Simulation", setup: float):
+        self.comm, self.simulation, self.setup = comm, simulation, setup
+        self.output = self.stepping = 0.0  # [s]
+        model = simulation.model
+        own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, simulation.integrator.unknowns
+        self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
+
+    def add(self, stepping: float, begun: float) -> None:
+        """A frame that took ``stepping`` [s] is written, which was ``begun`` at that count of perf_counter."""
+        self.stepping += stepping
+        self.output += perf_counter() - begun
+
+    def write(self, path: Path) -> None:
+        """Leave it all in a file (collective). Raises InputError where that cannot be written."""
+        from msmpetsc.solve.measured import times
+
+        comm = self.comm
+        told = {"machine": machine(), "versions": versions(), "ranks": comm.size}
+        told |= {"command": shlex.join(["msmpetsc", *sys.argv[1:]]), **self.counts}
+        own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
+        told["time"] = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
+        told["time"]["setup"] -= min(told["time"]["factor"], told["time"]["setup"])
+        told["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        told["trace"] = self.simulation.trace
+        on_root(comm, lambda: _write(path, told))
+
+
+def _write(path: Path, told: dict) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(told, indent=1))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def machine() -> dict:
+    """Processor, cores, memory [bytes], system."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    cpu = names[0] if names else platform.processor() or platform.machine()
+    return {"cpu": cpu, "cores": os.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
+
+
+def versions() -> dict:
+    from petsc4py import PETSc
+
+    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    return {"msmpetsc": __version__, "petsc": petsc, "python": platform.python_version()}

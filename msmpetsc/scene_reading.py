@@ -23,8 +23,7 @@ def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collect
     Raises InputError naming every problem of the file, one a line.
     """
     path, overrides = Path(path), list(overrides)
-    file_text = _read(path)
-    data = _parse(path, file_text)
+    file_text, data = read_toml(path)
     keys = {_override(data, override): override for override in overrides}
     try:
         checked = SceneFile.model_validate(data, context={"presets": presets})
@@ -33,13 +32,19 @@ def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collect
     return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
 
 
-def _read(path: Path) -> str:
+def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
+    """Text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    text = _read(path, kind)
+    return text, _parse(path, text)
+
+
+def _read(path: Path, kind: str) -> str:
     try:
         return path.read_bytes().decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
     except FileNotFoundError:
-        raise InputError(f"{path}: no such scene file") from None
+        raise InputError(f"{path}: no such {kind} file") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder, not a scene file") from None
+        raise InputError(f"{path}: is a folder, not a {kind} file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -57,7 +57,7 @@ class Progress:
         begun, first = self._begun
         if frame.index > first and now > begun:
             rate = (frame.index - first) / (now - begun)
-            parts += [f"{rate:.3g} frames/s", f"{_duration((self._total - frame.index) / rate)} left", _solver(frame)]
+            parts += [f"{rate:.3g} frames/s", f"{duration((self._total - frame.index) / rate)} left", _solver(frame)]
         print("  ".join(parts), file=self._stream, flush=True)
         self._told, self._untold = now, None
 
@@ -66,7 +66,7 @@ def _solver(frame: Frame) -> str:
     return f"its {frame.ksp_its}  error {frame.step_error:.1e}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """31 s, 12 min, 3.4 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"

@@ -1,0 +1,112 @@
+"""One process with all it starts: waited for, ended when it takes too long, and told of in one line."""
+
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from time import perf_counter
+
+GRACE = 3.0  # [s] between the request to end and the end
+MARKS_OF_MPI = ("PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_")  # of a launcher around us: not for our children
+
+
+@dataclass(frozen=True)
+class Ended:
+    """status: exit status, None where time ran out. reason: the last line of trouble, "" if status is 0."""
+
+    status: int | None
+    reason: str
+    seconds: float
+
+
+class Processes:
+    """Those under way; once stopped, none is started any more."""
+
+    def __init__(self):
+        self._running: set[subprocess.Popen] = set()
+        self._stopped = False
+        self._lock = Lock()
+
+    def run(self, command: Sequence[str], log: Path, timeout: float) -> Ended:
+        """Run to the end, or for ``timeout`` seconds; ``log`` gets what it says."""
+        begin = perf_counter()
+        process = self._start(command, log)
+        if process is None:
+            return Ended(None, "stopped", 0.0)
+        try:
+            status = process.wait(timeout)
+            reason = "" if status == 0 else last_error(log.read_text(errors="replace")) or f"exit status {status}"
+        except subprocess.TimeoutExpired:
+            status, reason = None, too_long(timeout)
+        finally:
+            end(process)  # what it may have left running, too
+            with self._lock:
+                self._running.discard(process)
+        return Ended(status, reason, perf_counter() - begin)
+
+    def stop(self) -> None:
+        """End all of them, for good."""
+        with self._lock:
+            self._stopped, running = True, list(self._running)
+        for process in running:
+            end(process)
+
+    @property
+    def stopped(self) -> bool:
+        return self._stopped
+
+    def _start(self, command: Sequence[str], log: Path) -> subprocess.Popen | None:
+        with self._lock, open(log, "w") as out:
+            if self._stopped:
+                return None
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=environment(), start_new_session=True
+            )
+            self._running.add(process)
+            return process
+
+
+def environment() -> dict[str, str]:
+    """As this process was started: an MPI that has since woken up in it leaves marks that confuse a child's."""
+    ours = {name: value for name, value in os.environ.items() if not name.startswith(MARKS_OF_MPI)}
+    # one thread a rank, or ranks and threads would fight for the cores; more ranks than cores are the user's to ask for
+    return {"OMP_NUM_THREADS": "1", "OMPI_MCA_rmaps_base_oversubscribe": "1"} | ours
+
+
+def too_long(timeout: float) -> str:
+    return f"took longer than {timeout:g} s"
+
+
+def last_error(told: str) -> str:
+    """The last line that tells of an error, or else the last line."""
+    lines = [line.strip() for line in told.splitlines() if line.strip()]
+    errors = [line for line in lines if "msmpetsc: error:" in line]
+    return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
+
+
+def end(process: subprocess.Popen) -> None:
+    """End a process and all of its session: mpiexec gives each rank a process group of its own."""
+    if process.poll() is None:
+        with suppress(ProcessLookupError):
+            os.kill(process.pid, signal.SIGTERM)  # mpiexec tells its ranks
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE)
+    for pid in session(process.pid):
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+    process.kill()
+    process.wait()
+
+
+def session(leader: int) -> list[int]:
+    """The processes of a session, as Linux shows them."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if os.getsid(int(entry.name)) == leader:
+                found.append(int(entry.name))
+    return found

@@ -1,0 +1,59 @@
+"""How far a study is: a bar on a terminal, lines in a log, both with what is left."""
+
+import sys
+from time import monotonic
+from typing import TextIO
+
+from tqdm import tqdm
+
+from msmpetsc.output.progress import duration
+from msmpetsc.study.figures import Row
+
+
+class StudyProgress:
+    """Tell of each case of ``total`` that is done; ``done`` were before."""
+
+    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None):
+        self._total, self._before, self._done = total, done, done
+        self._stream = stream or sys.stderr
+        self._begun = monotonic()
+        self._bar = tqdm(total=total, initial=done, unit="case", file=self._stream, dynamic_ncols=True) if self._stream.isatty() else None
+        if done and self._bar is None:
+            self._tell(f"{done} of {total} cases are done already")
+
+    def update(self, row: Row) -> None:
+        """A case is done."""
+        self._done += 1
+        if self._bar is not None:
+            if row["status"] != "ok":
+                self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
+            self._bar.set_postfix_str(described(row), refresh=False)
+            self._bar.update()
+            return
+        rate = (monotonic() - self._begun) / (self._done - self._before)
+        left = duration(rate * (self._total - self._done))
+        self._tell(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def _tell(self, line: str) -> None:
+        print(line, file=self._stream, flush=True)
+
+
+def described(row: Row) -> str:
+    """A case in a few words."""
+    goal = f"error {row['error']:g}" if row["error"] else f"{row['max_iterations']} iterations" if row["max_iterations"] else ""
+    step = f"t = {row['substep'] or row['time_step']:.3g} s"
+    parts = [row["scene"], row["label"], f"{row['cells']:.0f} cells" if row["cells"] else "", step, goal]
+    return " ".join(part for part in parts if part)
+
+
+def _outcome(row: Row) -> str:
+    if row["status"] != "ok":
+        return f"{row['status']}: {row['reason']}"
+    errors = {"step": row.get("true_error"), "trajectory": row.get("trajectory_error")}
+    told = [f"{name} error {value:.1e}" for name, value in errors.items() if value is not None]
+    time = row.get("time_frame")
+    return "  ".join([f"{time:.3g} s a step" if time else "no step", *told, *filter(None, [row["reason"]])])

@@ -1,0 +1,117 @@
+"""A study is carried out: case after case, the table written after each, so that it can be stopped and continued."""
+
+import json
+import os
+import shutil
+from collections.abc import Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from msmpetsc.errors import InputError
+from msmpetsc.study.case import Case
+from msmpetsc.study.figures import Row
+from msmpetsc.study.measure import Bench, Measured
+from msmpetsc.study.process import Processes, too_long
+from msmpetsc.study.progress import StudyProgress
+from msmpetsc.study.reading import load_study
+from msmpetsc.study.sweep import cases
+from msmpetsc.study.table import read_table, write_table
+
+
+@dataclass
+class Findings:
+    """What is known so far, in its folder: rows and traces by case, in the order of ``order``."""
+
+    folder: Path
+    order: Sequence[str]
+    rows: dict[str, Row] = field(default_factory=dict)
+    traces: dict[str, dict] = field(default_factory=dict)
+
+    def add(self, found: Measured) -> None:
+        case = found.row["case"]
+        self.rows[case] = found.row
+        if found.trace:
+            self.traces[case] = {key: found.row[key] for key in ("case", "scene", "label")} | {"trace": found.trace}
+        self.write()
+
+    def write(self) -> None:
+        """Table and traces, each replaced whole."""
+        write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
+        part = self.folder / "traces.json.part"
+        part.write_text(json.dumps([self.traces[case] for case in self.order if case in self.traces]))
+        os.replace(part, self.folder / "traces.json")
+
+
+def run_study(
+    path: Path, folder: Path, presets: Collection[str], full: bool = False, jobs: int = 1, restart: bool = False
+) -> int:
+    """Run what is not done yet of a study file; the number of its cases that have no figures.
+
+    The folder gets table.csv, table.h5, traces.json, study.toml, references/. Cases that are done and still in the
+    file are kept; ``restart`` forgets them. Raises InputError before anything is run.
+    """
+    study = load_study(path, presets)
+    every = cases(study, path.parent, True, presets)
+    wanted = {case.id for case in (every if full else cases(study, path.parent, False, presets))}
+    todo_or_done = [case for case in every if case.id in wanted]
+    folder.mkdir(parents=True, exist_ok=True)
+    if restart:
+        _forget(folder)
+    findings = _continued(folder, every)
+    shutil.copyfile(path, folder / "study.toml")
+    findings.write()
+    todo = [case for case in todo_or_done if not _is_done(case, findings.rows)]
+    progress = StudyProgress(len(todo_or_done), len(todo_or_done) - len(todo))
+    try:
+        with closing(measure_all(Bench(folder, Processes(), path.stem), todo, jobs)) as all_found:
+            for found in all_found:
+                findings.add(found)
+                progress.update(found.row)
+    finally:
+        progress.close()
+    return sum(findings.rows[case.id]["status"] != "ok" for case in todo_or_done)
+
+
+def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Iterable[Measured]:
+    """Each case's figures when it is done; whatever ends this early ends the runs under way."""
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        futures = [pool.submit(bench.measure, case) for case in todo]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        bench.processes.stop()
+        pool.shutdown(cancel_futures=True)
+
+
+def _continued(folder: Path, every: Sequence[Case]) -> Findings:
+    """What an earlier run found of these cases, called by their present names."""
+    by_id = {case.id: case for case in every}
+    findings = Findings(folder, list(by_id))
+    for row in read_table(folder):
+        if row["case"] in by_id:
+            findings.rows[row["case"]] = row | {"label": by_id[row["case"]].label}
+    traces = folder / "traces.json"
+    try:
+        told = json.loads(traces.read_text()) if traces.is_file() else []
+        findings.traces = {entry["case"]: entry for entry in told if entry["case"] in findings.rows}
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{traces} is not what a study left: --restart begins anew") from None
+    for case, entry in findings.traces.items():
+        entry["label"] = by_id[case].label
+    return findings
+
+
+def _is_done(case: Case, rows: dict[str, Row]) -> bool:
+    """A case that was given up is worth another try once it may take longer (or less long)."""
+    row = rows.get(case.id)
+    return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
+
+
+def _forget(folder: Path) -> None:
+    for name in ("table.csv", "table.h5", "traces.json"):
+        (folder / name).unlink(missing_ok=True)
+    for name in ("runs", "references"):
+        shutil.rmtree(folder / name, ignore_errors=True)

@@ -1,0 +1,73 @@
+"""Stands in for ``msmpetsc run`` in tests of studies: a lattice of 8 nodes that swings by a formula.
+
+    study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
+
+What it does is ruled by the options: -fail ends it with an error, -hang never ends it, -children starts another
+process before that. Its wall time counts up with the runs of the folder, its motion is off by the time step.
+"""
+
+import json
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.frame import Frame
+from msmpetsc.output.frames import ResultFile
+
+NODES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+MASS = np.arange(1.0, 9.0)
+
+
+def main() -> None:
+    words = sys.argv[1:]
+    out, measure = (Path(words[words.index(name) + 1]) for name in ("-o", "--measure"))
+    changes = [words[n + 1].partition("=") for n, word in enumerate(words) if word == "--set"]
+    tables = {key: tomllib.loads(f"v = {value}")["v"] for key, _, value in changes if value.startswith("{")}
+    comm = MPI.COMM_WORLD
+    calls = out.parent.parent / "calls.txt"
+    if comm.rank == 0:
+        with open(calls, "a") as file:
+            file.write(" ".join(words) + "\n")
+    count = len(calls.read_text().splitlines()) if calls.exists() else 0
+    if "-children" in words:
+        child = subprocess.Popen(["sleep", "60"])
+        (out.parent.parent / "child").write_text(str(child.pid))
+    if "-hang" in words:
+        time.sleep(60)
+    if "-fail" in words:
+        sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
+    write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
+    if comm.rank == 0:
+        measure.write_text(json.dumps(told(comm.size, count, "--trace" in words)))
+
+
+def write(comm, out: Path, table: dict, every: int, count: int) -> None:
+    """Frames off the exact motion by the time step."""
+    step, verlet = table["step"], table["integrator"] == "verlet" if "integrator" in table else False
+    own = slice(None) if comm.rank == 0 else slice(0)
+    with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, overwrite=True) as file:
+        file.write("lattice/nodes", NODES[own])
+        file.write("lattice/mass", MASS[own])
+        file.start_frames(round(table["duration"] / step / every) + 1, len(NODES[own]))
+        for index in range(round(table["duration"] / step / every) + 1):
+            now = index * step * every
+            x = NODES + (1 + (0 if verlet else step)) * now * np.array([0, 0, 1.0])
+            errors = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every)
+            energies = dict(kinetic=0, elastic=0, potential=0, contact=0, momentum=np.zeros(3))
+            file.append(Frame(index, now, x[own], None, wall_time=every * step * count, **errors, **energies))
+
+
+def told(ranks: int, count: int, traced: bool) -> dict:
+    times = dict.fromkeys(("setup", "factor", "local", "ksp", "output", "stepping"), float(count))
+    machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
+    counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks, "memory": 1000 - count}
+    trace = {"frame": 2, "iteration": [0, 1], "ksp_its": [0, 5], "seconds": [0, 1], "position_error": [1, 0.1]}
+    return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, "trace": trace if traced else None, **counts}
+
+
+main()

@@ -101,13 +101,13 @@ class Study(Table):
     title: str = Field("", description="for the reader")
     repeats: Count = Field(1, description="runs of each case, of which medians are taken [-]")
     timeout: Positive = Field(300.0, description="a run that takes longer is ended, and its case has no figures [s]")
-    scene: ListOf[StudyScene] = Field(min_length=1, description="what is run")
-    sweep: ListOf[Sweep] = Field(min_length=1, description="how it is run")
+    scene: ListOf[StudyScene] = Field(description="what is run")
+    sweep: ListOf[Sweep] = Field(description="how it is run")
 
     @field_validator("scene")
     @classmethod
     def _names_differ(cls, scenes: tuple[StudyScene, ...]) -> tuple[StudyScene, ...]:
-        names = [scene.name for scene in scenes]
+        names = [scene.name for scene in _not_empty(scenes)]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise rule(f"must not have two scenes of the name {twice!r}")
@@ -117,7 +117,7 @@ class Study(Table):
     @classmethod
     def _scenes_are_there(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
         names = [scene.name for scene in info.data.get("scene", ())]
-        unknown = next((name for sweep in sweeps for name in sweep.scenes if names and name not in names), None)
+        unknown = next((name for sweep in _not_empty(sweeps) for name in sweep.scenes if names and name not in names), None)
         if unknown is not None:
             raise rule(f"names a scene {unknown!r} that is not there{did_you_mean(unknown, names)}")
         return sweeps

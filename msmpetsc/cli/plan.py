@@ -1,0 +1,102 @@
+"""``msmpetsc plan``: the cheapest way to simulate a scene to an error."""
+
+import argparse
+import shlex
+import signal
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from msmpetsc.cli.study import refuse_ranks, stop
+from msmpetsc.errors import InputError
+
+NOTHING_MEETS = 3
+HEAD = f"{'method':34} {'time step [s]':>13} {'step error':>10} {'cost [s/s]':>10} {'error':>9}"
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "plan",
+        help="find the cheapest options that meet an error",
+        description="Try integrators, time steps and presets on the first frames of a scene, and say which is the "
+        "cheapest that meets the error. Exit status 3: none does.",
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    goal = parser.add_mutually_exclusive_group(required=True)
+    goal.add_argument("--error", type=float, metavar="E", help="relative error of the trajectory")
+    goal.add_argument("--step-error", type=float, metavar="E", help="true relative error of a step")
+    parser.add_argument("--frames", type=int, default=20, metavar="N", help="of the scene's steps, the first N (20)")
+    parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks of the trials")
+    parser.add_argument("--write", action="store_true", help="put the answer into the scene file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Plan; returns the exit status."""
+    refuse_ranks("plan")
+    target = args.error if args.step_error is None else args.step_error
+    if not 0 < target < 1:
+        raise InputError(f"the error must lie between 0 and 1, not {target:g}")
+    for name in ("frames", "ranks"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    from msmpetsc.study.plan import cheapest
+
+    trials = try_all(args, target)
+    best = cheapest(trials, target)
+    if best is None:
+        tell_what_was_reached(trials, target)
+        return NOTHING_MEETS
+    tell_answer(args, best)
+    return 0
+
+
+def try_all(args: argparse.Namespace, target: float) -> list:
+    """The trials, each told of when it is done."""
+    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.study.measure import Bench
+    from msmpetsc.study.plan import Planner
+    from msmpetsc.study.process import Processes
+
+    signal.signal(signal.SIGTERM, stop)
+    processes = Processes()
+    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
+        planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, tell)
+        print(HEAD, flush=True)
+        try:
+            return planner.for_step(target) if args.error is None else planner.for_trajectory(target)
+        finally:
+            processes.stop()
+
+
+def tell(trial) -> None:
+    """One line of the table of what was tried."""
+    method = trial.method
+    name = f"{method.preset or method.integrator} {method.options}".strip()
+    goal = "" if method.step_error is None else f"{method.step_error:.1e}"
+    cost = "" if trial.cost is None else f"{trial.cost:.3g}"
+    error = "" if trial.error is None else f"{trial.error:.1e}"
+    line = f"{name:34} {method.time_step:13.4g} {goal:>10} {cost:>10} {error:>9}  {trial.reason}"
+    print(line.rstrip(), flush=True)
+
+
+def tell_what_was_reached(trials: Sequence, target: float) -> None:
+    from msmpetsc.study.plan import nearest_miss
+
+    best = nearest_miss(trials)
+    print(f"\nnothing tried meets {target:g}; the smallest error reached:" if best else "\nnothing tried gave an error")
+    if best:
+        tell(best)
+
+
+def tell_answer(args: argparse.Namespace, best) -> None:
+    """Lines to paste, or the file changed."""
+    from msmpetsc.study.scene_lines import lines, put_into
+
+    print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")
+    if args.write:
+        put_into(args.scene, best.method)
+        print(f"written into {args.scene}:")
+    print(f"\n{lines(best.method)}\n")
+    launcher = f"mpiexec -n {args.ranks} " if args.ranks > 1 else ""
+    print(f"{launcher}msmpetsc run {shlex.quote(str(args.scene))} {best.method.options}".rstrip())

@@ -1,0 +1,213 @@
+"""The cheapest way to simulate a scene to an error: few trials on its first frames, in an order that stops early."""
+
+import math
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene_reading import load_scene
+from msmpetsc.study.case import Case
+from msmpetsc.study.figures import Row
+from msmpetsc.study.measure import Bench
+from msmpetsc.study.schema import Reference, Study, StudyScene, Sweep
+from msmpetsc.study.sweep import cases
+
+FIRST = 120.0  # [s] a trial may take while nothing is known
+REFERENCE_TIME = 60.0  # [s] that a verlet reference may be expected to take
+FINER = 4  # times: the substeps of a verlet reference; its error is then 1/16 of verlet's
+IMPLICIT_FINER = 16  # times: the steps of an implicit reference
+LOOSEST, TIGHTEST = 0.3, 1e-8  # step errors that are tried
+MOST_SHORTENED = 5  # times
+ALTERNATIVES = (
+    ("newton", "-pc_type icc"),
+    ("newton-multigrid", ""),
+    ("anderson", ""),
+    ("lbfgs", ""),
+    ("chebyshev", ""),
+    ("ngmres", ""),
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    """How the scene might be stepped. step_error is None for verlet."""
+
+    integrator: str
+    time_step: float  # [s]
+    preset: str = ""
+    options: str = ""
+    step_error: float | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """cost: computing seconds a simulated second; error as asked for; None with a reason where it has none."""
+
+    method: Method
+    cost: float | None
+    error: float | None
+    reason: str = ""
+
+    def meets(self, target: float) -> bool:
+        return self.cost is not None and self.error is not None and self.error <= target
+
+
+Try = Callable[[Method, Sequence[Trial]], Trial]  # the trials so far say how long this one may take
+
+
+def cheapest(trials: Iterable[Trial], target: float) -> Trial | None:
+    """The one to take; None if none meets the error."""
+    return min((trial for trial in trials if trial.meets(target)), key=lambda trial: trial.cost, default=None)
+
+
+def nearest_miss(trials: Iterable[Trial]) -> Trial | None:
+    """The smallest error reached; None if all failed."""
+    return min((trial for trial in trials if trial.error is not None), key=lambda trial: trial.error, default=None)
+
+
+def plan_trajectory(attempt: Try, step: float, target: float, verlet: bool, methods: Collection) -> list[Trial]:
+    """Explicit first, which needs one trial; then newton with steps as short as they must be; then its likes."""
+    done: list[Trial] = []
+    if verlet:
+        done.append(attempt(Method("verlet", step), done))
+    start = Method("implicit-euler", step, "newton", "", min(0.1, max(target, TIGHTEST)))
+    _shorten(attempt, start, target, done)
+    found = _best_implicit(done, target)
+    if found is None:
+        return done
+    _relax(attempt, found.method, target, done)
+    found = _best_implicit(done, target)
+    for preset, options in methods:
+        done.append(attempt(replace(found.method, preset=preset, options=options), done))
+    return done
+
+
+def plan_step(attempt: Try, step: float, target: float, methods: Collection) -> list[Trial]:
+    """Each method with the loosest goal that still meets the true error: the estimate is an upper bound."""
+    done: list[Trial] = []
+    for preset, options in (("newton", ""), *methods):
+        for goal in (min(3 * target, LOOSEST), target):
+            done.append(attempt(Method("implicit-euler", step, preset, options, goal), done))
+            if done[-1].meets(target) or done[-1].error is None:
+                break
+    return done
+
+
+def _shorten(attempt: Try, method: Method, target: float, done: list[Trial]) -> None:
+    """Shorter steps, or better solved ones, until the error is met or cannot be met cheaply.
+
+    The error of implicit Euler is of first order in the step; where it does not follow the step, it is that of the
+    steps' own solution.
+    """
+    before = None
+    for _ in range(1 + MOST_SHORTENED):
+        trial = attempt(method, done)
+        done.append(trial)
+        if trial.error is None or trial.meets(target):
+            return
+        if before is not None and trial.error > 0.7 * before and method.step_error > TIGHTEST:
+            method = replace(method, step_error=method.step_error / 10)
+            continue
+        shorter = 2 ** min(4, max(1, math.ceil(math.log2(trial.error / target) - 0.1)))
+        best = cheapest(done, target)
+        if best is not None and trial.cost * math.sqrt(shorter) > best.cost:
+            return  # shorter steps are somewhat easier, never so much
+        before, method = trial.error, replace(method, time_step=method.time_step / shorter)
+
+
+def _relax(attempt: Try, method: Method, target: float, done: list[Trial]) -> None:
+    """A looser solution of the steps, then longer steps, while the error is still met."""
+    if method.step_error < LOOSEST:
+        done.append(attempt(replace(method, step_error=min(LOOSEST, 10 * method.step_error)), done))
+    best = _best_implicit(done, target)
+    while best.error <= 0.6 * target and best.method.time_step < 4 * method.time_step:
+        done.append(attempt(replace(best.method, time_step=2 * best.method.time_step), done))
+        if not done[-1].meets(target) or done[-1].cost >= best.cost:
+            return
+        best = done[-1]
+
+
+def _best_implicit(done: Iterable[Trial], target: float) -> Trial | None:
+    return cheapest((trial for trial in done if trial.method.integrator != "verlet"), target)
+
+
+class Planner:
+    """Tries methods on the first frames of a scene."""
+
+    def __init__(
+        self, scene: Path, bench: Bench, presets: Collection[str], frames: int, ranks: int, tell: Callable[[Trial], None]
+    ):
+        self.scene, self.bench, self.presets, self.ranks, self.tell = scene, bench, presets, ranks, tell
+        self.as_given = load_scene(scene, (), presets)
+        self.step = self.as_given.time.step
+        self.duration = min(frames * self.step, self.as_given.time.duration)
+        self.reference: Reference | None = None
+        self.figure = "true_error"
+        self.best_seconds = math.inf  # [s] that the cheapest trial took, all in all
+
+    def for_trajectory(self, target: float) -> list[Trial]:
+        """Raises InputError if no reference can be made."""
+        self.figure = "trajectory_error"
+        probe = self._probe()
+        self.reference = self._finest(probe)
+        return plan_trajectory(self._attempt(target), self.step, target, probe is not None, self._methods())
+
+    def for_step(self, target: float) -> list[Trial]:
+        return plan_step(self._attempt(target), self.step, target, self._methods())
+
+    def _methods(self) -> list[tuple[str, str]]:
+        """PETSc's ICC is for one rank."""
+        return [
+            (preset, options)
+            for preset, options in ALTERNATIVES
+            if preset in self.presets and not (self.ranks > 1 and "icc" in options)
+        ]
+
+    def _probe(self) -> Row | None:
+        """Verlet's figures of two frames; None if it cannot be done, or not in a reasonable time."""
+        row = self._run(Method("verlet", self.step), 2 * self.step, FIRST / 4)
+        affordable = row["status"] == "ok" and row["time_frame"] * FINER * self.duration / self.step < REFERENCE_TIME
+        return row if affordable else None
+
+    def _finest(self, probe: Row | None) -> Reference:
+        """Tiny steps: explicit where these are affordable."""
+        if probe is not None:
+            substep = self.step / (FINER * probe["iterations"])
+            return Reference(integrator="verlet", substep=substep, timeout=5 * REFERENCE_TIME)
+        step = self.step / IMPLICIT_FINER
+        return Reference(integrator="implicit-euler", step=step, timeout=5 * REFERENCE_TIME)
+
+    def _attempt(self, target: float) -> Try:
+        def attempt(method: Method, done: Sequence[Trial]) -> Trial:
+            best = cheapest(done, target)
+            timeout = FIRST if best is None else 5 + 1.5 * self.best_seconds
+            row = self._run(method, self.duration, timeout)
+            if "no reference" in row["reason"]:
+                raise InputError(f"{row['reason']}: fewer --frames may help")
+            trial = Trial(method, row.get("time_second"), row.get(self.figure), row["reason"])
+            if trial.meets(target) and (best is None or trial.cost < best.cost):
+                self.best_seconds = row["seconds"]
+            self.tell(trial)
+            return trial
+
+        return attempt
+
+    def _run(self, method: Method, duration: float, timeout: float) -> Row:
+        found = self.bench.measure(self._case(method, duration, timeout))
+        return found.row | {"seconds": found.seconds}
+
+    def _case(self, method: Method, duration: float, timeout: float) -> Case:
+        """Through a study of one case: the same way from a method to a run."""
+        steps = max(1, round(duration / method.time_step))
+        scene = StudyScene(
+            name=self.scene.stem, file=self.scene.name, duration=max(duration, method.time_step), frame=self.step,
+            reference=self.reference, true_error=max(1, steps // 4) if self.figure == "true_error" else None,
+        )  # fmt: skip
+        sweep = Sweep(
+            integrators=(method.integrator,), time_steps=(method.time_step,), options=(method.options,),
+            presets=(method.preset,) if method.preset else (), ranks=(self.ranks,),
+            errors=(method.step_error,) if method.step_error else (),
+        )  # fmt: skip
+        study = Study(timeout=timeout, scene=(scene,), sweep=(sweep,))
+        return cases(study, self.scene.parent, True, self.presets)[0]

@@ -1,0 +1,44 @@
+"""A method as lines of a scene file, to paste or to put into the file as its author wrote it."""
+
+import os
+from pathlib import Path
+
+import tomlkit
+
+from msmpetsc.study.plan import Method
+
+
+def tables(method: Method) -> dict[str, dict[str, str | float | None]]:
+    """What the method says of a scene; None: the key must not stand there."""
+    if method.integrator == "verlet":
+        return {"time": {"integrator": "verlet", "step": method.time_step, "substep": None}}
+    time = {"integrator": None, "step": method.time_step, "substep": None}
+    return {"time": time, "solver": {"preset": method.preset, "error": method.step_error, "max_iterations": None}}
+
+
+def lines(method: Method) -> str:
+    """TOML lines to paste."""
+    shown = {
+        name: {key: value for key, value in table.items() if value is not None} for name, table in tables(method).items()
+    }
+    return tomlkit.dumps(shown).strip()
+
+
+def put_into(scene: Path, method: Method) -> None:
+    """Change the scene file; comments, order and all else stay as they are."""
+    with open(scene, encoding="utf-8", newline="") as file:
+        text = file.read()
+    line_end = "\r\n" if "\r\n" in text else "\n"
+    document = tomlkit.parse(text)
+    for name, table in tables(method).items():
+        if name not in document:
+            document[name] = tomlkit.table()
+        for key, value in table.items():
+            if value is None:
+                document[name].pop(key, None)
+            elif document[name].get(key) != value:
+                document[name][key] = value
+    part = scene.with_name(scene.name + ".part")
+    with open(part, "w", encoding="utf-8", newline="") as file:
+        file.write(tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))  # new lines end like the others
+    os.replace(part, scene)

@@ -396,6 +396,14 @@ def test_a_plan_that_cannot_meet_the_error_ends():
     assert cheapest(failed, 1e-3) is None and len(failed) == 2
 
 
+def test_a_plan_solves_the_steps_better_where_that_is_what_is_wrong():
+    """The error is the steps' own: no shorter step helps, a tenth of the step error does."""
+    trials = plan_trajectory(attempt_with(lambda m: (1 / m.time_step, m.step_error)), 0.02, 0.05, False, [])
+    assert [trial.method.step_error for trial in trials if trial.meets(0.05)][0] == 0.05
+    stubborn = plan_trajectory(attempt_with(lambda m: (1.0, 0.5 if m.time_step > 0.003 else 0.01)), 0.02, 0.05, False, [])
+    assert cheapest(stubborn, 0.05).method.time_step < 0.003  # a better solution did not help: on to shorter steps
+
+
 def test_a_plan_for_the_step_error_takes_the_loosest_goal_that_will_do():
     """The true error is 0.4 of the goal; a looser goal is cheaper."""
     trials = plan_step(attempt_with(lambda m: (1 / m.step_error, 0.3 * m.step_error)), 0.02, 1e-3, [("anderson", "")])

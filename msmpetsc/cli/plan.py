@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msmpetsc.cli.study import refuse_ranks, stop
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 
 NOTHING_MEETS = 3
@@ -64,7 +65,10 @@ def try_all(args: argparse.Namespace, target: float) -> list:
         planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, tell)
         print(HEAD, flush=True)
         try:
-            return planner.for_step(target) if args.error is None else planner.for_trajectory(target)
+            trials = planner.for_step(target) if args.error is None else planner.for_trajectory(target)
+            if not planner.deforms():
+                log.warning("nothing deforms in the first %d frames: more --frames will tell more", args.frames)
+            return trials
         finally:
             processes.stop()
 

@@ -54,6 +54,10 @@ class Bench:
         row = self._named(case) | together(runs) | {"status": status, "reason": ended.reason or why}
         return Measured(row | rates(row, case.time_step), found, seconds)
 
+    def references(self) -> list[Path]:
+        """The results of the references made so far."""
+        return sorted((self.folder / "references").glob("*.h5"))
+
     def _named(self, case: Case) -> Row:
         """What is known before it runs."""
         return naming(case) | {"study": self.study, "command": shown_command(case)}

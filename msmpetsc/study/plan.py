@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.frames import finished, open_result
 from msmpetsc.scene_reading import load_scene
 from msmpetsc.study.case import Case
 from msmpetsc.study.figures import Row
@@ -19,6 +20,8 @@ FINER = 4  # times: the substeps of a verlet reference; its error is then 1/16 o
 IMPLICIT_FINER = 16  # times: the steps of an implicit reference
 LOOSEST, TIGHTEST = 0.3, 1e-8  # step errors that are tried
 MOST_SHORTENED = 5  # times
+LIKES_GAIN = 4  # times that newton's likes may be cheaper than newton
+QUIET = 1e-6  # elastic energy over kinetic, where nothing deforms
 ALTERNATIVES = (
     ("newton", "-pc_type icc"),
     ("newton-multigrid", ""),
@@ -78,6 +81,8 @@ def plan_trajectory(attempt: Try, step: float, target: float, verlet: bool, meth
         return done
     _relax(attempt, found.method, target, done)
     found = _best_implicit(done, target)
+    if found.cost > LIKES_GAIN * cheapest(done, target).cost:
+        return done
     for preset, options in methods:
         done.append(attempt(replace(found.method, preset=preset, options=options), done))
     return done
@@ -95,25 +100,28 @@ def plan_step(attempt: Try, step: float, target: float, methods: Collection) -> 
 
 
 def _shorten(attempt: Try, method: Method, target: float, done: list[Trial]) -> None:
-    """Shorter steps, or better solved ones, until the error is met or cannot be met cheaply.
+    """Shorter steps until the error is met or cannot be met cheaply; better solved ones where that is what helps.
 
-    The error of implicit Euler is of first order in the step; where it does not follow the step, it is that of the
-    steps' own solution.
+    The error of implicit Euler is of first order in the step. Where it does not follow the step, it may be that of
+    the steps' solution: one better solved trial tells.
     """
-    before = None
+    before, looser = math.inf, None
     for _ in range(1 + MOST_SHORTENED):
         trial = attempt(method, done)
         done.append(trial)
         if trial.error is None or trial.meets(target):
             return
-        if before is not None and trial.error > 0.7 * before and method.step_error > TIGHTEST:
-            method = replace(method, step_error=method.step_error / 10)
+        stuck = trial.error > 0.7 * before
+        if stuck and looser is not None:
+            method = looser  # that was not it
+        elif stuck and method.step_error > TIGHTEST:
+            looser, method = method, replace(method, step_error=method.step_error / 10)
             continue
         shorter = 2 ** min(4, max(1, math.ceil(math.log2(trial.error / target) - 0.1)))
         best = cheapest(done, target)
         if best is not None and trial.cost * math.sqrt(shorter) > best.cost:
             return  # shorter steps are somewhat easier, never so much
-        before, method = trial.error, replace(method, time_step=method.time_step / shorter)
+        before, method = min(before, trial.error), replace(method, time_step=method.time_step / shorter)
 
 
 def _relax(attempt: Try, method: Method, target: float, done: list[Trial]) -> None:
@@ -192,6 +200,14 @@ class Planner:
             return trial
 
         return attempt
+
+    def deforms(self) -> bool:
+        """Whether there is elastic energy to speak of in the frames tried: in free flight every method is right."""
+        for path in self.bench.references():
+            with open_result(path) as file:
+                elastic, kinetic = (file["frames"][name][: finished(file)] for name in ("elastic", "kinetic"))
+            return bool(elastic.max() > QUIET * kinetic.max())
+        return True
 
     def _run(self, method: Method, duration: float, timeout: float) -> Row:
         found = self.bench.measure(self._case(method, duration, timeout))

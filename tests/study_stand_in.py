@@ -9,9 +9,10 @@ process before that. Its wall time counts up with the runs of the folder, its mo
 import json
 import subprocess
 import sys
-import time
 import tomllib
+from dataclasses import fields
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 from mpi4py import MPI
@@ -38,7 +39,7 @@ def main() -> None:
         child = subprocess.Popen(["sleep", "60"])
         (out.parent.parent / "child").write_text(str(child.pid))
     if "-hang" in words:
-        time.sleep(60)
+        sleep(60)
     if "-fail" in words:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
     write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
@@ -48,18 +49,23 @@ def main() -> None:
 
 def write(comm, out: Path, table: dict, every: int, count: int) -> None:
     """Frames off the exact motion by the time step."""
-    step, verlet = table["step"], table["integrator"] == "verlet" if "integrator" in table else False
-    own = slice(None) if comm.rank == 0 else slice(0)
+    step, own = table["step"], slice(None) if comm.rank == 0 else slice(0)
+    count_of_frames = round(table["duration"] / step / every) + 1
     with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, overwrite=True) as file:
         file.write("lattice/nodes", NODES[own])
         file.write("lattice/mass", MASS[own])
-        file.start_frames(round(table["duration"] / step / every) + 1, len(NODES[own]))
-        for index in range(round(table["duration"] / step / every) + 1):
-            now = index * step * every
-            x = NODES + (1 + (0 if verlet else step)) * now * np.array([0, 0, 1.0])
-            errors = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every)
-            energies = dict(kinetic=0, elastic=0, potential=0, contact=0, momentum=np.zeros(3))
-            file.append(Frame(index, now, x[own], None, wall_time=every * step * count, **errors, **energies))
+        file.start_frames(count_of_frames, len(NODES[own]))
+        for index in range(count_of_frames):
+            time = index * step * every
+            x = NODES + (1 + step) * time * np.array([0, 0, 1.0])
+            solved = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every, wall_time=every * step * count)
+            file.append(blank_frame(index=index, time=time, position=x[own], **solved))
+
+
+def blank_frame(**given) -> Frame:
+    """A frame of zeros but for what is given."""
+    blank = {field.name: 0.0 for field in fields(Frame)} | {"surface": None, "momentum": np.zeros(3)}
+    return Frame(**blank | given)
 
 
 def told(ranks: int, count: int, traced: bool) -> dict:
@@ -70,4 +76,5 @@ def told(ranks: int, count: int, traced: bool) -> dict:
     return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, "trace": trace if traced else None, **counts}
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from conftest import ENVIRONMENT
 from mpi4py import MPI
+from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.frame import Frame
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.study import case, measure
 from msmpetsc.study.figures import of_frames, together
@@ -186,7 +186,7 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     text += 'trace = 2\n[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]\ntrace = true'
     (row,) = carry_out(tmp_path, text)
     assert set(row) == set(COLUMNS)
-    # run 0 is the reference; the runs of 2 ranks count 1, 2, 3 or later, for one rank may see the other's line
+    # run 1 is the reference, 2, 3 and 4 are the repeats
     assert row["status"] == "ok" and row["ranks"] == 2 and row["repeats"] == 3
     assert (row["cells"], row["nodes"], row["frames"], row["steps"]) == (1, 8, 6, 10)
     assert row["time_setup"] == 3  # 2, 3 and 4
@@ -219,7 +219,7 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
-    rows = carry_out(tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-fail", ""]')
+    rows = carry_out(tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-fail", ""]', jobs=2)
     assert [(row["status"], row["reason"]) for row in rows] == [("failed", "planted, with reason"), ("ok", "")]
     assert rows[0]["time_frame"] is None and rows[0]["options"] == "-fail"
     assert len(calls(tmp_path)) == 3  # what fails is not repeated
@@ -293,10 +293,8 @@ def result(path: Path, times: list[float], positions: list[np.ndarray], mass: li
         file.write("lattice/mass", np.array(mass))
         file.start_frames(len(times), len(mass))
         for index, now in enumerate(times):
-            values = {"step_error": 0.0, "iterations": 0, "ksp_its": 0, "wall_time": 0.0}
-            values |= {name: column[index] for name, column in series.items()}
-            zero = dict(kinetic=0, elastic=0, potential=0, contact=0, momentum=np.zeros(3))
-            file.append(Frame(index=index, time=now, position=positions[index], surface=None, **values, **zero))
+            values = {name: column[index] for name, column in series.items()}
+            file.append(blank_frame(index=index, time=now, position=positions[index], **values))
     return path
 
 

@@ -54,6 +54,11 @@ class Case:
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
 
+    @property
+    def work(self) -> float:
+        """A guess, in cells: starting a process counts as much as 10^4 of them, and a scene is taken to have as many."""
+        return self.repeats * (1e4 + (self.cells or 1e4))
+
     def unmeasured(self) -> "Case":
         """The same run without what is measured beside it."""
         return replace(self, true_error=None, trace=None)

@@ -1,6 +1,7 @@
 """How far a study is: a bar on a terminal, lines in a log, both with what is left."""
 
 import sys
+from collections.abc import Sequence
 from time import monotonic
 from typing import TextIO
 
@@ -11,28 +12,30 @@ from msmpetsc.study.figures import Row
 
 
 class StudyProgress:
-    """Tell of each case of ``total`` that is done; ``done`` were before."""
+    """Tell of each case that is done. work: of each case still to do, in any unit; ``done`` cases were before."""
 
-    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None):
-        self._total, self._before, self._done = total, done, done
+    def __init__(self, work: Sequence[float], done: int = 0, stream: TextIO | None = None):
+        self._total, self._done = done + len(work), done
+        self._left, self._spent = sum(work), 0.0
         self._stream = stream or sys.stderr
         self._begun = monotonic()
-        self._bar = tqdm(total=total, initial=done, unit="case", file=self._stream, dynamic_ncols=True) if self._stream.isatty() else None
-        if done and self._bar is None:
-            self._tell(f"{done} of {total} cases are done already")
+        self._bar: tqdm | None = None
+        if self._stream.isatty():
+            self._bar = tqdm(total=self._total, initial=done, unit="case", file=self._stream, dynamic_ncols=True)
+        elif done:
+            self._tell(f"{done} of {self._total} cases are done already")
 
-    def update(self, row: Row) -> None:
+    def update(self, row: Row, work: float) -> None:
         """A case is done."""
-        self._done += 1
-        if self._bar is not None:
-            if row["status"] != "ok":
-                self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
-            self._bar.set_postfix_str(described(row), refresh=False)
-            self._bar.update()
+        self._done, self._left, self._spent = self._done + 1, self._left - work, self._spent + work
+        left = duration((monotonic() - self._begun) * self._left / self._spent)
+        if self._bar is None:
+            self._tell(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
             return
-        rate = (monotonic() - self._begun) / (self._done - self._before)
-        left = duration(rate * (self._total - self._done))
-        self._tell(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
+        if row["status"] != "ok":
+            self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
+        self._bar.set_postfix_str(f"{left} left, {described(row)}", refresh=False)
+        self._bar.update()
 
     def close(self) -> None:
         if self._bar is not None:

@@ -56,6 +56,7 @@ def run_study(
     every = cases(study, path.parent, True, presets)
     wanted = {case.id for case in (every if full else cases(study, path.parent, False, presets))}
     todo_or_done = [case for case in every if case.id in wanted]
+    by_id = {case.id: case for case in every}
     folder.mkdir(parents=True, exist_ok=True)
     if restart:
         _forget(folder)
@@ -63,12 +64,12 @@ def run_study(
     shutil.copyfile(path, folder / "study.toml")
     findings.write()
     todo = [case for case in todo_or_done if not _is_done(case, findings.rows)]
-    progress = StudyProgress(len(todo_or_done), len(todo_or_done) - len(todo))
+    progress = StudyProgress([case.work for case in todo], len(todo_or_done) - len(todo))
     try:
         with closing(measure_all(Bench(folder, Processes(), path.stem), todo, jobs)) as all_found:
             for found in all_found:
                 findings.add(found)
-                progress.update(found.row)
+                progress.update(found.row, by_id[found.row["case"]].work)
     finally:
         progress.close()
     return sum(findings.rows[case.id]["status"] != "ok" for case in todo_or_done)

@@ -73,7 +73,13 @@ def told(ranks: int, count: int, traced: bool) -> dict:
     machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
     counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks, "memory": 1000 - count}
     trace = {"frame": 2, "iteration": [0, 1], "ksp_its": [0, 5], "seconds": [0, 1], "position_error": [1, 0.1]}
-    return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, "trace": trace if traced else None, **counts}
+    return {
+        "machine": machine,
+        "versions": {"msmpetsc": "x"},
+        "time": times,
+        "trace": trace if traced else None,
+        **counts,
+    }
 
 
 if __name__ == "__main__":

@@ -17,6 +17,9 @@ from conftest import ENVIRONMENT
 from mpi4py import MPI
 from study_stand_in import blank_frame
 
+from msmpetsc.cli import plan
+from msmpetsc.cli.main import main
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.study import case, measure
@@ -52,6 +55,14 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(measure, "command", stands_in)
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def own_log():
+    """The command line sets up the log for its own process: afterwards it is as it was."""
+    before = log.handlers, log.level
+    yield
+    log.handlers, log.level = before
 
 
 def study_file(folder: Path, text: str) -> Path:
@@ -117,7 +128,9 @@ def test_the_command_line_refuses_with_status_2_and_one_line(tmp_path: Path):
     words = [sys.executable, "-m", "msmpetsc.cli.main", "study", str(path), "-o", str(tmp_path / "out")]
     done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr.splitlines() == [f"msmpetsc: error: {path}: sweep.0.erors: unknown key, did you mean 'errors'? (line 5)"]
+    assert done.stderr.splitlines() == [
+        f"msmpetsc: error: {path}: sweep.0.erors: unknown key, did you mean 'errors'? (line 5)"
+    ]
 
 
 def all_cases(folder: Path, text: str, full: bool = False) -> list[case.Case]:
@@ -171,7 +184,17 @@ def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
 
 
 def test_the_studies_shipped_are_sound():
-    presets = {"newton", "newton-multigrid", "anderson", "lbfgs", "chebyshev", "ngmres", "fast-msm", "paper", "fast-msm-kronecker"}
+    presets = {
+        "newton",
+        "newton-multigrid",
+        "anderson",
+        "lbfgs",
+        "chebyshev",
+        "ngmres",
+        "fast-msm",
+        "paper",
+        "fast-msm-kronecker",
+    }
     for name in ("pareto", "figure6", "growth"):
         path = ROOT / "scenes" / "studies" / f"{name}.toml"
         few, many = (cases(load_study(path, presets), path.parent, full) for full in (False, True))
@@ -219,7 +242,9 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
-    rows = carry_out(tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-fail", ""]', jobs=2)
+    rows = carry_out(
+        tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-fail", ""]', jobs=2
+    )
     assert [(row["status"], row["reason"]) for row in rows] == [("failed", "planted, with reason"), ("ok", "")]
     assert rows[0]["time_frame"] is None and rows[0]["options"] == "-fail"
     assert len(calls(tmp_path)) == 3  # what fails is not repeated
@@ -264,7 +289,14 @@ run_study(Path(sys.argv[2]), Path(sys.argv[3]), None)
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-children -hang", "-never"]'
-    words = [sys.executable, "-c", STUDY_IN_ITS_OWN_PROCESS, str(STAND_IN), str(study_file(tmp_path, text)), str(tmp_path / "out")]
+    words = [
+        sys.executable,
+        "-c",
+        STUDY_IN_ITS_OWN_PROCESS,
+        str(STAND_IN),
+        str(study_file(tmp_path, text)),
+        str(tmp_path / "out"),
+    ]
     study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL)
     child, deadline = tmp_path / "out" / "child", time.monotonic() + 60
     while not (child.is_file() and child.read_text()) and time.monotonic() < deadline:
@@ -351,7 +383,9 @@ def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
 
 
 def test_repeats_become_medians():
-    runs = [{"time_ksp": t, "memory": m, "true_error": e} for t, m, e in ((1.0, 9, 0.1), (5.0, 7, None), (2.0, 8, None))]
+    runs = [
+        {"time_ksp": t, "memory": m, "true_error": e} for t, m, e in ((1.0, 9, 0.1), (5.0, 7, None), (2.0, 8, None))
+    ]
     assert together(runs) == {"time_ksp": 2.0, "memory": 7, "true_error": 0.1}
 
 
@@ -382,7 +416,11 @@ def test_a_plan_takes_the_cheapest_that_meets_the_error():
 def test_a_plan_does_not_try_what_cannot_become_cheapest():
     """Verlet meets the error at a cost of 1; implicit steps cost 50 already where they are far off."""
     trials = plan_trajectory(
-        attempt_with(lambda m: (1.0, 1e-5) if m.integrator == "verlet" else (50.0, 0.2)), 0.02, 1e-3, True, [("anderson", "")]
+        attempt_with(lambda m: (1.0, 1e-5) if m.integrator == "verlet" else (50.0, 0.2)),
+        0.02,
+        1e-3,
+        True,
+        [("anderson", "")],
     )
     assert len(trials) == 2 and cheapest(trials, 1e-3).method.integrator == "verlet"
 
@@ -398,7 +436,9 @@ def test_a_plan_solves_the_steps_better_where_that_is_what_is_wrong():
     """The error is the steps' own: no shorter step helps, a tenth of the step error does."""
     trials = plan_trajectory(attempt_with(lambda m: (1 / m.time_step, 3 * m.step_error)), 0.02, 0.05, False, [])
     assert cheapest(trials, 0.05).method.step_error == pytest.approx(0.005)
-    stubborn = plan_trajectory(attempt_with(lambda m: (1.0, 0.5 if m.time_step > 0.003 else 0.01)), 0.02, 0.05, False, [])
+    stubborn = plan_trajectory(
+        attempt_with(lambda m: (1.0, 0.5 if m.time_step > 0.003 else 0.01)), 0.02, 0.05, False, []
+    )
     assert cheapest(stubborn, 0.05).method.time_step < 0.003  # a better solution did not help: on to shorter steps
 
 
@@ -431,3 +471,37 @@ def test_what_is_written_into_a_scene_keeps_its_comments(tmp_path: Path):
     put_into(path, Method("verlet", 0.02))
     told = path.read_text()
     assert 'integrator = "verlet"' in told and "# A scene of mine" in told and "# how" in told
+
+
+@pytest.mark.parametrize(("errors", "status"), [([0.2, 0.01], 0), ([0.2, 0.1], 3)])
+def test_the_command_tells_the_answer_and_writes_it(
+    tmp_path: Path, monkeypatch, capsys, own_log, errors: list, status: int
+):
+    methods = [Method("implicit-euler", step, "newton", "-pc_type icc", 0.01) for step in (0.02, 0.005)]
+    trials = [Trial(method, 1 / method.time_step, error) for method, error in zip(methods, errors, strict=True)]
+    monkeypatch.setattr(plan, "try_all", lambda *_: trials)
+    path = tmp_path / "scene.toml"
+    path.write_text(COMMENTED)
+    assert main(["plan", str(path), "--error", "0.05", "--write"]) == status
+    told = capsys.readouterr().out
+    if status == 0:
+        assert "step = 0.005 " in path.read_text() and "# how" in path.read_text()
+        assert f"msmpetsc run {path} -pc_type icc" in told and 'preset = "newton"' in told
+    else:
+        assert path.read_text() == COMMENTED
+        assert "nothing tried meets 0.05" in told and "1.0e-01" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--error", "2"], "between 0 and 1"),
+        ([], "--error --step-error"),
+        (["--error", "0.1", "--frames", "0"], "--frames must be at least 1"),
+        (["--error", "0.1"], "no such scene"),
+    ],
+)
+def test_a_plan_refuses_with_status_2_and_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):
+    assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("msmpetsc: error: ") and words in line

@@ -36,7 +36,10 @@ def of_frames(result: Path, time_step: float) -> Row:
         return {"frames": count, "steps": 0}
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
     kept = slice(2 if count > 2 else 1, None)  # what is only done once shows in the first
-    mean = {name: series[name][kept].sum() / steps[kept.start - 1 :].sum() for name in ("wall_time", "iterations", "ksp_its")}
+    mean = {
+        name: series[name][kept].sum() / steps[kept.start - 1 :].sum()
+        for name in ("wall_time", "iterations", "ksp_its")
+    }
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
     row |= {"iterations": float(mean["iterations"]), "ksp_its": float(mean["ksp_its"])}
     return row | _errors(series)
@@ -49,7 +52,11 @@ def _errors(series: dict[str, np.ndarray]) -> Row:
     true = series["true_error"][1:] if "true_error" in series else nothing
     energy = series["energy_error"][1:] if "energy_error" in series else nothing
     where = np.isfinite(true) if np.isfinite(true).any() else np.isfinite(estimated)
-    return {"estimated_error": _rms(estimated[where]), "true_error": _rms(true[where]), "energy_error": _rms(energy[where])}
+    return {
+        "estimated_error": _rms(estimated[where]),
+        "true_error": _rms(true[where]),
+        "energy_error": _rms(energy[where]),
+    }
 
 
 def _rms(values: np.ndarray) -> float | None:

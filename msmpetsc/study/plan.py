@@ -144,7 +144,13 @@ class Planner:
     """Tries methods on the first frames of a scene."""
 
     def __init__(
-        self, scene: Path, bench: Bench, presets: Collection[str], frames: int, ranks: int, tell: Callable[[Trial], None]
+        self,
+        scene: Path,
+        bench: Bench,
+        presets: Collection[str],
+        frames: int,
+        ranks: int,
+        tell: Callable[[Trial], None],
     ):
         self.scene, self.bench, self.presets, self.ranks, self.tell = scene, bench, presets, ranks, tell
         self.as_given = load_scene(scene, (), presets)

@@ -47,7 +47,13 @@ class StudyProgress:
 
 def described(row: Row) -> str:
     """A case in a few words."""
-    goal = f"error {row['error']:g}" if row["error"] else f"{row['max_iterations']} iterations" if row["max_iterations"] else ""
+    goal = (
+        f"error {row['error']:g}"
+        if row["error"]
+        else f"{row['max_iterations']} iterations"
+        if row["max_iterations"]
+        else ""
+    )
     step = f"t = {row['substep'] or row['time_step']:.3g} s"
     parts = [row["scene"], row["label"], f"{row['cells']:.0f} cells" if row["cells"] else "", step, goal]
     return " ".join(part for part in parts if part)

@@ -19,7 +19,8 @@ def tables(method: Method) -> dict[str, dict[str, str | float | None]]:
 def lines(method: Method) -> str:
     """TOML lines to paste."""
     shown = {
-        name: {key: value for key, value in table.items() if value is not None} for name, table in tables(method).items()
+        name: {key: value for key, value in table.items() if value is not None}
+        for name, table in tables(method).items()
     }
     return tomlkit.dumps(shown).strip()
 
@@ -40,5 +41,7 @@ def put_into(scene: Path, method: Method) -> None:
                 document[name][key] = value
     part = scene.with_name(scene.name + ".part")
     with open(part, "w", encoding="utf-8", newline="") as file:
-        file.write(tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))  # new lines end like the others
+        file.write(
+            tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end)
+        )  # new lines end like the others
     os.replace(part, scene)

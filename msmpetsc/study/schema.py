@@ -57,7 +57,9 @@ class StudyScene(Table):
     frame: Positive | None = Field(
         None, description="moments compared with the reference lie this far apart [s]; the scene's time step if absent"
     )
-    reference: Reference | None = Field(None, description="what the trajectory error is measured against; none if absent")
+    reference: Reference | None = Field(
+        None, description="what the trajectory error is measured against; none if absent"
+    )
     true_error: Count | None = Field(None, description="every so many steps the true step error is measured [-]")
     trace: Count | None = Field(None, description="the step whose iterates are followed, in sweeps with trace = true")
     full: bool = Field(False, description="only with --full")
@@ -117,7 +119,9 @@ class Study(Table):
     @classmethod
     def _scenes_are_there(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
         names = [scene.name for scene in info.data.get("scene", ())]
-        unknown = next((name for sweep in _not_empty(sweeps) for name in sweep.scenes if names and name not in names), None)
+        unknown = next(
+            (name for sweep in _not_empty(sweeps) for name in sweep.scenes if names and name not in names), None
+        )
         if unknown is not None:
             raise rule(f"names a scene {unknown!r} that is not there{did_you_mean(unknown, names)}")
         return sweeps

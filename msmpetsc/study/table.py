@@ -96,7 +96,9 @@ def _fill(file: h5py.File, rows: Sequence[Row]) -> None:
     for name, column in COLUMNS.items():
         values = [row.get(name) for row in rows]
         if column.kind is str:
-            file.create_dataset(name, data=[value or "" for value in values], dtype=h5py.string_dtype(), shape=(len(rows),))
+            file.create_dataset(
+                name, data=[value or "" for value in values], dtype=h5py.string_dtype(), shape=(len(rows),)
+            )
         elif column.kind is int:
             file[name] = np.array(values, dtype="i8")
         else:
@@ -108,7 +110,13 @@ def _fill(file: h5py.File, rows: Sequence[Row]) -> None:
 def _text(value: Any) -> str:
     if value is None or isinstance(value, float) and math.isnan(value):
         return ""
-    return repr(value) if isinstance(value, float) else " ".join(str(value).split()) if isinstance(value, str) else str(value)
+    return (
+        repr(value)
+        if isinstance(value, float)
+        else " ".join(str(value).split())
+        if isinstance(value, str)
+        else str(value)
+    )
 
 
 def _value(name: str, text: str) -> Any:

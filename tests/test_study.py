@@ -1,6 +1,5 @@
 """Studies and plans: what is run, how often, what goes wrong, and what stands in the table. The runs are stand-ins."""
 
-import csv
 import json
 import os
 import signal

@@ -56,7 +56,7 @@ class Case:
 
     @property
     def work(self) -> float:
-        """A guess, in cells: starting a process counts as much as 10^4 of them, and a scene is taken to have as many."""
+        """A guess, in cells: a process counts as 10^4 of them, and so does a scene that names none."""
         return self.repeats * (1e4 + (self.cells or 1e4))
 
     def unmeasured(self) -> "Case":

@@ -1,7 +1,6 @@
 """A case is run, repeated, and becomes a row."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock

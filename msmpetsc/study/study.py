@@ -5,7 +5,7 @@ import os
 import shutil
 from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -53,26 +53,32 @@ def run_study(
     file are kept; ``restart`` forgets them. Raises InputError before anything is run.
     """
     study = load_study(path, presets)
-    every = cases(study, path.parent, True, presets)
-    wanted = {case.id for case in (every if full else cases(study, path.parent, False, presets))}
-    todo_or_done = [case for case in every if case.id in wanted]
-    by_id = {case.id: case for case in every}
+    every = {case.id: case for case in cases(study, path.parent, True, presets)}
+    wanted = [case.id for case in cases(study, path.parent, full, presets)]
     folder.mkdir(parents=True, exist_ok=True)
     if restart:
         _forget(folder)
     findings = _continued(folder, every)
-    shutil.copyfile(path, folder / "study.toml")
+    (folder / "study.toml").write_bytes(path.read_bytes())
     findings.write()
-    todo = [case for case in todo_or_done if not _is_done(case, findings.rows)]
-    progress = StudyProgress([case.work for case in todo], len(todo_or_done) - len(todo))
+    todo = [every[case] for case in wanted if not _is_done(every[case], findings.rows)]
+    _carry_out(Bench(folder, Processes(), path.stem), todo, findings, jobs, len(wanted) - len(todo))
+    return sum(findings.rows[case]["status"] != "ok" for case in wanted)
+
+
+def _carry_out(bench: Bench, todo: Sequence[Case], findings: Findings, jobs: int, done: int) -> None:
+    """Run cases and keep what is found; ``done`` were before."""
+    work = {case.id: case.work for case in todo}
+    progress = StudyProgress(list(work.values()), done)
     try:
-        with closing(measure_all(Bench(folder, Processes(), path.stem), todo, jobs)) as all_found:
+        with closing(measure_all(bench, todo, jobs)) as all_found:
             for found in all_found:
                 findings.add(found)
-                progress.update(found.row, by_id[found.row["case"]].work)
+                progress.update(found.row, work[found.row["case"]])
     finally:
         progress.close()
-    return sum(findings.rows[case.id]["status"] != "ok" for case in todo_or_done)
+        with suppress(OSError):  # logs of cases that failed are in it
+            (bench.folder / "runs").rmdir()
 
 
 def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Iterable[Measured]:
@@ -87,9 +93,8 @@ def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Iterable[M
         pool.shutdown(cancel_futures=True)
 
 
-def _continued(folder: Path, every: Sequence[Case]) -> Findings:
+def _continued(folder: Path, by_id: dict[str, Case]) -> Findings:
     """What an earlier run found of these cases, called by their present names."""
-    by_id = {case.id: case for case in every}
     findings = Findings(folder, list(by_id))
     for row in read_table(folder):
         if row["case"] in by_id:

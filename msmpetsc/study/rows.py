@@ -8,19 +8,12 @@ from pathlib import Path
 
 from msmpetsc.errors import InputError
 from msmpetsc.study import wording
+from msmpetsc.study.table import COLUMNS
 
 Row = dict[str, str | float | None]  # column -> text, or a finite number, or None where nothing was measured
 
-TEXT = (
-    "study", "case", "scene", "integrator", "preset", "options", "label", "status", "reason", "machine", "versions",
-    "command",
-)  # fmt: skip
-NUMBERS = (
-    "ranks", "repeats", "time_step", "substep", "error", "max_iterations", "cells", "nodes", "unknowns", "springs",
-    "frames", "steps", "time_frame", "fps", "time_second", "time_setup", "time_factor", "time_local", "time_ksp",
-    "time_output", "iterations", "ksp_its", "memory", "estimated_error", "true_error", "energy_error",
-    "trajectory_error",
-)  # fmt: skip
+TEXT = tuple(name for name, column in COLUMNS.items() if column.kind is str)
+NUMBERS = tuple(name for name in COLUMNS if name not in TEXT)
 
 
 def read_rows(folder: Path) -> list[Row]:

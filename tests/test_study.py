@@ -447,6 +447,13 @@ def test_a_plan_for_the_step_error_takes_the_loosest_goal_that_will_do():
     assert [trial.method.step_error for trial in trials] == [pytest.approx(3e-3)] * 2
 
 
+def test_a_plan_does_not_tighten_what_is_dearer_already():
+    """The true error is that aimed at; anderson costs twice what newton does."""
+    model = lambda m: (2 / m.step_error if m.preset == "anderson" else 0.1 / m.step_error, m.step_error)  # noqa: E731
+    trials = plan_step(attempt_with(model), 0.02, 1e-3, [("anderson", "")])
+    assert [trial.method.preset for trial in trials] == ["newton", "newton", "anderson"]
+
+
 COMMENTED = """# A scene of mine
 title = "x"      # for the reader
 

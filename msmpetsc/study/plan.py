@@ -94,9 +94,14 @@ def plan_step(attempt: Try, step: float, target: float, methods: Collection) -> 
     for preset, options in (("newton", ""), *methods):
         for goal in (min(3 * target, LOOSEST), target):
             done.append(attempt(Method("implicit-euler", step, preset, options, goal), done))
-            if done[-1].meets(target) or done[-1].error is None:
+            if done[-1].meets(target) or done[-1].error is None or _is_dearer(done[-1], cheapest(done, target)):
                 break
     return done
+
+
+def _is_dearer(trial: Trial, best: Trial | None) -> bool:
+    """A tighter goal would make it dearer still."""
+    return best is not None and trial.cost > best.cost
 
 
 def _shorten(attempt: Try, method: Method, target: float, done: list[Trial]) -> None:
@@ -195,7 +200,7 @@ class Planner:
     def _attempt(self, target: float) -> Try:
         def attempt(method: Method, done: Sequence[Trial]) -> Trial:
             best = cheapest(done, target)
-            timeout = FIRST if best is None else 5 + 1.5 * self.best_seconds
+            timeout = FIRST if best is None else math.ceil(5 + 1.5 * self.best_seconds)
             row = self._run(method, self.duration, timeout)
             if "no reference" in row["reason"]:
                 raise InputError(f"{row['reason']}: fewer --frames may help")

@@ -10,7 +10,7 @@ import json
 import subprocess
 import sys
 import tomllib
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from time import sleep
 
@@ -64,7 +64,7 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
 
 def blank_frame(**given) -> Frame:
     """A frame of zeros but for what is given."""
-    blank = {field.name: 0.0 for field in fields(Frame)} | {"surface": None, "momentum": np.zeros(3)}
+    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {"surface": None, "momentum": np.zeros(3)}
     return Frame(**blank | given)
 
 

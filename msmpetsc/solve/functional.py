@@ -26,6 +26,7 @@ class StepFunctional:
         self.lattice = unknowns.lattice
         self.q, self.y, self.gradient = (np.empty_like(self.lattice.nodes) for _ in range(3))
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
+        self.free_mass = np.where(self.lattice.pinned[: self.lattice.owned], 0.0, self.lattice.mass)
 
     def begin(
         self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
@@ -48,16 +49,27 @@ class StepFunctional:
         moved = self.q[:owned] - self.y[:owned]
         scaled_sum(self.unknowns.free, self.lattice.mass, moved, self.t2, self.gradient, f.array.reshape(3, -1))
 
+    def value(self, q: np.ndarray) -> float:
+        """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart."""
+        owned = slice(self.lattice.owned)
+        moved = q[owned] - self.y[owned]
+        acting = self.elasticity.energy(q) - np.vdot(moved, self.load)
+        if self.contact:
+            acting += self.contact.change(q, self.y)
+        inertia = 0.5 * self.lattice.mass @ np.einsum("ij,ij->i", moved, moved)
+        return self.comm.allreduce(inertia + self.t2 * acting)
+
     def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
         """g(x) - g(base) [kg m^2] and |x - base|^2 [m^2], base (l, 3): summed so that the difference keeps its digits."""
         self.unknowns.to_nodes(x, self.q)
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - base[owned]
-        inertia = 0.5 * self.lattice.mass @ (moved * (self.q[owned] + base[owned] - 2 * self.y[owned])).sum(axis=1)
-        elastic = self.elasticity.change(self.q, base) - (moved * self.load).sum()
+        twice = self.q[owned] + base[owned] - 2 * self.y[owned]
+        inertia = 0.5 * self.lattice.mass @ np.einsum("ij,ij->i", moved, twice)
+        elastic = self.elasticity.change(self.q, base) - np.vdot(moved, self.load)
         if self.contact:
             elastic += self.contact.change(self.q, base)
-        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, (moved**2).sum()])))
+        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, np.vdot(moved, moved)])))
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""
@@ -69,6 +81,7 @@ class StepFunctional:
 
     def away(self) -> float:
         """|q - y|_M over the free nodes: what errors of the step are relative to."""
-        free = self.unknowns.free
-        squared = ((self.q[free] - self.y[free]) ** 2).sum(axis=1) @ self.lattice.mass[free]
+        owned = slice(self.lattice.owned)
+        moved = self.q[owned] - self.y[owned]
+        squared = np.einsum("ij,ij->i", moved, moved) @ self.free_mass
         return np.sqrt(self.comm.allreduce(squared))

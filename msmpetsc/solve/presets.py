@@ -45,7 +45,7 @@ NEWTON = {
     **NO_STOP_BY_SIZE,
     "snes_max_linear_solve_fail": "100",
     **JACOBI_CG,
-    "ksp_rtol": "1e-1",
+    "ksp_rtol": "3e-2",
 }
 
 LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES

@@ -26,7 +26,7 @@ PROJECTED = 5  # iterations with the projected Hessian before the true one, whic
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
 EARLY = 2.0  # a step is first looked at closely when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
-SHARE = 0.3  # of the error that would do, left to the linear solve
+SHARE = 0.5  # of the error that would do, left to the linear solve
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
@@ -80,6 +80,7 @@ class Stepper:
         self.unknowns = Unknowns(comm, lattice)
         self.functional = StepFunctional(comm, self.unknowns, self.elasticity, time_step)
         self.base = np.empty_like(lattice.nodes)
+        self.holds = self.unknowns.total < lattice.table.total  # some nodes are no unknowns
         self.corrections = []  # x - y of the last steps, at most two, the newest first
         self.ratio, self.its = FIRST_RATIO, 0
         self.local = PETSc.Log.Event(LOCAL_EVENT)
@@ -243,15 +244,16 @@ class Stepper:
             guesses += [flight, q + self._drift(flight - q)]
             if self.corrections:
                 guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        values = []
-        for guess in guesses:
-            self.unknowns.from_nodes(guess, self.x)
-            values.append(self._objective(self.snes, self.x) if len(guesses) > 1 else 0.0)
+        values = [self.functional.value(self._held(guess)) for guess in guesses] if len(guesses) > 1 else [0.0]
         self.unknowns.from_nodes(guesses[int(np.argmin(values))], self.x)
+
+    def _held(self, guess: np.ndarray) -> np.ndarray:
+        """The guess, but with the held nodes where they will be."""
+        return np.where(self.lattice.pinned[:, None], self.base, guess) if self.holds else guess
 
     def _drift(self, moved: np.ndarray) -> np.ndarray | float:
         """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
-        if self.unknowns.total < self.lattice.table.total:
+        if self.holds:
             return 0.0
         sums = np.append(self.lattice.mass @ moved[: self.lattice.owned], self.lattice.mass.sum())
         sums = self.comm.allreduce(sums)
@@ -350,9 +352,13 @@ class Stepper:
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         reasons = PETSc.SNES.ConvergedReason
-        # with an NPC on the left SNES's own function is not F
-        self._residual(snes, snes.getSolution(), self.work)
-        self.last_error = self._error_of(self.work)
+        x, f = snes.getSolution(), snes.getFunction()[0]
+        if self.inner is self.snes:
+            self.unknowns.to_nodes(x, self.functional.q)
+        else:  # with an NPC SNES's own function may not be F
+            f = self.work
+            self._residual(snes, x, f)
+        self.last_error = self._error_of(f)
         if self.observer:
             self.observer(self)
         if not np.isfinite(self.residual):
@@ -360,7 +366,7 @@ class Stepper:
         if self.last_error <= (self.error or 0.0):
             return reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
-            self.last_error = self._estimated(self.work, self.functional.away(), 0.0)
+            self.last_error = self._estimated(f, self.functional.away(), 0.0)
             return reasons.CONVERGED_ITS
         if self.adapts:
             self._loosen()

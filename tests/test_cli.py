@@ -142,7 +142,11 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
         ("newton", "", ""),
         ("newton-multigrid", "-ksp_view", "type: gamg"),
         ("fast-msm", "", ""),
+        ("fast-msm-kronecker", "", ""),
         ("paper", "", ""),
+        ("ngmres", "", ""),
+        ("lbfgs", "-snes_view", "type is LBFGS"),
+        ("chebyshev", "", ""),
         ("anderson", "-snes_anderson_m 2 -snes_view", "Number of stored past updates: 2"),
         ("fast-msm", "-pc_type gamg -ksp_view", "type: gamg"),
     ],
@@ -158,7 +162,8 @@ def test_the_presets_are_listed_once(msmpetsc):
     done = msmpetsc(2, "run", "--list-presets", timeout=60)
     assert done.returncode == 0
     names = [line.split()[0] for line in done.stdout.splitlines()]
-    assert {"anderson", "newton", "newton-multigrid", "fast-msm", "paper"} <= set(names) and len(names) == len(set(names))
+    presets = {"anderson", "ngmres", "lbfgs", "chebyshev", "newton", "newton-multigrid", "fast-msm", "paper"}
+    assert presets <= set(names) and len(names) == len(set(names))
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ class StepFunctional:
         self.lattice = unknowns.lattice
         self.q, self.y, self.gradient = (np.empty_like(self.lattice.nodes) for _ in range(3))
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
-        self.free_mass = np.where(self.lattice.pinned[: self.lattice.owned], 0.0, self.lattice.mass)
 
     def begin(
         self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
@@ -79,9 +78,10 @@ class StepFunctional:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
         return np.sqrt(self.comm.allreduce(f.array_r**2 @ (1 / self.mass)))
 
-    def away(self) -> float:
-        """|q - y|_M over the free nodes: what errors of the step are relative to."""
-        owned = slice(self.lattice.owned)
-        moved = self.q[owned] - self.y[owned]
-        squared = np.einsum("ij,ij->i", moved, moved) @ self.free_mass
-        return np.sqrt(self.comm.allreduce(squared))
+    def away(self, correction: PETSc.Vec | None = None) -> float:
+        """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""
+        free = self.unknowns.free
+        columns = (self.q[free] - self.y[free]).T.ravel()
+        if correction is not None:
+            columns -= correction.array_r
+        return np.sqrt(self.comm.allreduce(columns**2 @ self.mass))

@@ -339,11 +339,12 @@ class Stepper:
         return self._estimated(f, away, enough)
 
     def _estimated(self, f: PETSc.Vec, away: float, enough: float) -> float:
-        error = self.estimate(f, EARLY * enough * away if enough else np.inf) / away
-        if not np.isfinite(error):
+        """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
+        length = self.estimate(f, EARLY * enough * away if enough else np.inf)
+        if not np.isfinite(length):
             return self.bound
-        self.ratio, self.early, self.corrected = max(self.bound / error, 1.0), 1.0, True
-        return error
+        self.ratio, self.early, self.corrected = max(self.bound * away / length, 1.0), 1.0, True
+        return length / self.functional.away(self.estimate.correction)
 
     def _rounding_of_residual(self) -> float:
         """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: some eps of each row's diagonal."""

@@ -342,7 +342,7 @@ class Anchor(Table):
 class Solver(Table):
     """How a step is solved."""
 
-    preset: str = Field("anderson", min_length=1, description="named set of PETSc options")
+    preset: str = Field("newton", min_length=1, description="named set of PETSc options")
     error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
     max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
 

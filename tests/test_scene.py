@@ -121,7 +121,7 @@ def test_defaults(tmp_path):
     assert (scene.cages.method, scene.cages.embedding) == ("exact", "affine")
     assert (scene.cages.smoothing, scene.cages.max_cells) == (1.0, 5_000_000)
     assert scene.gravity is None and scene.obstacle == scene.pin == scene.force == ()
-    assert scene.solver.preset == "anderson" and scene.solver.error is None
+    assert scene.solver.preset == "newton" and scene.solver.error is None
     assert scene.output.surface
 
 

@@ -60,7 +60,7 @@ LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
 
 PRESETS = {
     "anderson": Preset(
-        "Anderson-accelerated local/global steps with loose CG solves: the default",
+        "Anderson-accelerated local/global steps with loose CG solves: easy steps to few digits, no Hessian",
         {
             "snes_type": "anderson",
             "snes_anderson_m": "5",
@@ -82,7 +82,7 @@ PRESETS = {
         inexact=True,
     ),
     "lbfgs": Preset(
-        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search",
+        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
         {
             "snes_type": "qn",
             "snes_qn_type": "lbfgs",
@@ -110,7 +110,7 @@ PRESETS = {
         inexact=True,
     ),
     "newton": Preset(
-        "Newton's method with the true Hessian and a line search: the reference, the most accurate, the most robust",
+        "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error, most robust",
         NEWTON,
         true_hessian=True,
         inexact=True,

@@ -62,7 +62,8 @@ class ListPresets(argparse.Action):
         from msmpetsc.solve.presets import PRESETS
 
         if MPI.COMM_WORLD.rank == 0:
-            print("\n".join(f"{name:16} {preset.about}" for name, preset in PRESETS.items()))
+            width = max(map(len, PRESETS))
+            print("\n".join(f"{name:{width}} {preset.about}" for name, preset in PRESETS.items()))
         parser.exit()
 
 

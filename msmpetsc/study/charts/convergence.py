@@ -102,6 +102,9 @@ def axis_from_zero(axes: Axes, values: Sequence[float], formatter) -> None:
     if positive:
         first = 10.0 ** math.floor(math.log10(min(positive)))
         axes.set_xscale("symlog", linthresh=first, linscale=0.6)
+        decades = round(math.log10(max(positive) / first)) + 1
+        steps = (1, 2, 5) if decades <= 2 else (1,)
+        axes.set_xticks([0, *(first * 10**decade * step for decade in range(decades) for step in steps)])
         axes.set_xlim(-0.15 * first, 1.3 * max(positive))
     axes.xaxis.set_major_formatter(formatter)
 

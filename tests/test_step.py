@@ -186,6 +186,33 @@ def petsc_options():
         database.delValue(name)
 
 
+@pytest.mark.parametrize(
+    ("preset", "options"),
+    [
+        ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),  # which takes no start for its solves
+        ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
+        ("ngmres", {"snes_type": "newtontr"}),
+    ],
+)
+def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: dict[str, str]):
+    petsc_options(**options)
+    assert all(result.error <= 1e-3 for result in swing(preset, 2, error=1e-3))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"snes_type": "shell"}, "PETSc cannot take a step with these options: .*SNESShellSetSolve"),
+        ({"snes_type": "python", "snes_python_type": "gone.Gone"}, "PETSc refuses its options: No module named 'gone'"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(petsc_options, options: dict[str, str], said: str):
+    petsc_options(**options)
+    with pytest.raises(InputError, match=said) as refused:
+        swing("newton", 1)
+    assert len(str(refused.value).splitlines()) == 1
+
+
 def test_a_preset_leaves_no_options_behind():
     from petsc4py import PETSc
 

@@ -153,6 +153,8 @@ PRESETS = {
 
 # a user who chooses another type does not want what only goes with ours
 BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
+# these solve with A or the Hessian themselves: a plain iteration as their preconditioner has no place
+SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
 
 
 def find_preset(name: str) -> Preset:
@@ -170,6 +172,8 @@ def set_defaults(preset: Preset, prefix: str = "") -> set[str]:
     for chosen, bound in BOUND_TO_TYPE.items():
         if chosen in given:
             ours -= bound
+    if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
+        ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
     for name in ours:
         database.setValue(prefix + name, preset.options[name] or None)
     return {prefix + name for name in ours}

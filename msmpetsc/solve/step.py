@@ -16,6 +16,7 @@ from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
 from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
+from msmpetsc.solve.refusal import refusal
 from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -89,10 +90,11 @@ class Stepper:
         try:
             self._create_solver(time_step, touches)
             self.rounding = self._rounding_of_residual()
-        except PETSc.Error as error:
+        except InputError:
             self.destroy()
-            raise InputError(f"PETSc refuses its options: {last_words(error)}") from None
+            raise
 
+    @refusal("PETSc refuses its options")
     def _create_solver(self, time_step: float, touches: bool) -> None:
         self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step, prefix=self.prefix))
         self.contact_blocks = ContactBlocks(self.unknowns, time_step) if touches else None
@@ -147,17 +149,16 @@ class Stepper:
         self.owned_objects.append(owned)
         return owned
 
+    @refusal("PETSc cannot set up the solver")
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
-        try:
-            self.ksp.setOperators(self.operator, self.operator)
-            self.ksp.setUp()
-        except PETSc.Error as error:
-            raise InputError(f"PETSc cannot set up the solver: {last_words(error)}") from None
+        self.ksp.setOperators(self.operator, self.operator)
+        self.ksp.setUp()
 
+    @refusal("PETSc cannot take a step with these options")
     def step(
         self,
         q: np.ndarray,
@@ -174,7 +175,7 @@ class Stepper:
         led     : q_n with the held nodes where they will be, (l, 3) [m]; q_n itself if they stay
         start   : a first guess (l, 3) [m]; the best of several if None
 
-        Raises StepFailed on all ranks.
+        Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
         self.functional.begin(q, q_previous, load, contact, led)
         self.base[:] = self.functional.q
@@ -319,6 +320,7 @@ class Stepper:
 
     def _start_from_estimate(self, snes: PETSc.SNES, given: bool) -> None:
         """CG goes on from what the estimate at this x, if it was ``given``, found of the same correction."""
+        given = given and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
         if given:
             self.estimate.correction.copy(snes.getSolutionUpdate())
         self.ksp.setInitialGuessNonzero(given)
@@ -396,10 +398,3 @@ class Stepper:
         for owned in reversed(self.owned_objects):
             owned.destroy()
         forget_defaults(self.defaults)
-
-
-def last_words(error: PETSc.Error) -> str:
-    """What a PETSc error says, without the calls it came through."""
-    lines = str(error).splitlines()
-    said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
-    return said[-1] if said else lines[0]

@@ -1,0 +1,27 @@
+"""What PETSc says of options that it cannot use, as the one line of an InputError."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from petsc4py import PETSc
+
+from msmpetsc.errors import InputError
+
+
+@contextmanager
+def refusal(what: str) -> Iterator[None]:
+    """PETSc's errors in the block, or in the function decorated, become InputError ``what``: its last words.
+
+    ImportError is that of an object of type python whose context is not there.
+    """
+    try:
+        yield
+    except (PETSc.Error, ImportError) as error:
+        raise InputError(f"{what}: {last_words(error)}") from None
+
+
+def last_words(error: Exception) -> str:
+    """What a PETSc error says, without the calls it came through."""
+    lines = str(error).splitlines()
+    said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
+    return said[-1] if said else lines[0]

@@ -165,6 +165,17 @@ def test_what_has_no_meaning_for_verlet_is_not_multiplied(tmp_path: Path):
     ]  # fmt: skip
 
 
+def test_nothing_is_measured_beyond_the_end_of_a_case(tmp_path: Path):
+    """The scene's steps are of 0.01 s: 3 of them, or 1."""
+    scene = ONE_SCENE + "duration = 0.03\ntrue_error = 2\ntrace = 3\n"
+    sweep = "[[sweep]]\ntrace = true\ntime_steps = "
+    study = load_study(study_file(tmp_path, scene + "[[sweep]]\ntime_steps = [0.01, 0.03]"))
+    assert [case.true_error for case in cases(study, tmp_path, False)] == [2, 1]
+    assert cases(load_study(study_file(tmp_path, scene + sweep + "[0.01]")), tmp_path, False)[0].trace == 3
+    with pytest.raises(InputError, match="scene a: trace = 3, but anderson takes 1 steps"):
+        cases(load_study(study_file(tmp_path, scene + sweep + "[0.03]")), tmp_path, False)
+
+
 def test_full_cases_are_for_full_studies_and_none_comes_twice(tmp_path: Path):
     text = ONE_SCENE + "[[sweep]]\nerrors = [0.1]\n[[sweep]]\nerrors = [0.1, 0.01]\nfull = true"
     assert [one.error for one in all_cases(tmp_path, text)] == [0.1]

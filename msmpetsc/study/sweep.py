@@ -81,9 +81,13 @@ def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
-    """With its time table, and its output at the moments that are compared."""
+    """With its time table, its output at the moments that are compared, and nothing measured beyond its end."""
     steps = sweep.steps or (scene.steps if scene.duration is None else None)
     duration = steps * case.time_step if steps else scene.duration or as_given.time.duration
+    steps = max(1, round(duration / case.time_step))
+    if case.trace and case.trace > steps:
+        raise InputError(f"scene {case.scene}: trace = {case.trace}, but {case.label} takes {steps} steps")
+    case = replace(case, true_error=case.true_error and min(case.true_error, steps))
     every = 1
     if case.reference is not None:
         every = max(1, round((scene.frame or as_given.time.step) / case.time_step))

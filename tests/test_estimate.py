@@ -102,7 +102,8 @@ def run(*words: str | Path) -> subprocess.CompletedProcess:
 
 def test_a_run_tells_its_true_errors_its_iterates_and_its_cost(tmp_path: Path):
     path, out, told = block_scene(tmp_path, gravity=GRAVITY, **SCENES["swings"]), tmp_path / "o.h5", tmp_path / "m.json"
-    done = run(path, "-o", out, "--true-error", 2, "--trace", 3, "--measure", told, "--frames", 4, "--error", 1e-4)
+    done = run(path, "-o", out, "--true-error", 2, "--trace", 3, "--measure", told, "--frames", 4, "--error", 1e-4,
+               "-reference_ksp_rtol", 1e-2)  # fmt: skip
     assert done.returncode == 0, done.stderr
     with h5py.File(out) as file:
         frames = file["frames"]
@@ -127,6 +128,11 @@ def test_a_run_tells_its_true_errors_its_iterates_and_its_cost(tmp_path: Path):
     [
         (["--true-error", "0"], "--true-error must be at least 1, not 0"),
         (["--trace", "2"], "--trace needs --measure"),
+        (["--trace", "2", "--measure", "m.json"], "--trace 2: the run has 1 step only"),
+        (["--true-error", "2"], "--true-error 2: the run has 1 step only"),
+        (["--true-error", "1", "-reference_gone", "1"], "-reference_gone: no part of this run uses"),
+        (["-reference_ksp_rtol", "1"], "-reference_ksp_rtol: no part of this run uses"),
+        (["-snes_mf"], "-snes_mf: Hessians are applied"),
         (["--true-error", "1", "--set", "time.integrator=verlet"], "verlet has none"),
         (["--measure", "/dev/null/m.json"], "cannot be written"),
     ],
@@ -134,6 +140,8 @@ def test_a_run_tells_its_true_errors_its_iterates_and_its_cost(tmp_path: Path):
 def test_what_cannot_be_measured_is_one_clear_line(tmp_path: Path, words: list[str], said: str):
     done = run(block_scene(tmp_path, **SCENES["swings"]), "-o", tmp_path / "o.h5", "--frames", "1", *words)
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) <= 4, done.stderr
+    if said == "cannot be written":
+        assert not (tmp_path / "o.h5").exists(), "known before the run"
 
 
 def test_two_solvers_do_not_take_each_others_options():

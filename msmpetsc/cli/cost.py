@@ -47,13 +47,23 @@ class Cost:
         told["time"]["setup"] -= min(told["time"]["factor"], told["time"]["setup"])
         told["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
         told["trace"] = self.simulation.trace
-        on_root(comm, lambda: _write(path, told))
+        on_root(comm, lambda: _write(path, json.dumps(told, indent=1)))
 
 
-def _write(path: Path, told: dict) -> None:
+def refuse_unwritable(path: Path | None) -> None:
+    """Raises InputError before the run rather than after it."""
+    if path:
+        was_there = path.exists()
+        _write(path, "", "a")
+        if not was_there:
+            path.unlink()
+
+
+def _write(path: Path, text: str, mode: str = "w") -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(told, indent=1))
+        with open(path, mode, encoding="utf-8") as file:
+            file.write(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 

@@ -13,7 +13,7 @@ import petsc4py
 from mpi4py import MPI
 
 from msmpetsc import __version__
-from msmpetsc.cli.cost import Cost, versions
+from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.frames import ResultFile
@@ -78,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
     began = perf_counter()
     measured = what_is_measured(args)
     scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
+    refuse_steps_beyond(scene.time.steps, args)
+    on_root(comm, lambda: refuse_unwritable(args.measure))
     path = args.output or Path("out") / f"{args.scene.stem}.h5"
     try:
         with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
@@ -112,6 +114,13 @@ def what_is_measured(args: argparse.Namespace) -> "Measured":
     if args.measure:
         begin_timing()
     return Measured(args.true_error, args.trace)
+
+
+def refuse_steps_beyond(steps: int, args: argparse.Namespace) -> None:
+    """Raises InputError for steps to be measured that the run does not come to."""
+    for option, number in {"--true-error": args.true_error, "--trace": args.trace}.items():
+        if number is not None and number > steps:
+            raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
 
 
 def finish(path: Path, picture: bool) -> None:

@@ -9,7 +9,7 @@ from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.solve.measured import Measured, Trace
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.reference import Problem, Reference
+from msmpetsc.solve.reference import PREFIX, Problem, Reference
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import Stepper, StepResult
 
@@ -91,7 +91,8 @@ class ImplicitEuler:
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         reference = self.reference.stepper.defaults if self.reference else set()
-        refuse_unused(self.comm, self.stepper.defaults | reference, at_end)
+        awaited = PREFIX if self.measured != Measured() else None
+        refuse_unused(self.comm, self.stepper.defaults | reference, at_end, awaited)
 
     def destroy(self) -> None:
         """Collective."""

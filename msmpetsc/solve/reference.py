@@ -14,6 +14,7 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.step import Stepper
 
 PRESET, ERROR = "newton-multigrid", 1e-10
+PREFIX = "reference_"  # of its PETSc options
 STAGE = "reference"  # of PETSc's log, so that its time is told apart
 
 
@@ -29,13 +30,13 @@ class Problem:
 
 
 class Reference:
-    """The solver, its options under the prefix reference_; not timed with the run."""
+    """The solver, its options under PREFIX; not timed with the run."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool):
         self.stage = PETSc.Log.Stage(STAGE)
         self.stage.push()
         self.stepper = Stepper(
-            comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix="reference_"
+            comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX
         )
         self.stepper.set_up()
         self.stage.pop()

@@ -92,6 +92,7 @@ def calls(folder: Path) -> list[str]:
         (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "'newton'"]),
         (ONE_SCENE + '[[sweep]]\nscenes = ["b"]', ["sweep", "'b'"]),
         (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be < 1"]),
+        (ONE_SCENE + "[[sweep]]\noptions = [\"-pc_type 'icc\"]", ["sweep.0.options.0", "no closing quotation"]),
         (ONE_SCENE + '[[sweep]]\nintegrators = ["verlett"]', ["sweep.0.integrators.0", "'verlet'"]),
         (ONE_SCENE + 'reference = { integrator = "implicit-euler" }\n[[sweep]]', ["scene.0.reference", "needs step"]),
         (ONE_SCENE + "steps = 3\nduration = 0.5\n[[sweep]]", ["scene.0.duration", "beside steps"]),
@@ -130,6 +131,16 @@ def test_the_command_line_refuses_with_status_2_and_one_line(tmp_path: Path):
     assert done.stderr.splitlines() == [
         f"msmpetsc: error: {path}: sweep.0.erors: unknown key, did you mean 'errors'? (line 5)"
     ]
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path, capsys, own_log):
+    path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
+    (tmp_path / "file").touch()
+    (tmp_path / "taken" / "traces.json.part").mkdir(parents=True)
+    for folder, said in {"file/out": "Not a directory", "taken": "Is a directory", "file": "not a folder"}.items():
+        assert main(["study", str(path), "-o", str(tmp_path / folder)]) == 2
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1 and said in told[0] and str(tmp_path / folder) in told[0]
 
 
 def all_cases(folder: Path, text: str, full: bool = False) -> list[case.Case]:
@@ -508,6 +519,17 @@ def test_the_command_tells_the_answer_and_writes_it(
     else:
         assert path.read_text() == COMMENTED
         assert "nothing tried meets 0.05" in told and "1.0e-01" in told
+
+
+def test_an_answer_that_cannot_be_written_is_told_all_the_same(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan, "try_all", lambda *_: [Trial(Method("verlet", 0.02), 1.0, 0.01)])
+    path = tmp_path / "scene.toml"
+    path.write_text(COMMENTED)
+    (tmp_path / "scene.toml.part").mkdir()
+    assert main(["plan", str(path), "--error", "0.05", "--write"]) == 2
+    told = capsys.readouterr()
+    assert 'integrator = "verlet"' in told.out and path.read_text() == COMMENTED
+    assert told.err == f"msmpetsc: error: {path}: cannot be written: Is a directory\n"
 
 
 @pytest.mark.parametrize(

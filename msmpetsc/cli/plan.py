@@ -43,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--{name} must be at least 1, not {getattr(args, name)}")
     from msmpetsc.study.plan import cheapest
 
-    trials = try_all(args, target)
+    try:
+        trials = try_all(args, target)
+    except OSError as error:  # of a full disk, of an mpiexec that is not there
+        raise InputError(f"{error.filename}: {error.strerror}") from None
     best = cheapest(trials, target)
     if best is None:
         tell_what_was_reached(trials, target)
@@ -98,9 +101,12 @@ def tell_answer(args: argparse.Namespace, best) -> None:
     from msmpetsc.study.scene_lines import lines, put_into
 
     print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")
-    if args.write:
-        put_into(args.scene, best.method)
-        print(f"written into {args.scene}:")
     print(f"\n{lines(best.method)}\n")
     launcher = f"mpiexec -n {args.ranks} " if args.ranks > 1 else ""
-    print(f"{launcher}msmpetsc run {shlex.quote(str(args.scene))} {best.method.options}".rstrip())
+    print(f"{launcher}msmpetsc run {shlex.quote(str(args.scene))} {best.method.options}".rstrip(), flush=True)
+    if args.write:
+        try:
+            put_into(args.scene, best.method)
+        except OSError as error:
+            raise InputError(f"{args.scene}: cannot be written: {error.strerror}") from None
+        print(f"\nwritten into {args.scene}")

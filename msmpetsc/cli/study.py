@@ -37,7 +37,10 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
-    failed = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart)
+    try:
+        failed = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart)
+    except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
+        raise InputError(f"{error.filename or folder}: {error.strerror}") from None
     if failed:
         log.warning("%d case%s without figures: see the column reason", failed, "s" * (failed > 1))
     from msmpetsc.study.report import write_report  # loads the charts: a second that refused files need not wait

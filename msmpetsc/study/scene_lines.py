@@ -1,6 +1,7 @@
 """A method as lines of a scene file, to paste or to put into the file as its author wrote it."""
 
 import os
+import shutil
 from pathlib import Path
 
 import tomlkit
@@ -26,8 +27,8 @@ def lines(method: Method) -> str:
 
 
 def put_into(scene: Path, method: Method) -> None:
-    """Change the scene file; comments, order and all else stay as they are."""
-    with open(scene, encoding="utf-8", newline="") as file:
+    """Change the scene file; comments, order and all else stay as they are. Raises OSError if it cannot be written."""
+    with open(scene, "r+", encoding="utf-8", newline="") as file:  # a file that is read-only is meant to stay
         text = file.read()
     line_end = "\r\n" if "\r\n" in text else "\n"
     document = tomlkit.parse(text)
@@ -40,8 +41,7 @@ def put_into(scene: Path, method: Method) -> None:
             elif document[name].get(key) != value:
                 document[name][key] = value
     part = scene.with_name(scene.name + ".part")
-    with open(part, "w", encoding="utf-8", newline="") as file:
-        file.write(
-            tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end)
-        )  # new lines end like the others
+    with open(part, "w", encoding="utf-8", newline="") as file:  # new lines end like the others
+        file.write(tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))
+    shutil.copymode(scene, part)
     os.replace(part, scene)

@@ -1,5 +1,6 @@
 """The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
 
+import shlex
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
@@ -26,7 +27,16 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
     return name
 
 
+def _words(options: str) -> str:
+    try:
+        shlex.split(options)
+    except ValueError as error:
+        raise rule(f"cannot be taken apart: {str(error).lower()}") from None
+    return options
+
+
 Preset = Annotated[str, AfterValidator(_known_preset)]
+Options = Annotated[str, AfterValidator(_words)]
 
 
 class Reference(Table):
@@ -78,7 +88,7 @@ class Sweep(Table):
     scenes: ListOf[str] = Field((), description="names of the scenes; all if absent")
     integrators: ListOf[Integrator] = Field(("implicit-euler",), description="how they are stepped")
     presets: ListOf[Preset] = Field((), description="implicit-euler: solver presets")
-    options: ListOf[str] = Field(("",), description='PETSc options, each one string: "-pc_type icc"')
+    options: ListOf[Options] = Field(("",), description='PETSc options, each one string: "-pc_type icc"')
     cells: ListOf[Count] = Field((), description="numbers of valid cells [-]")
     time_steps: ListOf[Positive] = Field((), description="time steps; of verlet, what is between two frames [s]")
     substeps: ListOf[Positive] = Field((), description="verlet: longest substeps [s]; the stability limit's if absent")

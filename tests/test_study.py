@@ -183,7 +183,7 @@ def test_nothing_is_measured_beyond_the_end_of_a_case(tmp_path: Path):
     study = load_study(study_file(tmp_path, scene + "[[sweep]]\ntime_steps = [0.01, 0.03]"))
     assert [case.true_error for case in cases(study, tmp_path, False)] == [2, 1]
     assert cases(load_study(study_file(tmp_path, scene + sweep + "[0.01]")), tmp_path, False)[0].trace == 3
-    with pytest.raises(InputError, match="scene a: trace = 3, but anderson takes 1 steps"):
+    with pytest.raises(InputError, match="scene a: trace = 3, but newton takes 1 steps"):
         cases(load_study(study_file(tmp_path, scene + sweep + "[0.03]")), tmp_path, False)
 
 

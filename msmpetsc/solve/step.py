@@ -12,6 +12,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
 from msmpetsc.solve.estimate import ErrorEstimate
+from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
 from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
@@ -81,8 +82,7 @@ class Stepper:
         self.unknowns = Unknowns(comm, lattice)
         self.functional = StepFunctional(comm, self.unknowns, self.elasticity, time_step)
         self.base = np.empty_like(lattice.nodes)
-        self.holds = self.unknowns.total < lattice.table.total  # some nodes are no unknowns
-        self.corrections = []  # x - y of the last steps, at most two, the newest first
+        self.first_guess = FirstGuess(self.functional, preset.extrapolate)
         self.ratio, self.its = FIRST_RATIO, 0
         self.local = PETSc.Log.Event(LOCAL_EVENT)
         self.owned_objects = [self.unknowns]
@@ -181,14 +181,11 @@ class Stepper:
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
         self.early, self.corrected = EARLY, False
-        if start is None:
-            self._first_guess(q)
-        else:
-            self.unknowns.from_nodes(start, self.x)
+        self.unknowns.from_nodes(self.first_guess.best(q) if start is None else start, self.x)
         iterations = 0 if self._is_solved() else self._solve()
         functional, its_before, self.its = self.functional, self.its, self.all_its()
         self.unknowns.to_nodes(self.x, functional.q)
-        self.corrections = [functional.q - functional.y, *self.corrections[:1]]
+        self.first_guess.learn(functional.q)
         return StepResult(functional.q.copy(), q, self.last_error, iterations, self.its - its_before)
 
     def all_its(self) -> int:
@@ -228,37 +225,6 @@ class Stepper:
 
     def _climbs(self) -> bool:
         return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
-
-    def _first_guess(self, q: np.ndarray) -> None:
-        """Put the start of least g into x.
-
-        Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
-        y and the elastic corrections c = x - y of the last steps extrapolated, near in smooth motion; and
-        q_n, which after an impact is not folded over as y may be, moved by what the free flight moves on average
-        where nothing is held, so that a step that stops early keeps the momentum.
-        """
-        y = self.functional.y
-        guesses = [y]
-        if self.preset.extrapolate:
-            flight = y.copy()
-            flight[: self.lattice.owned] += self.t2 * self.functional.load / self.lattice.mass[:, None]
-            guesses += [flight, q + self._drift(flight - q)]
-            if self.corrections:
-                guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        values = [self.functional.value(self._held(guess)) for guess in guesses] if len(guesses) > 1 else [0.0]
-        self.unknowns.from_nodes(guesses[int(np.argmin(values))], self.x)
-
-    def _held(self, guess: np.ndarray) -> np.ndarray:
-        """The guess, but with the held nodes where they will be."""
-        return np.where(self.lattice.pinned[:, None], self.base, guess) if self.holds else guess
-
-    def _drift(self, moved: np.ndarray) -> np.ndarray | float:
-        """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
-        if self.holds:
-            return 0.0
-        sums = np.append(self.lattice.mass @ moved[: self.lattice.owned], self.lattice.mass.sum())
-        sums = self.comm.allreduce(sums)
-        return sums[:3] / sums[3]
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         self.local.begin()

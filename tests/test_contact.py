@@ -5,7 +5,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from block_scene import CELL, DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
+from block_scene import DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
 
 from msmpetsc.model.motion import Path as Motion

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
-from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.lattice import build_lattice

@@ -163,6 +163,20 @@ def test_a_budget_is_kept_and_the_error_reported():
     assert all(result.iterations <= 4 for result in results) and results[-1].error > 1e-12
 
 
+def test_a_budget_may_be_more_than_a_preset_allows_itself(petsc_options):
+    """A -snes_max_it of the user's stays what it is."""
+    def most(budget: int) -> int:
+        stepper = Stepper(COMM, beam(), T, find_preset("anderson"), max_iterations=budget)
+        found = stepper.snes.getTolerances()[3]
+        stepper.destroy()
+        return found
+
+    allowed = int(PRESETS["anderson"].options["snes_max_it"])
+    assert [most(budget) for budget in (1, allowed + 7)] == [allowed, allowed + 7]
+    petsc_options(snes_max_it="3")
+    assert most(allowed + 7) == 3
+
+
 def test_cg_and_cholesky_give_the_same_step(petsc_options):
     direct = swing("fast-msm", 4, error=1e-10)[-1].position
     petsc_options(ksp_type="cg", pc_type="icc", ksp_rtol="1e-12")

@@ -60,7 +60,7 @@ LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
 
 PRESETS = {
     "anderson": Preset(
-        "Anderson-accelerated local/global steps with loose CG solves: easy steps to few digits, no Hessian",
+        "Anderson-accelerated local/global iterations with loose CG solves: easy steps to few digits, no Hessian",
         {
             "snes_type": "anderson",
             "snes_anderson_m": "5",
@@ -71,7 +71,7 @@ PRESETS = {
         inexact=True,
     ),
     "ngmres": Preset(
-        "Nonlinear GMRES over the same steps, its own line search: where anderson runs astray",
+        "Nonlinear GMRES over the same iterations, its own line search: where anderson runs astray",
         {
             "snes_type": "ngmres",
             "snes_ngmres_m": "5",
@@ -98,7 +98,7 @@ PRESETS = {
         inexact=True,
     ),
     "chebyshev": Preset(
-        "Wang 2015: local/global steps with Chebyshev's weights, no inner products: for many cores or a GPU",
+        "Wang 2015: local/global iterations with Chebyshev's weights, no inner products: for many cores or a GPU",
         {
             "snes_type": "python",
             "snes_python_type": "msmpetsc.solve.chebyshev.Chebyshev",
@@ -122,7 +122,7 @@ PRESETS = {
         inexact=True,
     ),
     "fast-msm": Preset(
-        "Liu et al. 2013: ten local/global steps, each one solve with a prefactored Cholesky",
+        "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
         {**PLAIN, **CHOLESKY},
         extrapolate=False,
         iterations=10,
@@ -135,7 +135,7 @@ PRESETS = {
         kronecker=True,
     ),
     "paper": Preset(
-        "Zheng et al.: the same ten steps with plain CG from x = b to a fixed tolerance",
+        "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",
         {
             **PLAIN,
             "ksp_type": "cg",
@@ -164,18 +164,22 @@ def find_preset(name: str) -> Preset:
     return PRESETS[name]
 
 
-def set_defaults(preset: Preset, prefix: str = "") -> set[str]:
-    """Put the preset's options into PETSc's database where the user has set none; returns their names."""
+def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
+    """Put the preset's options into PETSc's database where the user has set none; returns their names.
+
+    SNES then does not give up before the ``budget`` of iterations is spent.
+    """
+    options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
     database = PETSc.Options()
     given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix)}
-    ours = preset.options.keys() - given
+    ours = options.keys() - given
     for chosen, bound in BOUND_TO_TYPE.items():
         if chosen in given:
             ours -= bound
     if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
         ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
     for name in ours:
-        database.setValue(prefix + name, preset.options[name] or None)
+        database.setValue(prefix + name, options[name] or None)
     return {prefix + name for name in ours}
 
 

@@ -86,7 +86,7 @@ class Stepper:
         self.ratio, self.its = FIRST_RATIO, 0
         self.local = PETSc.Log.Event(LOCAL_EVENT)
         self.owned_objects = [self.unknowns]
-        self.defaults = set_defaults(preset, prefix)
+        self.defaults = set_defaults(preset, prefix, self.budget or 0)
         try:
             self._create_solver(time_step, touches)
             self.rounding = self._rounding_of_residual()
@@ -335,7 +335,8 @@ class Stepper:
         if self.last_error <= (self.error or 0.0):
             return reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
-            self.last_error = self._estimated(f, self.functional.away(), 0.0)
+            if not self.corrected:
+                self.last_error = self._estimated(f, self.functional.away(), 0.0)
             return reasons.CONVERGED_ITS
         if self.adapts:
             self._loosen()

@@ -15,7 +15,6 @@ from msmpetsc.scene_reading import load_scene
 from msmpetsc.study.case import Case, digest
 from msmpetsc.study.schema import Reference, Study, StudyScene, Sweep
 
-Changes = dict[str, Any]
 
 
 def cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:

@@ -318,7 +318,8 @@ def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path)
         str(study_file(tmp_path, text)),
         str(tmp_path / "out"),
     ]
-    study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL)
+    heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
+    study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL, preexec_fn=heard)
     child, deadline = tmp_path / "out" / "child", time.monotonic() + 60
     while not (child.is_file() and child.read_text()) and time.monotonic() < deadline:
         time.sleep(0.05)

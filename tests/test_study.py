@@ -28,7 +28,7 @@ from msmpetsc.study.reading import load_study
 from msmpetsc.study.scene_lines import put_into
 from msmpetsc.study.study import run_study
 from msmpetsc.study.sweep import cases
-from msmpetsc.study.table import COLUMNS, read_table
+from msmpetsc.study.table import COLUMNS, read_table, write_table
 from msmpetsc.study.trajectory import common_times, trajectory_error
 
 ROOT = Path(__file__).parent.parent
@@ -328,6 +328,15 @@ def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path)
     assert [row["status"] for row in read_table(tmp_path / "out")] == ["ok"]
     assert not alive(int(child.read_text()))
     assert len(calls(tmp_path)) == 2
+
+
+def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):
+    row = {"case": "1", "cells": 1009, "steps": 8, "time_step": 1e-3, "fps": 121.25, "memory": 4e8, "error": None}
+    row |= {name: 1 for name, column in COLUMNS.items() if column.kind is int}
+    write_table(tmp_path, [row])
+    once = (tmp_path / "table.csv").read_text()
+    write_table(tmp_path, read_table(tmp_path))
+    assert (tmp_path / "table.csv").read_text() == once and ",1009," in once
 
 
 def test_a_table_that_is_none_is_one_line(tmp_path: Path, stand_in):

@@ -15,7 +15,7 @@ from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.operators import Preconditioner, TrueHessian, python_matrix
 
 LOOK_EVERY = 4  # iterations
-CLOSE = 0.2  # the part: at 0.4, where stiff beams take Jacobi hundreds of iterations, one estimate in 50 was a sixth of the error
+CLOSE = 0.2  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 GROWTH = 1.5  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
 MOST = 512
 

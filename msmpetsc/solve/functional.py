@@ -59,7 +59,7 @@ class StepFunctional:
         return self.comm.allreduce(inertia + self.t2 * acting)
 
     def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
-        """g(x) - g(base) [kg m^2] and |x - base|^2 [m^2], base (l, 3): summed so that the difference keeps its digits."""
+        """g(x) - g(base) [kg m^2] and |x - base|^2 [m^2], base (l, 3); a difference that keeps its digits."""
         self.unknowns.to_nodes(x, self.q)
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - base[owned]

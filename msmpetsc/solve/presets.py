@@ -110,7 +110,7 @@ PRESETS = {
         inexact=True,
     ),
     "newton": Preset(
-        "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error, most robust",
+        "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
         NEWTON,
         true_hessian=True,
         inexact=True,

@@ -82,6 +82,14 @@ def _only_for(other: str, value: str) -> Callable[..., Any]:
     return check
 
 
+def _known_preset(name: str, info: ValidationInfo) -> str:
+    presets = (info.context or {}).get("presets")
+    if presets is not None and name not in presets:
+        raise unknown_name(presets)
+    return name
+
+
+Preset = Annotated[str, AfterValidator(_known_preset)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 
@@ -342,17 +350,9 @@ class Anchor(Table):
 class Solver(Table):
     """How a step is solved."""
 
-    preset: str = Field("newton", min_length=1, description="named set of PETSc options")
+    preset: Preset = Field("newton", min_length=1, description="named set of PETSc options")
     error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
     max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
-
-    @field_validator("preset")
-    @classmethod
-    def _is_known(cls, preset: str, info: ValidationInfo) -> str:
-        presets = (info.context or {}).get("presets")
-        if presets is not None and preset not in presets:
-            raise unknown_name(presets)
-        return preset
 
 
 class Output(Table):

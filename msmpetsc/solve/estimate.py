@@ -40,12 +40,14 @@ class ErrorEstimate:
         self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._told_enough)
 
-    def __call__(self, f: PETSc.Vec, enough: float) -> float:
+    def __call__(self, f: PETSc.Vec, bound: float, enough: float) -> float:
         """|x - x*|_M at functional.q, where F is f (collective); what comes out over ``enough`` may be too low.
+
+        bound : |F|_(M^-1)
 
         Infinite where the Hessian is not positive definite: there no linear correction tells the way.
         """
-        self.enough, self.f, self.bound, self.lengths = enough, f, self.functional.dual_norm(f), {}
+        self.enough, self.f, self.bound, self.lengths = enough, f, bound, {}
         self.hessian.linearise(self.functional.q, self.functional.contact)
         self.operator.assemble()
         self.ksp.solve(f, self.correction)

@@ -26,6 +26,7 @@ class StepFunctional:
         self.lattice = unknowns.lattice
         self.q, self.y, self.gradient = (np.empty_like(self.lattice.nodes) for _ in range(3))
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
+        self.per_mass = 1 / self.mass
 
     def begin(
         self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
@@ -76,7 +77,7 @@ class StepFunctional:
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
-        return np.sqrt(self.comm.allreduce(f.array_r**2 @ (1 / self.mass)))
+        return np.sqrt(self.comm.allreduce(f.array_r**2 @ self.per_mass))
 
     def away(self, correction: PETSc.Vec | None = None) -> float:
         """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""

@@ -97,17 +97,16 @@ class Stepper:
     @refusal("PETSc refuses its options")
     def _create_solver(self, time_step: float, touches: bool) -> None:
         self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step, prefix=self.prefix))
-        self.contact_blocks = ContactBlocks(self.unknowns, time_step) if touches else None
-        self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self.contact_blocks)
+        self.touches = touches
+        self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self._contact_blocks(time_step))
         self.projected = False  # whether newton's is, at the moment
-        context = self.hessian
+        self.linear = self.hessian
         if not self.preset.true_hessian:
-            context = ThreeColumns(self.matrix, ContactBlocks(self.unknowns, time_step) if touches else None)
-        self.linear = context
-        self.operator = self._keep(python_matrix(self.unknowns, context, self.comm))
+            self.linear = ThreeColumns(self.matrix, self._contact_blocks(time_step))
+        self.operator = self._keep(python_matrix(self.unknowns, self.linear, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
-        preconditioner = self._create_preconditioner(time_step, touches)
+        preconditioner = self._create_preconditioner(time_step)
         self.snes = self._keep(PETSc.SNES().create(self.comm))
         self.snes.setOptionsPrefix(self.prefix)
         self.inner = self.snes
@@ -131,13 +130,16 @@ class Stepper:
         self.adapts = self.preset.inexact and f"{self.prefix}ksp_rtol" in self.defaults
         self.tightest = self.ksp.getTolerances()[0]
 
-    def _create_preconditioner(self, time_step: float, touches: bool) -> Preconditioner:
+    def _contact_blocks(self, time_step: float) -> ContactBlocks | None:
+        return ContactBlocks(self.unknowns, time_step) if self.touches else None
+
+    def _create_preconditioner(self, time_step: float) -> Preconditioner:
         """Of A, or of A (x) I_3; contact changes what A is preconditioned with, but not A."""
         self.preconditioned, columns = self.matrix, 1
         if self.preset.kronecker:
             columns = 3
             self.preconditioned = self._keep(assemble(self.comm, self.unknowns, time_step, columns, self.prefix))
-        elif touches:
+        elif self.touches:
             self.preconditioned = self._keep(self.matrix.copy())
         self.scalar = self._keep(self.preconditioned.createVecLeft())
         self.preconditioned.getDiagonal(self.scalar)
@@ -255,9 +257,9 @@ class Stepper:
             if not given:
                 self.hessian.linearise(self.base, contact, self.projected)
             self._start_from_estimate(snes, given)
-        elif self.contact_blocks:
+        elif self.touches:
             self.linear.contact.linearise(contact, self.base, False)
-        changed = self.contact_blocks is not None and self._precondition_contact()
+        changed = self.touches and self._precondition_contact()
         if self.preset.true_hessian or changed:
             self.operator.assemble()
         self.local.end()
@@ -308,7 +310,7 @@ class Stepper:
 
     def _estimated(self, f: PETSc.Vec, away: float, enough: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
-        length = self.estimate(f, EARLY * enough * away if enough else np.inf)
+        length = self.estimate(f, self.residual, EARLY * enough * away if enough else np.inf)
         if not np.isfinite(length):
             return self.bound
         self.ratio, self.early, self.corrected = max(self.bound * away / length, 1.0), 1.0, True
@@ -321,13 +323,12 @@ class Stepper:
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         reasons = PETSc.SNES.ConvergedReason
-        x, f = snes.getSolution(), snes.getFunction()[0]
-        if self.inner is self.snes:
-            self.unknowns.to_nodes(x, self.functional.q)
-        else:  # with an NPC SNES's own function may not be F
-            f = self.work
-            self._residual(snes, x, f)
-        self.last_error = self._error_of(f)
+        f = self.work
+        if its == 0 and self.inner is not self.snes:  # known since _is_solved
+            self.unknowns.to_nodes(snes.getSolution(), self.functional.q)
+        else:
+            f = self._function(snes)
+            self.last_error = self._error_of(f)
         if self.observer:
             self.observer(self)
         if not np.isfinite(self.residual):
@@ -341,6 +342,14 @@ class Stepper:
         if self.adapts:
             self._loosen()
         return reasons.ITERATING
+
+    def _function(self, snes: PETSc.SNES) -> PETSc.Vec:
+        """F at SNES's iterate, which functional.q then is."""
+        if self.inner is self.snes:
+            self.unknowns.to_nodes(snes.getSolution(), self.functional.q)
+            return snes.getFunction()[0]
+        self._residual(snes, snes.getSolution(), self.work)  # with an NPC SNES's own function may not be F
+        return self.work
 
     def _loosen(self) -> None:
         """Let the next linear solve leave what the step can do with: it need not gain more digits than are missing."""

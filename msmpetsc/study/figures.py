@@ -4,13 +4,12 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 
 from msmpetsc.output.frames import finished, open_result
+from msmpetsc.study.table import Row
 
-Row = dict[str, Any]
 COUNTS = ("cells", "nodes", "unknowns", "springs")
 PARTS = ("setup", "factor", "local", "ksp", "output")
 

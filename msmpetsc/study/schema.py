@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.errors import did_you_mean
-from msmpetsc.scene import Count, ListOf, Positive, Table
-from msmpetsc.scene_errors import rule, unknown_name
+from msmpetsc.scene import Count, ListOf, Positive, Preset, Table
+from msmpetsc.scene_errors import rule
 
 Integrator = Literal["implicit-euler", "verlet"]
 Error = Annotated[float, Field(gt=0, lt=1)]
@@ -20,13 +20,6 @@ def _not_empty(values: tuple) -> tuple:
     return values
 
 
-def _known_preset(name: str, info: ValidationInfo) -> str:
-    presets = (info.context or {}).get("presets")
-    if presets is not None and name not in presets:
-        raise unknown_name(presets)
-    return name
-
-
 def _words(options: str) -> str:
     try:
         shlex.split(options)
@@ -35,7 +28,6 @@ def _words(options: str) -> str:
     return options
 
 
-Preset = Annotated[str, AfterValidator(_known_preset)]
 Options = Annotated[str, AfterValidator(_words)]
 
 

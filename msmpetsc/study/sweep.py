@@ -16,7 +16,6 @@ from msmpetsc.study.case import Case, digest
 from msmpetsc.study.schema import Reference, Study, StudyScene, Sweep
 
 
-
 def cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
     """All cases, each once, in the order of the file; ``folder`` is that of the study file.
 

@@ -17,9 +17,18 @@ class InputError(MsmpetscError):
 
 
 class StepFailed(MsmpetscError):
-    """A time step did not converge."""
+    """A time step did not converge, or what came of it is no motion of a body.
+
+    kind : "iterations" (at their limit), "line search", "linear solve", "not finite", "energy" (grew without
+        work), "unstable" (explicit substeps)
+    frame : number of the step, once it is known
+    """
 
     exit_status = 3
+
+    def __init__(self, message: str, kind: str = "iterations", frame: int | None = None):
+        super().__init__(message)
+        self.kind, self.frame = kind, frame
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:

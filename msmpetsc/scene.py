@@ -89,6 +89,7 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
     return name
 
 
+Integrator = Literal["implicit-euler", "bdf2", "verlet"]
 Preset = Annotated[str, AfterValidator(_known_preset)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
@@ -201,8 +202,8 @@ class Time(Table):
 
     step: Positive = Field(description="time step [s]")
     duration: Positive = Field(description="simulated time [s]")
-    integrator: Literal["implicit-euler", "verlet"] = Field(
-        "implicit-euler", description="how a step is taken: solved at once, or in explicit substeps"
+    integrator: Integrator = Field(
+        "implicit-euler", description="how a step is taken: solved at once, of first or second order; or in explicit substeps"
     )
     substep: Positive | None = Field(
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
@@ -355,6 +356,14 @@ class Solver(Table):
     max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
 
 
+class Safety(Table):
+    """What is done about a step that fails."""
+
+    on_failure: Literal["stop", "substep", "fallback"] = Field(
+        "stop", description="stop the run; take that step in shorter ones; or solve it with a slower, robust method"
+    )
+
+
 class Output(Table):
     """What is stored beside the lattice."""
 
@@ -387,6 +396,7 @@ class SceneFile(Table):
     anchor: ListOf[Anchor] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
     solver: Solver = Field(Solver(), description="how a step is solved")
+    safety: Safety = Field(Safety(), description="what is done about a step that fails")
     output: Output = Field(Output(), description="what is stored")
     picture: Picture = Field(Picture(), description="how the result is drawn")
 

@@ -304,7 +304,7 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
     def one_step(name: str, error: float):
         stepper = Stepper(MPI.COMM_SELF, lattice, PRESS_T, find_preset(name), error, touches=True)
         try:
-            return stepper.step(q, before, load, contact)
+            return stepper.step(q, 2 * q - before, load, contact)
         finally:
             stepper.destroy()
 

@@ -73,7 +73,7 @@ def test_g_falls_at_every_iteration_of_plain_and_line_searched_methods(preset: s
         values.append(stepper.functional.change(stepper.snes.getSolution(), y)[0])
 
     stepper.observer = observe
-    stepper.step(q, before, weight(lattice))
+    stepper.step(q, 2 * q - before, weight(lattice))
     stepper.destroy()
     falls = np.diff(values)
     assert len(values) > 2 and (falls <= 1e-12 * abs(values[-1])).all() and values[-1] < 0
@@ -90,7 +90,7 @@ def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     y = 2 * 1.3 - 1.25
     exact = (m * y + T**2 * k * r) / (m + T**2 * k)
     found = [np.array([[0.0, 0, 0], [0, 0, exact + e * (y - exact)]]) for e in (1.0, 0.5, -0.01)]
-    errors = reference.errors(Problem(q, before, np.zeros((2, 3)), None, None), found)
+    errors = reference.errors(Problem(q, 2 * q - before, np.zeros((2, 3)), None, None), found)
     reference.destroy()
     np.testing.assert_allclose(errors, [[1, 1], [0.5, 0.25], [0.01, 1e-4]], rtol=1e-6)
 
@@ -168,7 +168,7 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
         lattice, seen = beam(), []
         stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=error)
         stepper.observer = lambda stepper: seen.append(stepper.ksp.getTolerances()[0])
-        stepper.step(lattice.nodes, lattice.nodes - [0, 0, 1e-3], weight(lattice))
+        stepper.step(lattice.nodes, lattice.nodes + [0, 0, 1e-3], weight(lattice))
         stepper.destroy()
         return seen[1:]
 

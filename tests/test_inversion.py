@@ -209,7 +209,7 @@ def after_many_steps(lattice: Lattice, start: np.ndarray, steps: int = 150) -> n
     q = before = start
     try:
         for _ in range(steps):
-            q, before = stepper.step(q, before, np.zeros_like(q)).position, q
+            q, before = stepper.step(q, 2 * q - before, np.zeros_like(q)).position, q
     finally:
         stepper.destroy()
     return q

@@ -37,7 +37,7 @@ def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -
     q, before, results = lattice.nodes.copy(), lattice.nodes.copy(), []
     try:
         for _ in range(steps):
-            result = stepper.step(q, before, weight(lattice))
+            result = stepper.step(q, 2 * q - before, weight(lattice))
             q, before = result.position, q
             results.append(result)
     finally:
@@ -118,7 +118,7 @@ def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
     q = q_before = np.array([[0.0, 0, 0], [0, 0, x]])
     for _ in range(10):
         x, before = (m * (2 * x - before) + T**2 * k * r) / (m + T**2 * k), x
-        q, q_before = stepper.step(q, q_before, np.zeros((2, 3))).position, q
+        q, q_before = stepper.step(q, 2 * q - q_before, np.zeros((2, 3))).position, q
         np.testing.assert_allclose(q[1], [0, 0, x], atol=1e-8)
     stepper.destroy()
 
@@ -135,7 +135,7 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
     def one_step(name: str, error: float):
         stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
         try:
-            return stepper.step(q, before, weight(lattice)), stepper.corrected
+            return stepper.step(q, 2 * q - before, weight(lattice)), stepper.corrected
         finally:
             stepper.destroy()
 

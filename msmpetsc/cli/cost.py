@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.comm import on_root
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, StepFailed
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation
@@ -35,18 +35,21 @@ class Cost:
         self.stepping += stepping
         self.output += perf_counter() - begun
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
+        from msmpetsc.solve.frequency import explicit_limit
         from msmpetsc.solve.measured import times
 
-        comm = self.comm
+        comm, simulation = self.comm, self.simulation
         told = {"machine": machine(), "versions": versions(), "ranks": comm.size}
         told |= {"command": shlex.join(["msmpetsc", *sys.argv[1:]]), **self.counts}
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         told["time"] = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
         told["time"]["setup"] -= min(told["time"]["factor"], told["time"]["setup"])
         told["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
-        told["trace"] = self.simulation.trace
+        told["trace"] = simulation.trace
+        told["explicit_limit"] = explicit_limit(comm, simulation.model.lattice, simulation.elasticity)
+        told["failure"] = failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)}
         on_root(comm, lambda: _write(path, json.dumps(told, indent=1)))
 
 

@@ -90,10 +90,10 @@ def run(args: argparse.Namespace) -> int:
                 cost = Cost(comm, simulation, perf_counter() - began)
                 write_model(comm, file, model)
                 write_frames(comm, file, simulation, cost)
-    except StepFailed:
+    except StepFailed as failure:
         on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
         if args.measure:
-            cost.write(args.measure)
+            cost.write(args.measure, failure)
         raise
     if args.measure:
         cost.write(args.measure)

@@ -18,6 +18,9 @@ class Frame:
     iterations : outer (SNES) iterations of these steps, or their explicit substeps, summed
     ksp_its    : KSP iterations of these steps, summed
     momentum   : (3,) [kg m/s]
+    inverted   : cells that are inside out
+    substeps   : shorter steps taken where these steps failed; fallbacks: steps that the robust method solved
+    energy_gained : in these steps, neither from loads nor from obstacles or anchors
     """
 
     index: int
@@ -35,3 +38,7 @@ class Frame:
     wall_time: float  # [s] that these steps took
     true_error: float = math.nan
     energy_error: float = math.nan
+    inverted: int = 0
+    substeps: int = 0
+    fallbacks: int = 0
+    energy_gained: float = 0.0  # [J]

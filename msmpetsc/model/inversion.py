@@ -51,6 +51,39 @@ def least_volumes(q: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return least
 
 
+@numba.njit(cache=True, inline="always")
+def _between(q, a, b):
+    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
+
+
+@numba.njit(cache=True, inline="always")
+def _volume(a, b, c):
+    """a . (b x c)"""
+    return (
+        a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    )
+
+
+@numba.njit(cache=True)
+def inverted_cells(q: np.ndarray, cells: np.ndarray) -> tuple[int, int, float]:
+    """How many cells are inverted, which has the least corner volume (-1 if there are none), and that volume [m^3].
+
+    What least_volumes tells, with each edge looked at once: every frame is looked through.
+    """
+    count, worst, least = 0, -1, np.inf
+    for i in range(len(cells)):
+        c = cells[i]
+        x0, x1, x2, x3 = _between(q, c[0], c[1]), _between(q, c[3], c[2]), _between(q, c[4], c[5]), _between(q, c[7], c[6])
+        y0, y1, y2, y3 = _between(q, c[0], c[3]), _between(q, c[1], c[2]), _between(q, c[4], c[7]), _between(q, c[5], c[6])
+        z0, z1, z2, z3 = _between(q, c[0], c[4]), _between(q, c[1], c[5]), _between(q, c[2], c[6]), _between(q, c[3], c[7])
+        volume = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
+        volume = min(volume, _volume(x2, y2, z0), _volume(x2, y3, z1), _volume(x3, y3, z2), _volume(x3, y2, z3))
+        count += volume <= 0
+        if volume < least:
+            least, worst = volume, i
+    return count, worst, least
+
+
 @numba.njit(cache=True)
 def resistance_energy(q: np.ndarray, cells: np.ndarray, volume: float, resistance: float) -> float:
     """Energy [J]. volume: J_0 h^3 [m^3]; resistance: K [J]."""

@@ -38,8 +38,8 @@ class Lattice:
     stiffness   : (s,) [N/m]
     pinned      : (l,) bool, nodes that do not move
     stiffening  : of the springs' law (model.energy) [-]; 0 for Hooke's
-    local_cells : (d, 8) local corner nodes of all cells around the owned nodes, only where the law stiffens;
-                  the first ``cells_owned`` belong to this rank, as their first corner does
+    local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
+                  first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
     """
 
     table: SortedKeys
@@ -117,8 +117,8 @@ def build_lattice(
         stiffness=k,
         pinned=np.zeros(len(ijk), bool),
         stiffening=stiffening,
-        local_cells=local_cells[np.argsort(~first_owned, kind="stable")] if stiffening else NO_CELLS,
-        cells_owned=int(first_owned.sum()) if stiffening else 0,
+        local_cells=np.concatenate([local_cells[first_owned], local_cells[~first_owned & (stiffening > 0)]]),
+        cells_owned=int(first_owned.sum()),
     )
 
 

@@ -100,6 +100,18 @@ class Surroundings:
                 stiffness[inside > -reach] += p.stiffness
         return stiffness
 
+    def dragged(self, before: np.ndarray, after: np.ndarray, time: float, time_step: float) -> float:
+        """No less than the work [J] that the friction of moving obstacles does on this rank's nodes in a step between
+        two positions (owned, 3) [m]: mu N times how far they go."""
+        work = 0.0
+        for p in self._pressing(time) if self.penalties else ():
+            way = np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step))
+            if p.friction > 0 and way > 0:
+                for q, when in ((before, time - time_step), (after, time)):
+                    inside, _ = depths(q, p.obstacle.points_at(when), p.obstacle.normals)
+                    work += p.friction * p.stiffness * np.maximum(inside, 0).sum() * way
+        return work
+
     def _pressing(self, time: float) -> list[Penalty]:
         return [penalty for penalty in self.penalties if penalty.obstacle.acts_at(time)]
 

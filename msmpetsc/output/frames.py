@@ -48,6 +48,10 @@ SERIES = {
     "wall_time": ("f8", (), "s"),
     "true_error": ("f8", (), "1"),
     "energy_error": ("f8", (), "1"),
+    "inverted": ("i8", (), "1"),
+    "substeps": ("i8", (), "1"),
+    "fallbacks": ("i8", (), "1"),
+    "energy_gained": ("f8", (), "J"),
 }
 
 

@@ -1,6 +1,6 @@
 """What one implicit Euler step minimises, its gradient, and how far a gradient is from none.
 
-g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), y = 2 q_n - q_(n-1) (paper Eq. 10-12);
+g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), for implicit Euler y = 2 q_n - q_(n-1) (paper Eq. 10-12);
 F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
 """
 
@@ -24,16 +24,15 @@ class StepFunctional:
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
         self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
         self.lattice = unknowns.lattice
-        self.q, self.y, self.gradient = (np.empty_like(self.lattice.nodes) for _ in range(3))
+        self.q, self.gradient = np.empty_like(self.lattice.nodes), np.empty_like(self.lattice.nodes)
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
         self.per_mass = 1 / self.mass
 
     def begin(
-        self, q: np.ndarray, q_previous: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
+        self, q: np.ndarray, y: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
     ) -> None:
         """A new step, as Stepper.step takes it."""
-        self.y = 2 * q - q_previous
-        self.load, self.contact = load, contact
+        self.y, self.load, self.contact = y, load, contact
         self.q[:] = q if led is None else led  # held nodes stay there
         self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
 
@@ -78,6 +77,11 @@ class StepFunctional:
     def dual_norm(self, f: PETSc.Vec) -> float:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
         return np.sqrt(self.comm.allreduce(f.array_r**2 @ self.per_mass))
+
+    def pull(self, f: PETSc.Vec) -> tuple[np.ndarray, np.ndarray]:
+        """The free nodes, local numbers, and |F| / m of each [m]: how far each is pulled from where it is."""
+        columns = (f.array_r * self.per_mass).reshape(3, -1)
+        return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
     def away(self, correction: PETSc.Vec | None = None) -> float:
         """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""

@@ -28,12 +28,12 @@ TYPES = {
 }
 
 
-def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited: str | None = None) -> None:
+def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
     """Raise InputError for options of the user that no object has looked at (collective).
 
     ours    : names of the preset's own options, which another type may well leave unused
     at_end  : before the end, options that are read while solving still have their time
-    awaited : prefix of a solver that is only made while solving
+    awaited : prefixes of solvers that are only made while solving
     """
     if "snes_mf" in PETSc.Options().getAll():  # it would crash
         raise InputError("-snes_mf: Hessians are applied spring by spring already, without differences")
@@ -43,7 +43,7 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited:
         if name not in ours
         and not READ_AT_THE_END.search(name)
         and (at_end or not READ_WHILE_SOLVING.search(name))
-        and (at_end or not (awaited and name.startswith(awaited)))
+        and not name.startswith(awaited)
     ]
     message = None
     if comm.rank == 0 and unused:

@@ -5,6 +5,7 @@ method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The 
 options always mean the linear solve with A (or with the true Hessian, for ``newton``).
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 from petsc4py import PETSc
@@ -17,6 +18,7 @@ class Preset:
     """about: when to use it. options: PETSc's, without the dash.
 
     true_hessian : the Jacobian is the true Hessian of g, not the constant A
+    projected    : and always without its negative parts
     start_from_b : CG starts from x = b, as in the paper's Algorithm 1
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None iterates to the error target
@@ -27,6 +29,7 @@ class Preset:
     about: str
     options: dict[str, str]
     true_hessian: bool = False
+    projected: bool = False
     start_from_b: bool = False
     extrapolate: bool = True
     iterations: int | None = None
@@ -121,6 +124,13 @@ PRESETS = {
         true_hessian=True,
         inexact=True,
     ),
+    "newton-projected": Preset(
+        "Newton's method with the Hessian's negative parts left out: slower, and what a hard step falls back on",
+        {**NEWTON, "snes_max_it": "1000"},
+        true_hessian=True,
+        projected=True,
+        inexact=True,
+    ),
     "fast-msm": Preset(
         "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
         {**PLAIN, **CHOLESKY},
@@ -157,6 +167,9 @@ BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_nor
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
 
 
+in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's
+
+
 def find_preset(name: str) -> Preset:
     """Raises InputError with the nearest name for an unknown one."""
     if name not in PRESETS:
@@ -171,7 +184,7 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
     """
     options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
     database = PETSc.Options()
-    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix)}
+    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
     ours = options.keys() - given
     for chosen, bound in BOUND_TO_TYPE.items():
         if chosen in given:
@@ -180,10 +193,14 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
         ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
     for name in ours:
         database.setValue(prefix + name, options[name] or None)
-    return {prefix + name for name in ours}
+    names = {prefix + name for name in ours}
+    in_use.update(names)
+    return names
 
 
 def forget_defaults(names: set[str]) -> None:
     """Take them out again: another preset may follow, and -options_left is to show the user's own."""
+    in_use.subtract(names)
     for name in names:
-        PETSc.Options().delValue(name)
+        if not in_use[name]:
+            PETSc.Options().delValue(name)

@@ -23,7 +23,7 @@ class Problem:
     """A step, as Stepper.step takes it."""
 
     q: np.ndarray
-    q_previous: np.ndarray
+    y: np.ndarray
     load: np.ndarray
     contact: Contact | None
     led: np.ndarray | None
@@ -49,7 +49,7 @@ class Reference:
         self.stage.push()
         try:
             exact = self.stepper.step(**vars(problem), start=positions[-1]).position
-            away = self._distances(2 * problem.q - problem.q_previous, exact)
+            away = self._distances(problem.y, exact)
             found = np.array([self._distances(x, exact) for x in positions])
             return np.divide(found, away, out=np.zeros_like(found), where=away > 0)
         except StepFailed as failure:

@@ -13,14 +13,20 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Scene
-from msmpetsc.solve.implicit_euler import ImplicitEuler
+from msmpetsc.solve.balance import EnergyBalance
+from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
+from msmpetsc.solve.rescue import Done, Rescue
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 from msmpetsc.solve.surface import SurfaceMotion
 from msmpetsc.solve.verlet import Verlet
+from msmpetsc.solve.watch import Watch
 
-INTEGRATORS = {"implicit-euler": ImplicitEuler, "verlet": Verlet}
+INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+
+
+WHOLE = Done()  # a step that needed no rescue
 
 
 @dataclass
@@ -33,13 +39,18 @@ class Effort:
     wall_time: float = 0.0  # [s]
     true_error: float = np.nan
     energy_error: float = np.nan
+    substeps: int = 0
+    fallbacks: int = 0
+    energy_gained: float = 0.0  # [J]
 
     def measure(self, errors: np.ndarray) -> None:
         """Of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
-    def add(self, result: StepResult, wall_time: float) -> None:
+    def add(self, result: StepResult, done: Done, wall_time: float) -> None:
         self.step_error = max(self.step_error, result.error)
+        self.substeps += done.substeps
+        self.fallbacks += done.fallbacks
         self.iterations += result.iterations
         self.ksp_its += result.ksp_its
         self.wall_time += wall_time
@@ -54,6 +65,9 @@ class Simulation:
         self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
         integrator = INTEGRATORS[scene.time.integrator]
         self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver, measured)
+        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity)
+        self.rescue = Rescue(comm, model, self.surroundings, scene, self._attempt)
+        self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
 
@@ -68,62 +82,70 @@ class Simulation:
 
         Raises StepFailed on all ranks, naming the step.
         """
-        start = StepResult(self.state.q, self.state.q_previous, 0.0, 0, 0)
-        yield self._frame(0, start, Effort())
-        effort = Effort()
+        state, self.effort = self.state, Effort()
+        self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0)
+        yield self._frame(0, state.q)
         for index in range(1, self.steps + 1):
             if index == self.measured.trace:
                 self.integrator.follow()
             begin = perf_counter()
-            result = self._step(index)
-            effort.add(result, perf_counter() - begin)
-            if self.measured.asks(index):
+            result, done = self._step(index)
+            self.effort.add(result, done, perf_counter() - begin)
+            if self.measured.asks(index) and done == WHOLE:
                 errors, trace = self.integrator.true_errors(index, result)
-                effort.measure(errors)
+                self.effort.measure(errors)
                 self.trace = trace or self.trace
             if index % self.every == 0 or index == self.steps:
-                yield self._frame(index, result, effort)
-                effort = Effort()
+                yield self._frame(index, result.position)
+        self.watch.sum_up()
+        self.rescue.sum_up()
 
-    def _step(self, index: int) -> StepResult:
+    def _step(self, index: int) -> tuple[StepResult, Done]:
         """The step that ends at index * t; ``state`` moves on (collective)."""
-        time = index * self.time_step
+        time, rescue = index * self.time_step, self.rescue
         try:
-            result, self.state = self.integrator.advance(self.state, time)
+            if rescue.is_on:
+                result, self.state, done = rescue.step(self.state, time, None)
+                return result, done
+            try:
+                result, self.state = self._attempt(self.integrator, self.state, time, self.time_step)
+                return result, WHOLE
+            except StepFailed as failure:
+                result, self.state, done = rescue.step(self.state, time, failure)
+                return result, done
         except StepFailed as failure:
-            raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}") from None
-        return result
+            raise StepFailed(f"frame {index} (t = {time:.6g} s) {failure}", failure.kind, index) from None
+
+    def _attempt(self, integrator, state: State, time: float, time_step: float) -> tuple[StepResult, State]:
+        """A step that passes its examination (collective). Raises StepFailed."""
+        result, after = integrator.advance(state, time)
+        self.energies, ledger = self.balance.check(state, result, time, time_step)
+        self.balance.keep(self.energies, ledger, result)
+        self.effort.energy_gained += ledger.last
+        return result, after
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
-        self.integrator.refuse_unused_options(at_end)
+        self.integrator.refuse_unused_options(at_end, self.rescue.awaited)
 
-    def _frame(self, index: int, result: StepResult, effort: Effort) -> Frame:
-        lattice, time = self.model.lattice, index * self.time_step
-        owned, contact = slice(lattice.owned), self.surroundings.push(time)
-        position = result.position[owned]
-        velocity = (position - result.previous[owned]) / self.time_step
-        sums = self.comm.allreduce(
-            np.array(
-                [
-                    0.5 * lattice.mass @ (velocity**2).sum(axis=1),
-                    self.elasticity.energy(result.position),
-                    -(self.surroundings.load(time) * position).sum(),
-                    contact.energy(position) if contact else 0.0,
-                    *(lattice.mass @ velocity),
-                ]
-            )
-        )
+    def _frame(self, index: int, q: np.ndarray) -> Frame:
+        """What is stored of positions q (l, 3) and of the steps since the frame before (collective)."""
+        time, energies = index * self.time_step, self.energies
+        effort, self.effort = self.effort, Effort()
+        effort.energy_gained = max(effort.energy_gained, 0.0)
+        self.watch.error(index, time, effort.step_error)
+        position = q[: self.model.lattice.owned]
         return Frame(
             index=index,
             time=time,
             position=position,
             surface=self.surface(position) if self.surface else None,
-            kinetic=sums[0],
-            elastic=sums[1],
-            potential=sums[2],
-            contact=sums[3],
-            momentum=sums[4:],
+            kinetic=energies.kinetic,
+            elastic=energies.elastic,
+            potential=energies.potential,
+            contact=energies.contact,
+            momentum=energies.momentum,
+            inverted=self.watch.inverted(index, time, q),
             **vars(effort),
         )
 
@@ -139,6 +161,7 @@ class Simulation:
         self.destroy()
 
     def destroy(self) -> None:
+        self.rescue.destroy()
         self.integrator.destroy()
         if self.surface:
             self.surface.destroy()

@@ -11,6 +11,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
+from msmpetsc.model.worst import inside_out, place_of_greatest
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
@@ -29,6 +30,11 @@ FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was esti
 EARLY = 2.0  # a step is first looked at closely when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
+KINDS = {
+    PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
+    PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN: "not finite",
+}
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
@@ -36,8 +42,8 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 
 @dataclass(frozen=True)
 class StepResult:
-    """position (l, 3) [m], ghosts included; previous (l, 3) [m]: q_(n-1) for the next step, so that the velocity
-    is (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
+    """position (l, 3) [m], ghosts included; previous (l, 3) [m]: so that the velocity is
+    (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
     the KSP iterations of all of them, and of the estimates."""
 
     position: np.ndarray
@@ -164,13 +170,13 @@ class Stepper:
     def step(
         self,
         q: np.ndarray,
-        q_previous: np.ndarray,
+        y: np.ndarray,
         load: np.ndarray,
         contact: Contact | None = None,
         led: np.ndarray | None = None,
         start: np.ndarray | None = None,
     ) -> StepResult:
-        """q_(n+1) from q_n and q_(n-1), (l, 3) [m] each, ghosts included.
+        """q_(n+1) from q_n and y, where it would be without forces, (l, 3) [m] each, ghosts included.
 
         load    : force (owned, 3) [N]
         contact : what presses on the nodes in this step
@@ -179,7 +185,7 @@ class Stepper:
 
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
-        self.functional.begin(q, q_previous, load, contact, led)
+        self.functional.begin(q, y, load, contact, led)
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
         self.early, self.corrected = EARLY, False
@@ -222,7 +228,7 @@ class Stepper:
                 break
         self.projected = False
         if self.snes.reason < 0:
-            raise StepFailed(self._failure())
+            raise self._failure(iterations)
         return iterations
 
     def _climbs(self) -> bool:
@@ -252,7 +258,7 @@ class Stepper:
         self.unknowns.to_nodes(x, self.base)
         contact = self.functional.contact
         if self.preset.true_hessian:
-            self.projected = self.projected and snes.its < PROJECTED
+            self.projected = self.preset.projected or self.projected and snes.its < PROJECTED
             given = self.corrected and not self.projected  # the estimate has linearised at this very x
             if not given:
                 self.hessian.linearise(self.base, contact, self.projected)
@@ -357,16 +363,22 @@ class Stepper:
         rtol = SHARE * (self.error or 0.0) / missing
         self.ksp.setTolerances(rtol=min(max(rtol, self.tightest), LOOSEST))
 
-    def _failure(self) -> str:
-        advice = "a smaller time.step, another preset (newton), or a looser solver.error"
-        reason = REASON.get(self.snes.reason, str(self.snes.reason))
-        if self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+    def _failure(self, iterations: int) -> StepFailed:
+        """What is known of it, in one line (collective)."""
+        reason, kind = REASON.get(self.snes.reason, str(self.snes.reason)), KINDS.get(self.snes.reason, "iterations")
+        other = "" if self.preset.true_hessian else "the preset newton, "
+        advice = f'a smaller time.step, {other}a looser solver.error, or safety.on_failure = "substep"'
+        if kind == "linear solve":
             ksp = KSP_REASON.get(self.ksp.reason, str(self.ksp.reason))
             reason += f" (KSP {ksp} after {self.ksp.its} its)"
             advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
-        return (
-            f"did not converge: {reason} after {self.snes.its} iterations, "
-            f"residual |F| = {self.residual:.2e}, relative error {self.last_error:.2e}; try {advice}"
+        self._residual(self.snes, self.snes.getSolution(), self.work)
+        worst = place_of_greatest(self.comm, self.lattice, *self.functional.pull(self.work))
+        cells = inside_out(self.comm, self.lattice, self.functional.q)
+        return StepFailed(
+            f"did not converge: {reason} after {iterations} iterations, residual |F| = {self.residual:.2e}, "
+            f"relative error {self.last_error:.2e}, worst at {worst}{cells}; try {advice}",
+            kind,
         )
 
     def destroy(self) -> None:

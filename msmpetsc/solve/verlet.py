@@ -18,6 +18,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.solve.frequency import HighestMode
 from msmpetsc.solve.ghosted import Ghosted
 from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.options import refuse_unused
@@ -25,8 +26,6 @@ from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
-SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
-MOST_ITERATIONS = 100
 RETRIES = 4  # of a step
 MOST_SUBSTEPS = 1e6  # of a step
 TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
@@ -49,11 +48,12 @@ class Verlet:
         self.comm, self.lattice, self.around = comm, model.lattice, surroundings
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
-        self.position, self.velocity, self.mode = (Ghosted(comm, self.lattice) for _ in range(3))
+        self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
+        self.highest = HighestMode(comm, self.lattice, self.elasticity)
         owned = self.lattice.owned
         self.q, self.v, self.before = self.position.values[:owned], self.velocity.values[:owned], np.empty((owned, 3))
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
-        self.known = None  # the positions that ``gradient`` is of, and omega^2, 0 if it is not known
+        self.known = None  # the positions that ``gradient`` and the highest frequency are of
         self.anchors = None  # how many hold
         springs = slice(self.lattice.springs_owned)
         crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
@@ -67,9 +67,9 @@ class Verlet:
     def set_up(self) -> None:
         """There is no matrix to make ready."""
 
-    def refuse_unused_options(self, at_end: bool = False) -> None:
+    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
-        refuse_unused(self.comm, set(), at_end)
+        refuse_unused(self.comm, set(), at_end, awaited)
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
@@ -79,7 +79,7 @@ class Verlet:
         start = time - self.time_step
         self._begin(state, start)
         pushed = self._pushed(start, time)
-        squared = pushed + (self.squared or self._elastic_squared())
+        squared = pushed + (self.highest.squared or self._elastic_squared())
         for _ in range(1 + RETRIES):
             count = self._count(squared)
             with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
@@ -92,7 +92,8 @@ class Verlet:
             self._begin(state, start)
         raise StepFailed(
             f"became unstable: elastic energy {energy:.2e} J after substeps of {dt:.2e} s; "
-            "try a smaller time.step, a softer material, or implicit-euler"
+            "try a smaller time.step, a softer material, or implicit-euler",
+            "unstable",
         )
 
     def _begin(self, state: State, start: float) -> None:
@@ -102,7 +103,7 @@ class Verlet:
         if state.q is not self.known:
             self.position.values[:] = state.q
             self._pull(start)
-            self.squared = 0.0
+            self.highest.squared = 0.0
 
     def _take(self, count: int, start: float, time: float) -> None:
         """All substeps of a step."""
@@ -168,7 +169,7 @@ class Verlet:
             self.anchors = anchors
             self.held = self.around.pinned_at(time)[: self.lattice.owned]
             self.free = np.flatnonzero(~self.held)
-            self._any_mode()
+            self.highest.hold(self.held)
 
     def _pushed(self, start: float, time: float) -> float:
         """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
@@ -189,43 +190,11 @@ class Verlet:
             self.substep = np.inf  # said once
         count = self.time_step / min(limit, self.substep)
         if not count < MOST_SUBSTEPS:
-            raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler")
+            raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler", "unstable")
         return max(1, int(np.ceil(count * (1 - 1e-12))))
 
     def _elastic_squared(self) -> float:
-        """omega^2 [1/s^2] of the springs at q by power iterations from the mode found last (collective).
-
-        Without the negative curvature across pressed springs, which is no oscillation and has no bound.
-        """
-        q, x, owned = self.position.values, self.mode.values, self.lattice.owned
-        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
-        for _ in range(MOST_ITERATIONS):
-            before = self.squared
-            product[:] = 0
-            hessian.add_product(x, product)
-            np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
-            x[:owned][self.held] = 0
-            self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
-            if not abs(self.squared - before) > SETTLED * self.squared:
-                break
-        return self.squared
-
-    def _any_mode(self) -> None:
-        """Something of every mode, whatever the number of ranks."""
-        numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
-        self.mode.values[:] = np.sin(1e4 * np.sin(numbers))
-        self.mode.values[: self.lattice.owned][self.held] = 0
-        self._normalise()
-        self.squared = 0.0
-
-    def _normalise(self) -> float:
-        """Make |x|_M = 1; returns what it was (collective)."""
-        x = self.mode.values[: self.lattice.owned]
-        size = np.sqrt(self.comm.allreduce(self.lattice.mass @ np.einsum("ij,ij->i", x, x)))
-        if size > 0:
-            x /= size
-        self.mode.update()
-        return size
+        return self.highest.squared_at(self.position.values)
 
     def _energy(self) -> float:
         """E of the springs [J] (collective)."""
@@ -233,7 +202,7 @@ class Verlet:
 
     def destroy(self) -> None:
         """Collective."""
-        for field in (self.position, self.velocity, self.mode):
+        for field in (self.position, self.velocity, self.highest):
             field.destroy()
 
 

@@ -1,15 +1,14 @@
 """The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
 
 import shlex
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.errors import did_you_mean
-from msmpetsc.scene import Count, ListOf, Positive, Preset, Table
+from msmpetsc.scene import Count, Integrator, ListOf, Positive, Preset, Table
 from msmpetsc.scene_errors import rule
 
-Integrator = Literal["implicit-euler", "verlet"]
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]
 

@@ -227,6 +227,31 @@ class Time(Table):
         return round(self.duration / self.step)
 
 
+class Twist(Table):
+    """Turned ever further along an axis through the middle of the rest bounding box."""
+
+    axis: Direction = Field(description="of any length but zero [-]")
+    degrees: float = Field(
+        lt=1e6, gt=-1e6, description="turn of the far end against the near one, right-handed about the axis [degrees]"
+    )
+
+
+class Start(Table):
+    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order. Nodes that
+    are pinned or led stay where they are."""
+
+    scale: Vector = Field(
+        (1.0, 1.0, 1.0),
+        description="factors along the axes, about the middle of the rest bounding box: 0 collapses, a negative one mirrors [-]",
+    )
+    twist: Twist | None = Field(None, description="a turn that grows along an axis")
+    scatter: float = Field(
+        0.0, ge=0, le=1, description="every node goes so much of the way to a random place in the rest bounding box [-]"
+    )
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s]")
+    spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]")
+
+
 class Gravity(Table):
     """A uniform field."""
 
@@ -300,7 +325,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space at rest; the nodes in it are meant."""
+    """A part of space at rest; the nodes in it are meant, or of a part the cells whose centres it holds."""
 
     one_of = ("box", "sphere", "half_space", "painted")
     box: Box | None = Field(
@@ -311,7 +336,7 @@ class Region(Table):
     painted: Painted | None = Field(
         None,
         description="numbers, from 0, of points of the prepared surface (/surface/points of the result), or a "
-        "text file beside this file that lists them: the corners of the cells they lie in are meant [-]",
+        "text file beside this file that lists them: the cells they lie in are meant, or their corners [-]",
     )
     relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
 
@@ -321,6 +346,33 @@ class Region(Table):
         if relative and info.data.get("painted") is not None:
             raise rule("has no meaning for painted points", "painted")
         return relative
+
+
+class Part(Table):
+    """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
+
+    region: Region = Field(description="the cells whose centres lie in it")
+    density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
+    young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")
+    stiffness: Positive | None = Field(
+        None, description="of springs; one between cells of several parts has the mean of its cells' [N/m]"
+    )
+
+    @model_validator(mode="after")
+    def _says_something(self) -> "Part":
+        if self.density is None and self.young_modulus is None and self.stiffness is None:
+            raise rule("needs density, young_modulus or stiffness")
+        return self
+
+
+def _as_the_material(cls, parts: tuple[Part, ...], info: ValidationInfo) -> tuple[Part, ...]:
+    """Stiffness and Young's modulus are two ways to name all springs: parts must take the material's."""
+    material = info.data.get("material")
+    for number, part in enumerate(parts):
+        for name in Material.one_of:
+            if material is not None and getattr(part, name) is not None and getattr(material, name) is None:
+                raise rule(f"may give {name} only where material does, as part.{number} does", "material")
+    return parts
 
 
 class Pin(Table):
@@ -389,7 +441,9 @@ class SceneFile(Table):
     mesh: Mesh = Field(description="the closed surface")
     cages: Cages = Field(description="the cells that fill it")
     material: Material = Field(description="what it is made of")
+    part: ListOf[Part] = Field((), description="cells of another material")
     time: Time = Field(description="time step and duration")
+    start: Start | None = Field(None, description="how it is at time 0; at rest in its rest shape if absent")
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
     obstacle: ListOf[Obstacle] = Field((), description="what nodes bounce off")
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
@@ -399,6 +453,8 @@ class SceneFile(Table):
     safety: Safety = Field(Safety(), description="what is done about a step that fails")
     output: Output = Field(Output(), description="what is stored")
     picture: Picture = Field(Picture(), description="how the result is drawn")
+
+    _of_one_kind = field_validator("part")(_as_the_material)
 
 
 class Scene(SceneFile):

@@ -15,6 +15,7 @@ from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.model.start import at_rest
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Solver, Time
 from msmpetsc.scene_reading import load_scene
@@ -29,7 +30,7 @@ EXPLICIT = {"integrator": "verlet"}
 
 
 def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
-    model = Model(None, lattice, None, [], [], [], [])
+    model = Model(None, lattice, None, [], [], [], [], at_rest(lattice))
     return Verlet(COMM, model, Surroundings(model), Time(step=T, duration=1.0, substep=substep, **EXPLICIT), Solver())
 
 

@@ -1,6 +1,7 @@
 """From a scene to what is simulated: surface, cages, lattice, embedding, loads, obstacles."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from mpi4py import MPI
@@ -18,9 +19,11 @@ from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.loads import Load, spread_by_mass
 from msmpetsc.model.motion import Path
 from msmpetsc.model.obstacle import Obstacle
+from msmpetsc.model.part import cell_materials
 from msmpetsc.model.penalty import Penalty
 from msmpetsc.model.reflection import Reflection
 from msmpetsc.model.region import Finder
+from msmpetsc.model.start import State, start_of
 from msmpetsc.scene import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
@@ -35,6 +38,7 @@ class Model:
 
     embedding : None where the scene stores no surface
     loads     : gravity first, where there is any
+    start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
     """
 
     surface: Surface | None
@@ -44,6 +48,7 @@ class Model:
     anchors: list[Anchor]
     reflections: list[Reflection]
     penalties: list[Penalty]
+    start: State
 
 
 def build_model(comm: MPI.Comm, scene: Scene) -> Model:
@@ -51,13 +56,15 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
     body = read_body(comm, scene)
     cages = fill_cages(body, scene)
     material = scene.material
-    lattice = build_lattice(
-        cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening
-    )
     finder = Finder(body, cages, scene.folder)
+    of_cells = cell_materials(material, scene.part, finder)
+    lattice = build_lattice(
+        cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening, of_cells
+    )
     lattice = _pin(comm, scene, lattice, finder)
     anchors = _anchors(scene, lattice, finder)
-    _check_that_something_moves(comm, lattice, anchors)
+    held = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
+    _check_that_something_moves(comm, lattice, held, anchors)
     embedding = None
     if scene.output.surface:
         points = np.empty((0, 3)) if body.surface is None else body.surface.points
@@ -70,6 +77,7 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
         anchors,
         _reflections(scene),
         _penalties(comm, scene, lattice, body),
+        start_of(comm, scene.start, lattice, held, body.bounds),
     )
 
 
@@ -124,10 +132,7 @@ def _anchors(scene: Scene, lattice: Lattice, finder: Finder) -> list[Anchor]:
     return anchors
 
 
-def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, anchors: list[Anchor]) -> None:
-    held = lattice.pinned
-    for anchor in anchors:
-        held = held | anchor.where
+def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, held: np.ndarray, anchors: list[Anchor]) -> None:
     if comm.allreduce(int((~held[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")

@@ -4,6 +4,7 @@ Each rank holds the nodes it owns, the ghost nodes that its springs reach, and e
 end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numba
@@ -13,7 +14,7 @@ from mpi4py import MPI
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.model.material import calibrated_stiffness
+from msmpetsc.model.material import CellMaterial, calibrated_stiffness
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
@@ -82,6 +83,7 @@ def build_lattice(
     young_modulus: float | None = None,
     stiffness: float | None = None,
     stiffening: float = 0.0,
+    of_cells: Callable[[np.ndarray], CellMaterial] | None = None,
 ) -> Lattice:
     """Masses and springs of the valid cells (collective).
 
@@ -89,6 +91,7 @@ def build_lattice(
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
     stiffening    : of the springs' law (model.energy) [-]
+    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.part)
     """
     h = cages.grid.cell_size
     corner_keys = morton.encode(cages.ijk[:, None, :] + CORNERS)
@@ -98,17 +101,22 @@ def build_lattice(
     ghosts = table.find(morton.encode(ijk[len(table.keys) :]))
     numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
     springs, owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
+    mass, of_spring = density * h**3 / 8 * octants.sum(axis=1), young_modulus or float(stiffness)
+    if of_cells is not None:
+        made_of = of_cells(ijk[local_cells[:, 0]])
+        mass = h**3 / 8 * _sums_of_nodes(local_cells, made_of.density, len(mass))
+        of_spring = _sums_of_springs(local_cells, made_of.spring, ijk, springs, len(mass)) / sharing
     if stiffness is None:
-        k = calibrated_stiffness(young_modulus, h, kind, sharing)
+        k = calibrated_stiffness(of_spring, h, kind, sharing)
     else:
-        k = np.full(len(springs), float(stiffness))
+        k = np.full(len(springs), of_spring)
     first_owned = local_cells[:, 0] < len(table.keys)
     return Lattice(
         table=table,
         cell_size=h,
         nodes=cages.grid.node_positions(ijk),
         ghosts=ghosts,
-        mass=density * h**3 / 8 * octants.sum(axis=1),
+        mass=mass,
         cells=cells,
         cell_kind=cages.kind,
         springs=springs,
@@ -138,6 +146,33 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarra
     order = np.argsort(keys)
     local = order[np.searchsorted(keys, corner_keys, sorter=order)]
     return morton.decode(keys), local, octants
+
+
+def _sums_of_nodes(cells: np.ndarray, values: np.ndarray, owned: int) -> np.ndarray:
+    """Of the cells (c, 8) around each owned node, the sum of their ``values`` (c,), (owned,)."""
+    return np.bincount(cells.ravel(), np.repeat(values, 8), owned)[:owned]
+
+
+def _sums_of_springs(
+    cells: np.ndarray, values: np.ndarray, ijk: np.ndarray, springs: np.ndarray, owned: int
+) -> np.ndarray:
+    """Of the cells (c, 8) that share each spring (s, 2), the sum of their ``values`` (c,), (s,).
+
+    ijk : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
+    """
+    direction = (ijk[springs[:, 1]] - ijk[springs[:, 0]] + 1) @ np.array([9, 3, 1])
+    return _sums_by_direction(cells, values, owned)[springs[:, 0], direction]
+
+
+@numba.njit(cache=True)
+def _sums_by_direction(cells, values, owned):
+    sums = np.zeros((owned, 27))
+    for i in range(len(cells)):
+        for a in range(8):
+            if cells[i, a] < owned:
+                for b in range(8):
+                    sums[cells[i, a], DIRECTION[a, b]] += values[i]
+    return sums
 
 
 @numba.njit(cache=True)

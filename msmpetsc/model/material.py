@@ -3,6 +3,8 @@
 Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 EDGE, FACE_DIAGONAL, SPACE_DIAGONAL = 1, 2, 3  # squared length in cells
@@ -12,14 +14,25 @@ CELLS_AROUND = np.array([0, 4, 2, 1])  # cells that share a spring of each kind 
 ISOTROPIC = np.array([0, 40, 16, 9]) / 40
 
 
-def calibrated_stiffness(young_modulus: float, cell_size: float, kind: np.ndarray, cells: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True)
+class CellMaterial:
+    """density (c,) [kg/m^3]; spring (c,): Young's modulus [Pa], or stiffness [N/m] where the material gives that."""
+
+    density: np.ndarray
+    spring: np.ndarray
+
+
+def calibrated_stiffness(
+    young_modulus: float | np.ndarray, cell_size: float, kind: np.ndarray, cells: np.ndarray
+) -> np.ndarray:
     """Spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
 
     Assembled cell by cell, so a spring on the body's boundary has the weight of the cells it bounds.
 
-    cell_size : h [m]
-    kind      : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
-    cells     : (s,) number of valid cells that share the spring
+    young_modulus : E; where cells differ, (s,) the mean of those that share a spring
+    cell_size     : h [m]
+    kind          : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
+    cells         : (s,) number of valid cells that share the spring
     """
     edge = 4 / 7 * young_modulus * cell_size
     return edge * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]

@@ -1,9 +1,10 @@
-"""Which nodes a scene means by a region."""
+"""Which nodes or cells a scene means by a region."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
@@ -17,7 +18,7 @@ EDGE = 1e-9  # of the body's longest side: a node this near to a region counts a
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds a region's nodes in a body's lattice. folder: where files of painted points lie."""
+    """Finds a region's nodes in a body's lattice, or its cells. folder: where files of painted points lie."""
 
     body: Body
     cages: Cages
@@ -34,6 +35,18 @@ class Finder:
             where = self._corners_of(self._painted_cells(key, region.painted), lattice)
         if self.body.comm.allreduce(int(where[: lattice.owned].sum())) == 0:
             raise InputError(f"{key}.region holds no node of the lattice")
+        return where
+
+    def find_cells(self, key: str, region: Region, ijk: np.ndarray) -> np.ndarray:
+        """Which cells of grid index (c, 3) have their centres in a region, or hold a painted point, (c,) bool
+        (collective). Raises InputError on all ranks if there are none.
+        """
+        if region.painted is None:
+            where = inside(region, self.cages.grid.node_positions(ijk + 0.5), self.body.bounds)
+        else:
+            where = np.isin(morton.encode(ijk), morton.encode(self._painted_cells(key, region.painted)))
+        if not self.body.comm.allreduce(bool(where.any()), MPI.LOR):
+            raise InputError(f"{key}.region holds the centre of no cell")
         return where
 
     def _painted_cells(self, key: str, painted: str | tuple[int, ...]) -> np.ndarray:

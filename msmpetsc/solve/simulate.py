@@ -57,7 +57,7 @@ class Effort:
 
 
 class Simulation:
-    """Steps a model from rest. Use as a context manager: its PETSc objects are destroyed on leaving."""
+    """Steps a model from its start. Use as a context manager: its PETSc objects are destroyed on leaving."""
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, measured: Measured = Measured()):
         self.comm, self.model, self.time_step = comm, model, scene.time.step
@@ -69,7 +69,8 @@ class Simulation:
         self.rescue = Rescue(comm, model, self.surroundings, scene, self._attempt)
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
-        self.state = State(model.lattice.nodes.copy(), model.lattice.nodes.copy())
+        q, velocity = model.start
+        self.state = State(q.copy(), q - self.time_step * velocity)
 
     @property
     def stored(self) -> int:

@@ -11,7 +11,17 @@ from pathlib import Path
 
 from msmpetsc import __version__
 
-NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference")
+NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "place")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a case stands in a map, and whether its body should be in its rest shape at the end."""
+
+    map: str
+    x: str | float
+    y: str | float
+    recovers: bool = False
 
 
 @dataclass(frozen=True)
@@ -25,6 +35,7 @@ class Case:
     true_error : every so many steps the true step error is measured; None for never
     trace      : the step that is followed; None for none
     reference  : the run its motion is measured against
+    place      : in a map; None for the case of a sweep
     """
 
     scene: str
@@ -46,12 +57,14 @@ class Case:
     label: str = ""
     timeout: float = 300.0  # [s]
     reference: "Case | None" = None
+    place: Place | None = None
 
     @property
     def id(self) -> str:
         """The same for the same run, whatever it is called, however long it may take."""
         what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
+        what |= {"place": asdict(self.place)} if self.place else {}
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
 
     @property

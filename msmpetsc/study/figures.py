@@ -8,6 +8,7 @@ from statistics import median
 import numpy as np
 
 from msmpetsc.output.frames import finished, open_result
+from msmpetsc.study.shape import shape_error
 from msmpetsc.study.table import Row
 
 COUNTS = ("cells", "nodes", "unknowns", "springs")
@@ -17,9 +18,18 @@ PARTS = ("setup", "factor", "local", "ksp", "output")
 def measured(path: Path) -> Row:
     """Figures of the measure file that ``msmpetsc run --measure`` leaves."""
     told = json.loads(path.read_text())
-    row = {name: told.get(name) for name in COUNTS} | {"memory": told.get("memory")}
+    row = {name: told.get(name) for name in (*COUNTS, "memory", "explicit_limit")}
     row |= {f"time_{part}": told.get("time", {}).get(part) for part in PARTS}
     return row | {"machine": _machine(told.get("machine", {})), "versions": _versions(told.get("versions", {}))}
+
+
+def failure(path: Path) -> str:
+    """What kind of failure the measure file tells of; "" for none, or where there is no such file."""
+    try:
+        told = json.loads(path.read_text()).get("failure")
+    except (OSError, ValueError):
+        return ""
+    return told["kind"] if told else ""
 
 
 def trace(path: Path) -> dict | None:
@@ -31,8 +41,9 @@ def of_frames(result: Path, time_step: float) -> Row:
     with open_result(result) as file:
         count, frames = finished(file), file["frames"]
         series = {name: frames[name][:count] for name in frames if frames[name].ndim == 1}
+        shape = {"shape_error": shape_error(file, count - 1)} if count else {}
     if count < 2:
-        return {"frames": count, "steps": 0}
+        return {"frames": count, "steps": 0} | shape
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
     kept = slice(2 if count > 2 else 1, None)  # what is only done once shows in the first
     mean = {
@@ -41,7 +52,24 @@ def of_frames(result: Path, time_step: float) -> Row:
     }
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
     row |= {"iterations": float(mean["iterations"]), "ksp_its": float(mean["ksp_its"])}
-    return row | _errors(series)
+    row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
+    return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
+
+
+def _soundness(series: dict[str, np.ndarray]) -> Row:
+    """What went wrong on the way, as far as the file tells; cells inverted count in the last frame alone."""
+    row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
+    if "energy_gained" in series:
+        row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
+    if "inverted" in series:
+        row["inverted"] = float(series["inverted"][-1])
+    return row
+
+
+def _energy_left(series: dict[str, np.ndarray]) -> float | None:
+    """Of a body on which no load acts: energy at the end over that at the start; None for others."""
+    energy = series["kinetic"] + series["elastic"] + series["contact"]
+    return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 
 def _errors(series: dict[str, np.ndarray]) -> Row:

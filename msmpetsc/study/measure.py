@@ -7,7 +7,8 @@ from threading import Lock
 
 from msmpetsc.errors import InputError
 from msmpetsc.study.case import Case, command, shown_command
-from msmpetsc.study.figures import Row, measured, of_frames, rates, together, trace
+from msmpetsc.study.figures import Row, failure, measured, of_frames, rates, together, trace
+from msmpetsc.study.outcome import outcome
 from msmpetsc.study.process import Ended, Processes
 from msmpetsc.study.trajectory import trajectory_error
 
@@ -35,7 +36,7 @@ class Bench:
         """Run a case as often as it says; what goes wrong stands in its row."""
         runs, path, seconds = [], self.folder / "runs" / f"{case.id}.h5", 0.0
         reference, why = self._reference(case)
-        found = None
+        found, kind = None, ""
         for repeat in range(case.repeats):
             ended = self._run(case if repeat == 0 else case.unmeasured(), path)
             seconds += ended.seconds
@@ -44,6 +45,7 @@ class Bench:
                 found = trace(path.with_suffix(".json"))
                 if reference is not None and not ended.reason:
                     row["trajectory_error"], why = _distance(path, reference)
+            kind = failure(path.with_suffix(".json"))
             _forget(path, log=not ended.reason)
             runs.append(row)
             if ended.reason:
@@ -51,6 +53,8 @@ class Bench:
             why = why or problem
         status = "ok" if not ended.reason else "timeout" if ended.status is None else "failed"
         row = self._named(case) | together(runs) | {"status": status, "reason": ended.reason or why}
+        if case.place:
+            row["outcome"] = outcome(ended.status, kind, row, case.place.recovers)
         return Measured(row | rates(row, case.time_step), found, seconds)
 
     def references(self) -> list[Path]:
@@ -105,6 +109,8 @@ def naming(case: Case) -> Row:
     """The columns that define a case."""
     same = ("scene", "integrator", "preset", "options", "label", "ranks", "repeats", "time_step", "substep", "error")
     row = {name: getattr(case, name) for name in (*same, "max_iterations")}
+    if case.place:
+        row |= {"map": case.place.map, "x": str(case.place.x), "y": str(case.place.y)}
     return row | {"case": case.id, "cells": case.cells}
 
 

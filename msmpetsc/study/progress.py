@@ -32,7 +32,7 @@ class StudyProgress:
         if self._bar is None:
             self._tell(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
             return
-        if row["status"] != "ok":
+        if row["status"] != "ok" and not row.get("map"):
             self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
         self._bar.set_postfix_str(f"{left} left, {described(row)}", refresh=False)
         self._bar.update()
@@ -47,6 +47,9 @@ class StudyProgress:
 
 def described(row: Row) -> str:
     """A case in a few words."""
+    if row.get("map"):
+        x = "" if row["x"] == row["label"] else f"{row['x']}, "
+        return f"{row['map']} {row['label']} at {x}{row['y']}"
     goal = (
         f"error {row['error']:g}"
         if row["error"]
@@ -60,6 +63,8 @@ def described(row: Row) -> str:
 
 
 def _outcome(row: Row) -> str:
+    if row.get("map"):
+        return row["outcome"]
     if row["status"] != "ok":
         return f"{row['status']}: {row['reason']}"
     errors = {"step": row.get("true_error"), "trajectory": row.get("trajectory_error")}

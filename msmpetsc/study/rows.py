@@ -59,6 +59,16 @@ def failed(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row["status"] != "ok"]
 
 
+def swept(rows: Iterable[Row]) -> list[Row]:
+    """Rows of sweeps: those of a map stand apart, for there it is no failure of the study that a run fails."""
+    return [row for row in rows if not row.get("map")]
+
+
+def mapped(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows by their map."""
+    return grouped((row for row in rows if row.get("map")), lambda row: row["map"])
+
+
 def measured(rows: Iterable[Row], *columns: str) -> list[Row]:
     """Rows with a positive number in each of these columns: what a logarithmic axis can show."""
     return [row for row in rows if all(isinstance(row[name], float) and row[name] > 0 for name in columns)]

@@ -1,7 +1,7 @@
 """The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
 
 import shlex
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -25,6 +25,20 @@ def _words(options: str) -> str:
     except ValueError as error:
         raise rule(f"cannot be taken apart: {str(error).lower()}") from None
     return options
+
+
+def _differ(names: list[str], what: str) -> None:
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise rule(f"must not have two {what} of the name {twice!r}")
+
+
+def _known(wanted: list[str], what: str, info: ValidationInfo) -> None:
+    """``wanted`` are names of scenes, or labels of methods, of this study."""
+    names = [getattr(one, "name", None) or one.label for one in info.data.get(what, ())]
+    unknown = next((name for name in wanted if what in info.data and name not in names), None)
+    if unknown is not None:
+        raise rule(f"names a {what} {unknown!r} that is not there{did_you_mean(unknown, names)}")
 
 
 Options = Annotated[str, AfterValidator(_words)]
@@ -98,31 +112,132 @@ class Sweep(Table):
         return _not_empty(values)
 
 
+class Method(Table):
+    """How the scenes of maps are stepped and solved."""
+
+    label: str = Field(min_length=1, description="what maps call it")
+    integrator: Integrator = Field("implicit-euler", description="how it is stepped")
+    preset: Preset = Field("newton", description="solver preset; of no use to verlet")
+    error: Error | None = Field(None, description="relative error of a step aimed at; the preset's if absent [-]")
+    max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
+    options: Options = Field("", description="PETSc options")
+
+
+class Axis(Table):
+    """What changes along a side of a map: a key of the scene, or several changes that name their {value}."""
+
+    one_of = ("key", "template")
+    name: str = Field(min_length=1, description="what it is, for the reader")
+    key: str | None = Field(None, min_length=1, description='what is set: "material.young_modulus"')
+    template: ListOf[Override] = Field((), description='or changes: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"')
+    values: ListOf[float] = Field(min_length=1, description="in the order of the axis")
+    unit: str = Field("", description='for the reader; "%" shows 0.2 as 20% and s as 10 ms')
+
+    def changes(self, value: float) -> tuple[str, ...]:
+        """Overrides of the scene at this value."""
+        templates = (f"{self.key}={{value}}",) if self.key else self.template
+        return tuple(text.replace("{value}", repr(value)) for text in templates)
+
+
+class Length(Table):
+    """How long a run is."""
+
+    steps: Count | None = Field(None, description="time steps of a run [-]")
+    duration: Positive | None = Field(None, description="or: simulated time [s]; the scene's own if absent")
+
+    @field_validator("duration")
+    @classmethod
+    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
+        if duration is not None and info.data.get("steps") is not None:
+            raise rule("must not stand beside steps", "steps")
+        return duration
+
+
+class MapCase(Length):
+    """A named case: a line of a map whose columns are the methods."""
+
+    name: str = Field(min_length=1, description="what the map calls it")
+    file: str = Field(min_length=1, description="scene file, beside the study file")
+    set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
+    recovers: bool = Field(False, description="the body should be in its rest shape at the end")
+    options: Options = Field("", description="PETSc options for all methods that solve")
+
+
+class Map(Length):
+    """What happens to a scene over two axes, a panel a method; or to named cases, a column a method."""
+
+    one_of: ClassVar[tuple[str, ...]] = ("file", "case")
+    name: str = Field(min_length=1, description="of its files and of its rows")
+    title: str = Field("", description="for the reader; the name if absent")
+    file: str | None = Field(None, min_length=1, description="scene file, beside the study file")
+    set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
+    methods: ListOf[str] = Field((), description="labels of the methods; all if absent")
+    x: Axis | None = Field(None, description="what changes from left to right")
+    y: Axis | None = Field(None, description="what changes from bottom to top")
+    case: ListOf[MapCase] = Field((), description="or: named cases")
+    full: bool = Field(False, description="only with --full")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Map":
+        if self.file and not (self.x and self.y):
+            raise rule("needs x and y beside file")
+        if self.case and (self.x or self.y):
+            raise rule("has cases: x and y are of no use")
+        _differ([case.name for case in self.case], "cases")
+        return self
+
+
+class Order(Table):
+    """A scene whose sweep over time steps is drawn as the order of the integrators."""
+
+    scene: str = Field(min_length=1, description="name of the scene; it needs a reference")
+    frequency: Positive | None = Field(None, description="of its slowest vibration, for implicit Euler's loss [Hz]")
+
+
 class Study(Table):
     """A study file."""
 
     title: str = Field("", description="for the reader")
     repeats: Count = Field(1, description="runs of each case, of which medians are taken [-]")
     timeout: Positive = Field(300.0, description="a run that takes longer is ended, and its case has no figures [s]")
-    scene: ListOf[StudyScene] = Field(description="what is run")
-    sweep: ListOf[Sweep] = Field(description="how it is run")
+    jobs: Count = Field(1, description="cases at a time, unless --jobs says otherwise [-]")
+    scene: ListOf[StudyScene] = Field((), description="what is run")
+    sweep: ListOf[Sweep] = Field((), description="how it is run")
+    method: ListOf[Method] = Field((), description="the methods of maps")
+    map: ListOf[Map] = Field((), validate_default=True, description="what happens where")
+    order: ListOf[Order] = Field((), description="scenes that show the order of the integrators")
 
     @field_validator("scene")
     @classmethod
-    def _names_differ(cls, scenes: tuple[StudyScene, ...]) -> tuple[StudyScene, ...]:
-        names = [scene.name for scene in _not_empty(scenes)]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise rule(f"must not have two scenes of the name {twice!r}")
+    def _scenes_differ(cls, scenes: tuple[StudyScene, ...]) -> tuple[StudyScene, ...]:
+        _differ([scene.name for scene in scenes], "scenes")
         return scenes
 
     @field_validator("sweep")
     @classmethod
     def _scenes_are_there(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
-        names = [scene.name for scene in info.data.get("scene", ())]
-        unknown = next(
-            (name for sweep in _not_empty(sweeps) for name in sweep.scenes if names and name not in names), None
-        )
-        if unknown is not None:
-            raise rule(f"names a scene {unknown!r} that is not there{did_you_mean(unknown, names)}")
+        _known([name for sweep in sweeps for name in sweep.scenes], "scene", info)
         return sweeps
+
+    @field_validator("method")
+    @classmethod
+    def _methods_differ(cls, methods: tuple[Method, ...]) -> tuple[Method, ...]:
+        _differ([method.label for method in methods], "methods")
+        return methods
+
+    @field_validator("map")
+    @classmethod
+    def _has_what_it_needs(cls, maps: tuple[Map, ...], info: ValidationInfo) -> tuple[Map, ...]:
+        if not maps and not all(info.data.get(name, True) for name in ("scene", "sweep")):
+            raise rule("required, or else scene and sweep")
+        _differ([one.name for one in maps], "maps")
+        _known([name for one in maps for name in one.methods], "method", info)
+        if maps and not info.data.get("method", True):
+            raise rule("needs methods: [[method]]", "method")
+        return maps
+
+    @field_validator("order")
+    @classmethod
+    def _orders_are_there(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
+        _known([order.scene for order in orders], "scene", info)
+        return orders

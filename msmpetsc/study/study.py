@@ -45,9 +45,9 @@ class Findings:
 
 
 def run_study(
-    path: Path, folder: Path, presets: Collection[str], full: bool = False, jobs: int = 1, restart: bool = False
-) -> int:
-    """Run what is not done yet of a study file; the number of its cases that have no figures.
+    path: Path, folder: Path, presets: Collection[str], full: bool = False, jobs: int | None = None, restart: bool = False
+) -> list[Row]:
+    """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
 
     The folder gets table.csv, table.h5, traces.json, study.toml, references/. Cases that are done and still in the
     file are kept; ``restart`` forgets them. Raises InputError before anything is run.
@@ -62,8 +62,8 @@ def run_study(
     (folder / "study.toml").write_bytes(path.read_bytes())
     findings.write()
     todo = [every[case] for case in wanted if not _is_done(every[case], findings.rows)]
-    _carry_out(Bench(folder, Processes(), path.stem), todo, findings, jobs, len(wanted) - len(todo))
-    return sum(findings.rows[case]["status"] != "ok" for case in wanted)
+    _carry_out(Bench(folder, Processes(), path.stem), todo, findings, jobs or study.jobs, len(wanted) - len(todo))
+    return [findings.rows[case] for case in wanted]
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], findings: Findings, jobs: int, done: int) -> None:

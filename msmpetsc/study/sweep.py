@@ -1,18 +1,17 @@
-"""The cases of a study: each sweep's lists multiplied with each other, for each of its scenes."""
+"""The cases of a study: each sweep's lists multiplied with each other, for each of its scenes; then those of maps."""
 
-import json
 import math
-import tomllib
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene import Scene
 from msmpetsc.scene_reading import load_scene
-from msmpetsc.study.case import Case, digest
+from msmpetsc.study.case import Case
+from msmpetsc.study.maps import map_cases
+from msmpetsc.study.overrides import content, inline, solver_changes, time_changes
 from msmpetsc.study.schema import Reference, Study, StudyScene, Sweep
 
 
@@ -27,6 +26,9 @@ def cases(study: Study, folder: Path, full: bool, presets: Collection[str] | Non
             wanted = (not sweep.scenes or scene.name in sweep.scenes) and (full or not (sweep.full or scene.full))
             for case in _cases(study, scene, sweep, folder, presets) if wanted else ():
                 found.setdefault(case.id, case)
+    for one in study.map:
+        for case in map_cases(study, one, folder, presets) if full or not one.full else ():
+            found.setdefault(case.id, case)
     return list(found.values())
 
 
@@ -36,11 +38,10 @@ def _cases(
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
     as_given = load_scene(file, changes, presets)
-    content = digest(file, list(_texts(tomllib.loads(as_given.text))))
     for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
         sized = (*changes, *((f"cages.count={cells}",) if cells else ()))
         base = Case(
-            scene.name, file, content, sized, integrator, "", "", cells, as_given.time.step, None, None, None,
+            scene.name, file, content(file, as_given), sized, integrator, "", "", cells, as_given.time.step, None, None, None,
             repeats=study.repeats, timeout=study.timeout,
         )  # fmt: skip
         reference = _reference(base, scene, scene.reference, as_given) if scene.reference else None
@@ -64,12 +65,14 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
     ):
         case = replace(
             base, preset=preset, options=options, time_step=step, error=goal[0], max_iterations=goal[1], ranks=n,
-            label=_label(sweep, preset, options, n), true_error=scene.true_error,
+            label=_label(sweep, _called(base.integrator, preset), options, n), true_error=scene.true_error,
             trace=scene.trace if sweep.trace else None,
         )  # fmt: skip
-        solver = as_given.solver.model_dump(exclude_unset=True)
-        solver |= {"preset": preset, "error": case.error, "max_iterations": case.max_iterations}
-        yield _timed(replace(case, set=(*case.set, f"solver={inline(solver)}")), scene, sweep, as_given)
+        yield _timed(replace(case, set=(*case.set, *solver_changes(case, as_given))), scene, sweep, as_given)
+
+
+def _called(integrator: str, preset: str) -> str:
+    return preset if integrator == "implicit-euler" else f"{integrator} {preset}"
 
 
 def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
@@ -90,15 +93,6 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
     if case.reference is not None:
         every = max(1, round((scene.frame or as_given.time.step) / case.time_step))
     return replace(case, set=(*case.set, *time_changes(case, duration, every, as_given)))
-
-
-def time_changes(case: Case, duration: float, every: int, scene: Scene) -> tuple[str, ...]:
-    """Overrides of the time and output tables."""
-    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
-    verlet = case.integrator == "verlet"
-    time |= {"integrator": "verlet" if verlet else None, "substep": case.substep}
-    output = ("output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
-    return f"time={inline(time)}", *output
 
 
 def _reference(base: Case, scene: StudyScene, reference: Reference, as_given: Scene) -> Case:
@@ -123,17 +117,3 @@ def reference_case(base: Case, reference: Reference, frame: float, duration: flo
         case = replace(case, preset=reference.preset, error=reference.error)
         solver = (f"solver={inline({'preset': reference.preset, 'error': reference.error})}",)
     return replace(case, set=(*case.set, *solver, *time_changes(case, duration, every, scene)))
-
-
-def inline(table: dict[str, Any]) -> str:
-    """A TOML inline table of plain values; None is left out."""
-    return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
-
-
-def _texts(data: Any) -> Iterator[str]:
-    """All strings in a TOML value."""
-    if isinstance(data, str):
-        yield data
-    elif isinstance(data, dict | list):
-        for item in data.values() if isinstance(data, dict) else data:
-            yield from _texts(item)

@@ -28,7 +28,10 @@ COLUMNS = {
     "study": Column(str, "", "name of the study"),
     "case": Column(str, "", "what defines the case, as a number"),
     "scene": Column(str, "", "the scene's name in the study"),
-    "integrator": Column(str, "", "implicit-euler or verlet"),
+    "map": Column(str, "", "the map that it is a place of"),
+    "x": Column(str, "", "place on the map's horizontal axis"),
+    "y": Column(str, "", "place on the map's vertical axis, or the name of its case"),
+    "integrator": Column(str, "", "implicit-euler, bdf2 or verlet"),
     "preset": Column(str, "", "solver preset"),
     "options": Column(str, "", "PETSc options"),
     "label": Column(str, "", "what its curve is called"),
@@ -40,6 +43,7 @@ COLUMNS = {
     "max_iterations": Column(float, "1", "outer iterations allowed in a step"),
     "status": Column(str, "", "ok, failed or timeout"),
     "reason": Column(str, "", "why it has no figures"),
+    "outcome": Column(str, "", "of a place of a map: how it went, in a word"),
     "cells": Column(float, "1", "valid cells"),
     "nodes": Column(float, "1", "nodes"),
     "unknowns": Column(float, "1", "nodes that are not held"),
@@ -55,7 +59,15 @@ COLUMNS = {
     "time_ksp": Column(float, "s", "whole run: linear solves"),
     "time_output": Column(float, "s", "whole run: files"),
     "iterations": Column(float, "1", "outer iterations, mean of a step"),
+    "most_iterations": Column(float, "1", "outer iterations, the most of a step"),
     "ksp_its": Column(float, "1", "KSP iterations, mean of a step"),
+    "substeps": Column(float, "1", "shorter steps taken in place of whole ones"),
+    "fallbacks": Column(float, "1", "steps solved by the robust method"),
+    "inverted": Column(float, "1", "cells turned inside out in the last frame"),
+    "energy_gained": Column(float, "J", "energy that came from nowhere"),
+    "energy_left": Column(float, "1", "total energy at the end over that at the start, where no load acts"),
+    "shape_error": Column(float, "1", "distance of the last frame from the rest shape, moved as a rigid body"),
+    "explicit_limit": Column(float, "s", "longest stable explicit step of the lattice at rest"),
     "memory": Column(float, "byte", "peak of resident memory, sum of the ranks"),
     "estimated_error": Column(float, "1", "step error as estimated, rms"),
     "true_error": Column(float, "1", "step error, rms of the steps measured"),
@@ -84,7 +96,7 @@ def read_table(folder: Path) -> list[Row]:
         return []
     try:
         with open(path, newline="", encoding="utf-8") as file:
-            return [{name: _value(name, row[name]) for name in COLUMNS} for row in csv.DictReader(file)]
+            return [{name: _value(name, row.get(name) or "") for name in COLUMNS} for row in csv.DictReader(file)]
     except (KeyError, ValueError, TypeError, csv.Error):
         raise InputError(f"{path} is not the table of a study of this version: --restart begins anew") from None
 

@@ -1,0 +1,47 @@
+"""What a case changes in its scene file, as --set takes it, and what the file and its changes amount to."""
+
+import json
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from msmpetsc.scene import Scene
+from msmpetsc.study.case import Case, digest
+
+
+def content(file: Path, scene: Scene) -> str:
+    """Digest of a scene file and of the files that it names."""
+    return digest(file, list(_texts(tomllib.loads(scene.text))))
+
+
+def time_changes(case: Case, duration: float, every: int, scene: Scene) -> tuple[str, ...]:
+    """Overrides of the time and output tables."""
+    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
+    named = None if case.integrator == "implicit-euler" else case.integrator
+    time |= {"integrator": named, "substep": case.substep}
+    output = ("output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
+    return f"time={inline(time)}", *output
+
+
+def solver_changes(case: Case, scene: Scene) -> tuple[str, ...]:
+    """Overrides of the solver table; none for verlet."""
+    if case.integrator == "verlet":
+        return ()
+    solver = scene.solver.model_dump(exclude_unset=True)
+    solver |= {"preset": case.preset, "error": case.error, "max_iterations": case.max_iterations}
+    return (f"solver={inline(solver)}",)
+
+
+def inline(table: dict[str, Any]) -> str:
+    """A TOML inline table of plain values; None is left out."""
+    return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
+
+
+def _texts(data: Any) -> Iterator[str]:
+    """All strings in a TOML value."""
+    if isinstance(data, str):
+        yield data
+    elif isinstance(data, dict | list):
+        for item in data.values() if isinstance(data, dict) else data:
+            yield from _texts(item)

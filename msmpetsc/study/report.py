@@ -18,12 +18,15 @@ from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.figure6 import figure6_charts
 from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import RC, looks
+from msmpetsc.study.charts.order import order_charts
 from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, pareto_charts
+from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
-from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, read_rows, read_traces, stepping
+from msmpetsc.study.outcome import counted
+from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept
 
 PRINTED = {
-    "label", "scene", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_second",
+    "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_second",
     "ksp_its", "memory", "true_error", "trajectory_error",
 }  # fmt: skip
 NOT_PRINTED = {*TEXT, *NUMBERS} - PRINTED
@@ -37,7 +40,7 @@ def write_report(folder: Path) -> Path:
     Returns the path of report.html. Raises InputError where there is no table.
     """
     rows, traces = read_rows(folder), read_traces(folder)
-    charts = draw_charts(rows, traces)
+    charts = draw_charts(rows, traces, study_file(folder))
     for chart in charts:
         save_png(chart, folder)
     path = folder / "report.html"
@@ -45,19 +48,26 @@ def write_report(folder: Path) -> Path:
     return path
 
 
-def draw_charts(rows: list[Row], traces: list[dict]) -> list[Chart]:
-    """All charts that there are numbers for; a method looks the same in each."""
+def draw_charts(rows: list[Row], traces: list[dict], study: dict) -> list[Chart]:
+    """All charts that there are numbers for; a method looks the same in each. study: the tables of the study file."""
     named = looks([row["label"] for row in rows] + [entry["label"] for entry in traces])
     with style.context(["default", RC]):
-        charts = pareto_charts(rows, named) + figure6_charts(rows, named) + growth_charts(rows, named)
+        charts = stability_charts(rows, study)
+        rows = swept(rows)
+        charts += pareto_charts(rows, named) + figure6_charts(rows, named) + growth_charts(rows, named)
+        charts += order_charts(rows, named, study)
         return charts + convergence_charts(traces, named, {row["case"]: row["command"] for row in rows if row["case"]})
+
+
+def study_file(folder: Path) -> dict:
+    """The tables of study.toml; none where there is no such file."""
+    file = folder / "study.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
 def title(folder: Path, rows: list[Row]) -> str:
     """The title in study.toml, else the name in the table, else that of the folder."""
-    file = folder / "study.toml"
-    given = tomllib.loads(file.read_text(encoding="utf-8")).get("title") if file.is_file() else None
-    return str(given or next((row["study"] for row in rows if row["study"]), "") or folder.resolve().name)
+    return str(study_file(folder).get("title") or next((row["study"] for row in rows if row["study"]), "") or folder.resolve().name)
 
 
 def measured_on(folder: Path) -> str:
@@ -77,9 +87,11 @@ def page(title: str, date: str, rows: list[Row], charts: list[Chart]) -> str:
 
 def facts(date: str, rows: list[Row]) -> str:
     """Date, machine, versions and how many cases there are."""
-    lost = len(failed(rows))
-    count = f"{len(rows)}, " + (f"{lost} of them <a href='#failed'>failed</a>" if lost else "none failed")
-    entries = [("Date", escape(date)), ("Cases", count)]
+    plain = swept(rows)
+    lost = len(failed(plain))
+    count = f"{len(plain)}, " + (f"{lost} of them <a href='#failed'>failed</a>" if lost else "none failed")
+    entries = [("Date", escape(date))] + ([("Cases", count)] if plain or not rows else [])
+    entries += [(f"Map {escape(name)}", f"{len(group)}: {counted(group)}") for name, group in mapped(rows).items()]
     for name in ("machine", "versions"):
         texts = dict.fromkeys(readable(str(row[name])) for row in rows if row[name])
         entries += [(name.capitalize(), "<br>".join(map(escape, texts)))] if texts else []
@@ -202,8 +214,8 @@ def point_line(point: Point, names: list[str], with_command: bool) -> list[tuple
 
 
 def failures(rows: list[Row]) -> str:
-    """All failed cases with their commands."""
-    lost = failed(rows)
+    """All failed cases with their commands; those of maps are answers, and stand there."""
+    lost = failed(swept(rows))
     if not lost:
         return ""
     lines = [[row["scene"], name_of(row), row["status"], reason_of(row), row["command"]] for row in lost]

@@ -3,7 +3,7 @@
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
 What it does is ruled by the options: -fail ends it with an error, -hang never ends it, -children starts another
-process before that. Its wall time counts up with the runs of the folder, its motion is off by the time step.
+process before that, -exit N ends it with that status, -kind K tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion is off by the time step.
 """
 
 import json
@@ -44,7 +44,11 @@ def main() -> None:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
     write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
     if comm.rank == 0:
-        measure.write_text(json.dumps(told(comm.size, count, "--trace" in words)))
+        kind = words[words.index("-kind") + 1] if "-kind" in words else None
+        failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
+        measure.write_text(json.dumps(told(comm.size, count, "--trace" in words) | failure))
+    if "-exit" in words:
+        sys.exit(int(words[words.index("-exit") + 1]))
 
 
 def write(comm, out: Path, table: dict, every: int, count: int) -> None:

@@ -27,5 +27,6 @@ def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> flo
     size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a flat body several rotations are the best: any will do
-        _, distance = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
-    return float(distance * size / side)
+        rotation, _ = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
+    squared = ((x - rotation.apply(rest)) ** 2).sum(axis=1) / size**2  # scipy's own figure ends at 1e-8
+    return float(np.sqrt(mass @ squared / mass.sum()) * size / side)

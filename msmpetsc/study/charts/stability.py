@@ -35,7 +35,7 @@ MARKS = {
     "not recovered": "S", "inverted": "I",
 }  # fmt: skip
 DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}  # their marks are white
-WIDE, COLUMNS = 2.0, 5  # [in] of a panel; panels side by side
+COLUMNS = 6  # panels side by side
 CELL = 0.33  # [in]: height
 FONT = 8  # [points] of marks and ticks
 

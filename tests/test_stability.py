@@ -304,8 +304,8 @@ def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
 
 def test_the_findings_say_where(folder: Path):
     text = re.sub("<[^>]*>", "", (folder / "report.html").read_text()).replace("\N{NO-BREAK SPACE}", " ")
-    assert "newton: all 6 done, 2 of them slowly." in text
-    assert "verlet: 4 of 6 done, diverged in 2 (time step 1 s; modulus 1 kPa to 100 kPa)." in text
+    assert "newton: all 6 ok, 2 of them slowly." in text
+    assert "verlet: 4 of 6 ok, diverged in 2 (time step 1 s; modulus 1 kPa to 100 kPa)." in text
 
 
 def test_a_map_without_its_study_file_is_drawn(tmp_path: Path):

@@ -9,13 +9,13 @@ OUTCOMES = (
     "crashed", "timeout", "refused", "not finite", "energy", "diverged", "not recovered", "inverted", "slow", "ok",
 )  # fmt: skip
 MEANING = {
-    "crashed": "the program ended as it should never",
+    "crashed": "the program itself broke",
     "timeout": "took too long",
     "refused": "the program would not begin",
     "not finite": "a number overflowed",
     "energy": "the energy grew without work",
-    "diverged": "a step was not solved, or explicit steps ran away",
-    "not recovered": "the end is more than 2% off the rest shape",
+    "diverged": "a step not solved, or explicit steps ran away",
+    "not recovered": "more than 2% off the rest shape at the end",
     "inverted": "cells are inside out at the end",
     "slow": "more than 30 iterations a step",
     "ok": "none of these",

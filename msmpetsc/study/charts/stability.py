@@ -24,7 +24,7 @@ CAPTION = (
     "How each run went, the worst that befell it. A number is the mean of the iterations a step, where every step was "
     "solved; of verlet, its substeps. Point at a cell for its numbers and the command that repeats it."
 )
-LIMIT = "longest stable explicit step, 2 / ω of the lattice at rest"
+LIMIT = "longest stable explicit step, 2 / ω"
 # from the worst to the best: told apart by lightness as well as by hue, and each cell has its mark
 COLORS = {
     "crashed": "#000000", "timeout": "#7a4a1e", "refused": "#9a9a9a", "not finite": "#332288", "energy": "#882255",
@@ -104,7 +104,8 @@ def stability_chart(name: str, rows: list[Row], told: dict) -> Chart:
     has_limit = not of_cases and any(line.get_label() == LIMIT for axes in all_axes for line in axes.lines)
     legend(figure, rows, has_limit)
     heading = "By case" if of_cases else "By method"
-    chart.findings[heading] = by_case(rows, y) if of_cases else [finding(label, group, x, y) for label, group in by_label.items()]
+    of_methods = [finding(label, group, x, y) for label, group in by_label.items()]
+    chart.findings[heading] = by_case(rows, y) if of_cases else of_methods
     return chart
 
 
@@ -133,7 +134,8 @@ def draw(chart: Chart, axes: Axes, rows: list[Row], x: Scale, y: Scale) -> None:
     shown = [(i, j, row) for (i, j), row in here.items() if known(row)]
     for i, j, row in shown:
         color = "white" if row["outcome"] in DARK else INK
-        axes.text(x.places.index(i) + 0.5, y.places.index(j) + 0.5, mark(row), color=color, fontsize=FONT, ha="center", va="center")
+        at = x.places.index(i) + 0.5, y.places.index(j) + 0.5
+        axes.text(*at, mark(row), color=color, fontsize=FONT, ha="center", va="center", zorder=5)
     look = Look(INK, "s")
     at = [x.places.index(i) + 0.5 for i, _, _ in shown], [y.places.index(j) + 0.5 for _, j, _ in shown]
     chart.mark(axes, *at, [point(row, x, y) for _, _, row in shown], look, markersize=CELL * 72 * 0.9, alpha=0)
@@ -186,8 +188,8 @@ def draw_limit(axes: Axes, rows: list[Row], x: Scale, y: Scale) -> None:
     if all(map(math.isnan, along)):
         return
     points = (along, across) if steps is x else (across, along)
-    axes.plot(*points, color="white", linewidth=4, solid_capstyle="butt", zorder=3)
-    axes.plot(*points, color=INK, linewidth=2, solid_capstyle="butt", zorder=3, label=LIMIT)
+    axes.plot(*points, color="white", linewidth=3.4, solid_capstyle="butt", zorder=3)
+    axes.plot(*points, color=INK, linewidth=1.6, solid_capstyle="butt", zorder=3, label=LIMIT)
 
 
 def decorate(axes: Axes, x: Scale, y: Scale, of_cases: bool, left: bool, low: bool) -> None:
@@ -196,8 +198,8 @@ def decorate(axes: Axes, x: Scale, y: Scale, of_cases: bool, left: bool, low: bo
     axes.tick_params(length=0, labelsize=10 if of_cases else FONT, labelleft=left, labelbottom=low)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    tilted = {} if of_cases else {"rotation": 90}
-    axes.set_xticks([index + 0.5 for index in range(len(x.places))], x.texts, **tilted)
+    texts = [text.replace("-", "-\n") for text in x.texts] if of_cases else x.texts
+    axes.set_xticks([index + 0.5 for index in range(len(x.places))], texts, rotation=0 if of_cases else 90)
     axes.set_yticks([index + 0.5 for index in range(len(y.places))], y.texts)
     if of_cases:
         axes.invert_yaxis()
@@ -210,16 +212,18 @@ def decorate(axes: Axes, x: Scale, y: Scale, of_cases: bool, left: bool, low: bo
 def legend(figure: Figure, rows: list[Row], limit: bool) -> None:
     """The outcomes that there are, best first."""
     names = [name for name in reversed(OUTCOMES) if any(row["outcome"] == name for row in rows)]
-    handles = [Patch(facecolor=COLORS[name], label=f"{MARKS.get(name, '12')}  {name}: {MEANING[name]}") for name in names]
+    handles = [
+        Patch(facecolor=COLORS[name], label=f"{MARKS.get(name, '12')}  {name}: {MEANING[name]}") for name in names
+    ]
     handles += [Line2D([], [], color=INK, linewidth=2, label=LIMIT)] if limit else []
-    figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=9, handlelength=1.4)
+    figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8.5, handlelength=1.4, columnspacing=1.4)
 
 
 def finding(label: str, rows: list[Row], x: Scale, y: Scale) -> str:
     """How a method did, and where it failed, in plain words."""
     counts = Counter(row["outcome"] for row in rows)
     good = counts["ok"] + counts["slow"]
-    parts = [f"all {len(rows)} done" if good == len(rows) else f"{good} of {len(rows)} done"]
+    parts = [f"all {len(rows)} ok" if good == len(rows) else f"{good} of {len(rows)} ok"]
     if counts["slow"]:
         parts[0] += f", {counts['slow']} of them slowly"
     for name in OUTCOMES:
@@ -238,7 +242,8 @@ def reach(rows: list[Row], column: str, of: Scale) -> str:
 
 def by_case(rows: list[Row], y: Scale) -> list[str]:
     """Of each case, which methods failed and how."""
-    return [case_finding(y.texts[y.places.index(name)], group) for name, group in grouped(rows, lambda row: row["y"]).items()]
+    groups = grouped(rows, lambda row: row["y"])
+    return [case_finding(y.texts[y.places.index(name)], group) for name, group in groups.items()]
 
 
 def case_finding(name: str, rows: list[Row]) -> str:

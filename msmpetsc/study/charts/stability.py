@@ -198,7 +198,7 @@ def decorate(axes: Axes, x: Scale, y: Scale, of_cases: bool, left: bool, low: bo
     axes.tick_params(length=0, labelsize=10 if of_cases else FONT, labelleft=left, labelbottom=low)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    texts = [text.replace("-", "-\n") for text in x.texts] if of_cases else x.texts
+    texts = [text.replace("-", "-\n") if len(text) > 12 else text for text in x.texts] if of_cases else x.texts
     axes.set_xticks([index + 0.5 for index in range(len(x.places))], texts, rotation=0 if of_cases else 90)
     axes.set_yticks([index + 0.5 for index in range(len(y.places))], y.texts)
     if of_cases:

@@ -56,19 +56,31 @@ class Reference(Table):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Reference":
-        if self.integrator == "implicit-euler" and self.step is None:
-            raise rule('needs step for integrator = "implicit-euler"')
+        if self.integrator != "verlet" and self.step is None:
+            raise rule(f'needs step for integrator = "{self.integrator}"')
         return self
 
 
-class StudyScene(Table):
+class Length(Table):
+    """How long a run is."""
+
+    steps: Count | None = Field(None, description="time steps of a run [-]")
+    duration: Positive | None = Field(None, description="or: simulated time [s]; the scene's own if absent")
+
+    @field_validator("duration")
+    @classmethod
+    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
+        if duration is not None and info.data.get("steps") is not None:
+            raise rule("must not stand beside steps", "steps")
+        return duration
+
+
+class StudyScene(Length):
     """A scene of the study, and what of it is run and measured."""
 
     name: str = Field(min_length=1, description="what charts call it")
     file: str = Field(min_length=1, description="scene file, beside the study file")
     set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
-    steps: Count | None = Field(None, description="time steps of a case [-]")
-    duration: Positive | None = Field(None, description="or: simulated time of a case [s]; the scene's own if absent")
     frame: Positive | None = Field(
         None, description="moments compared with the reference lie this far apart [s]; the scene's time step if absent"
     )
@@ -78,13 +90,6 @@ class StudyScene(Table):
     true_error: Count | None = Field(None, description="every so many steps the true step error is measured [-]")
     trace: Count | None = Field(None, description="the step whose iterates are followed, in sweeps with trace = true")
     full: bool = Field(False, description="only with --full")
-
-    @field_validator("duration")
-    @classmethod
-    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
-        if duration is not None and info.data.get("steps") is not None:
-            raise rule("must not stand beside steps", "steps")
-        return duration
 
 
 class Sweep(Table):
@@ -137,20 +142,6 @@ class Axis(Table):
         """Overrides of the scene at this value."""
         templates = (f"{self.key}={{value}}",) if self.key else self.template
         return tuple(text.replace("{value}", repr(value)) for text in templates)
-
-
-class Length(Table):
-    """How long a run is."""
-
-    steps: Count | None = Field(None, description="time steps of a run [-]")
-    duration: Positive | None = Field(None, description="or: simulated time [s]; the scene's own if absent")
-
-    @field_validator("duration")
-    @classmethod
-    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
-        if duration is not None and info.data.get("steps") is not None:
-            raise rule("must not stand beside steps", "steps")
-        return duration
 
 
 class MapCase(Length):

@@ -1,4 +1,4 @@
-"""Small cases that are hard on a solver (scenes/studies/hard.toml): what comes of each, good or bad, and why."""
+"""Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good or bad, and why."""
 
 import runpy
 import tomllib
@@ -21,7 +21,8 @@ from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
 STUDIES = ROOT / "scenes" / "studies"
-CASES = {case["name"]: case for case in tomllib.loads((STUDIES / "hard.toml").read_text())["scene"]}
+MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
+CASES = {case["name"]: case for of in MAPS for case in of.get("case", ()) if case["file"].startswith("hard/")}
 shape_error = runpy.run_path(str(ROOT / "scripts" / "press_study"))["shape_error"]
 
 

@@ -20,3 +20,16 @@ def _kernel_folder() -> Path:
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
+
+
+def open(path: str | Path) -> "Result":  # noqa: A001, F821
+    """A result file, to be read: frames, lattice, surface, embedding, scene. Needs neither MPI nor PETSc.
+
+        with msmpetsc.open("out/bunny_fall.h5") as run:
+            last = run.frames.position[-1]
+
+    Raises InputError, one line, if the file is no result, or damaged.
+    """
+    from msmpetsc.output.result import Result  # here: the package itself stays quick to import
+
+    return Result(path)

@@ -23,8 +23,8 @@ import numpy as np
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.frame import Frame
+from msmpetsc.output.result import FORMAT, FORMAT_VERSION, finished, open_result, read_checkpoint  # noqa: F401
 
-FORMAT, FORMAT_VERSION = "msmpetsc", 1
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 CHUNK_BYTES = 64 * 2**20
 STATIC_UNITS = {
@@ -320,31 +320,3 @@ def _plain_errors(path: Path) -> Iterator[None]:
         if not told and not isinstance(error, OSError):
             raise
         raise InputError(f"{path} cannot be written: {told[1] if told else error.strerror or error}") from error
-
-
-def open_result(path: str | Path) -> h5py.File:
-    """Open a result file to read it; InputError if it is none."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    if not h5py.is_hdf5(path):
-        raise InputError(f"{path} is not an HDF5 file")
-    file = h5py.File(path, "r", locking=False)
-    told = file.attrs.get("format"), file.attrs.get("format_version")
-    if told != (FORMAT, FORMAT_VERSION) or "frames" not in file:
-        file.close()
-        raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
-    return file
-
-
-def finished(file: h5py.File) -> int:
-    """The number of finished frames: those whose time is finite."""
-    return int(np.isfinite(file["frames/time"][:]).sum())
-
-
-def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np.ndarray, np.ndarray] | None:
-    """The newest checkpoint, or None: step index, q_n and q_(n-1) of these rows of nodes (n,3) [m]."""
-    checkpoint = file["checkpoint"]
-    slot = int(np.argmax(checkpoint["step"]))
-    step = int(checkpoint["step"][slot])
-    return None if step < 0 else (step, checkpoint["q"][slot, rows], checkpoint["q_previous"][slot, rows])

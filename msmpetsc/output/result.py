@@ -1,0 +1,257 @@
+"""Result files, read without MPI and without PETSc: ``msmpetsc.open``.
+
+What a file claims is checked when it is opened, before anything of that size is read: whoever made the file, it ends in
+an InputError of one line, or its arrays have the shapes and types of format_version 1.
+"""
+
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+from scipy.sparse import csr_array
+
+from msmpetsc.errors import InputError
+from msmpetsc.output.lazy import Arrays, LazyArray, one_line
+
+FORMAT, FORMAT_VERSION = "msmpetsc", 1
+NEEDED = ("lattice/nodes", "frames/time", "frames/position")
+# Kind of numbers, and shape: a letter stands for the same number throughout, T for at least the finished frames.
+SHAPES = {
+    "lattice/nodes": ("f", ("n", 3)),
+    "lattice/cells": ("iu", ("c", 8)),
+    "lattice/cell_kind": ("iu", ("c",)),
+    "lattice/springs": ("iu", ("s", 2)),
+    "lattice/rest_length": ("f", ("s",)),
+    "lattice/stiffness": ("f", ("s",)),
+    "lattice/mass": ("f", ("n",)),
+    "lattice/pinned": ("iu", ("p",)),
+    "surface/points": ("f", ("v", 3)),
+    "surface/triangles": ("iu", ("f", 3)),
+    "embedding/indptr": ("iu", ("r",)),
+    "embedding/indices": ("iu", ("e",)),
+    "embedding/weights": ("f", ("e",)),
+    "checkpoint/step": ("i", (2,)),
+    "checkpoint/q": ("f", (2, "n", 3)),
+    "checkpoint/q_previous": ("f", (2, "n", 3)),
+    "frames/time": ("f", ("T",)),
+    "frames/position": ("f", ("T", "n", 3)),
+    "frames/surface": ("f", ("T", "v", 3)),
+    "frames/momentum": ("f", ("T", 3)),
+}
+DEFLATE_MOST = 1032  # zlib packs no better than this
+
+
+class Checkpoint(NamedTuple):
+    """Enough to go on: q_n and q_(n-1), (n, 3) [m], after so many steps."""
+
+    step: int
+    q: np.ndarray
+    q_previous: np.ndarray
+
+
+class Result:
+    """A result file, opened to be read; also one that is being written, up to the frames finished by now.
+
+    attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
+    lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
+        have, because an older version wrote it or the scene did not ask for it, is not among them
+    """
+
+    def __init__(self, path: str | Path):
+        """Raises InputError, one line, if the file is no result, or damaged."""
+        self.path = Path(path)
+        self._file = open_result(path)
+        try:
+            with _damage_told(self.path):
+                self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
+                datasets = _checked_datasets(self._file)
+                self.lattice, self.surface, self.frames, self._embedding, self._checkpoint = (
+                    self._arrays(group, datasets) for group in ("lattice", "surface", "frames", "embedding", "checkpoint")
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    def _arrays(self, group: str, datasets: dict[str, h5py.Dataset]) -> Arrays:
+        count = finished(self._file) if group == "frames" else None
+        names = [name for name in datasets if name.startswith(f"{group}/")]
+        return Arrays(group, {name.partition("/")[2]: LazyArray(datasets[name], count) for name in names})
+
+    def __enter__(self) -> "Result":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Nothing can be read afterwards but what was; a second call does nothing."""
+        self._file.close()
+
+    def __repr__(self) -> str:
+        if not self._file:
+            return f"<closed {self.path}>"
+        lattice, frames = self.lattice.nodes.shape[0], len(self.frames.time)
+        return f"<{self.path}: {frames} frames of {lattice} nodes, {self.attributes.get('command', 'no command')}>"
+
+    @cached_property
+    def scene(self) -> dict:
+        """The scene as run, overrides included, as TOML has it: ``scene["material"]["density"]``."""
+        text = self.attributes.get("scene")
+        if not isinstance(text, str):
+            raise InputError(f"{self.path} does not say its scene")
+        try:
+            return tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{self.path}: its scene is not TOML: {one_line(error)}") from error
+
+    @cached_property
+    def embedding(self) -> csr_array | None:
+        """W (v, n): surface points = W @ positions; None where the scene has output.surface = false."""
+        if not self._embedding:
+            return None
+        if len(self._embedding) < 3:
+            raise InputError(f"{self.path}: a part of embedding is missing")
+        parts = [self._embedding[name][:] for name in ("weights", "indices", "indptr")]
+        try:
+            W = csr_array(tuple(parts), shape=(len(parts[2]) - 1, len(self.lattice.nodes)))
+            W.check_format(full_check=True)
+        except ValueError as error:
+            raise InputError(f"{self.path}: embedding is no matrix: {one_line(error)}") from error
+        if "points" in self.surface and W.shape[0] != len(self.surface.points):
+            raise InputError(f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points")
+        return W
+
+    @property
+    def checkpoint(self) -> Checkpoint | None:
+        """The newest there is now, or None."""
+        if len(self._checkpoint) < 3:
+            return None
+        while True:
+            step = self._checkpoint.step[:]
+            slot = int(np.argmax(step))
+            if step[slot] < 0:
+                return None
+            found = Checkpoint(int(step[slot]), self._checkpoint.q[slot], self._checkpoint.q_previous[slot])
+            if self._checkpoint.step[slot] == found.step:  # or a running process has just begun to replace it
+                return found
+
+    def to_xarray(self):
+        """The frames as an xarray.Dataset, read where it is used: with coordinates, units and long names."""
+        from msmpetsc.output.labelled import labelled
+
+        return labelled(self)
+
+
+def open_result(path: str | Path) -> h5py.File:
+    """Open a result file to read it; InputError if it is none."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} is a folder, not a file" if path.is_dir() else f"{path}: no such file")
+    with _damage_told(path):
+        path.open("rb").close()  # is_hdf5 does not tell why it cannot read
+        if not h5py.is_hdf5(path):
+            raise InputError(f"{path} is not an HDF5 file")
+        # No lock, no cache: it may be written just now. What is read is what stands in the file.
+        file = h5py.File(path, "r", locking=False, rdcc_nbytes=0)
+    try:
+        with _damage_told(path):
+            _check_is_result(path, file)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def finished(file: h5py.File) -> int:
+    """The number of finished frames: those whose time is finite."""
+    there = np.isfinite(file["frames/time"][:])
+    return int(np.argmin(np.append(there, False)))
+
+
+def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """The newest checkpoint, or None: step index, q_n and q_(n-1) of these rows of nodes (n,3) [m]."""
+    checkpoint = file["checkpoint"]
+    slot = int(np.argmax(checkpoint["step"]))
+    step = int(checkpoint["step"][slot])
+    return None if step < 0 else (step, checkpoint["q"][slot, rows], checkpoint["q_previous"][slot, rows])
+
+
+def _check_is_result(path: Path, file: h5py.File) -> None:
+    name, version = (_plain(file.attrs.get(key)) for key in ("format", "format_version"))
+    if not (isinstance(name, str) and name == FORMAT):
+        raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
+    if not (isinstance(version, int) and version == FORMAT_VERSION):
+        raise InputError(f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here")
+    if not isinstance(file.get("frames"), h5py.Group):
+        raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
+    _check(path, file, "frames/time")
+
+
+@contextmanager
+def _damage_told(path: Path) -> Iterator[None]:
+    """One line for what HDF5 and h5py raise on files that no one wrote so."""
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
+
+
+def _plain(value):
+    """An attribute as Python's own type, where there is one."""
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """All that belong to a result, "frames/time" and the like; InputError if one is not what it should be."""
+    path = Path(file.filename)
+    for name in NEEDED:
+        if name not in file:
+            raise InputError(f"{path} is damaged: it has no {name}")
+    names = [name for name in SHAPES if name in file]
+    names += [f"frames/{name}" for name in file["frames"] if f"frames/{name}" not in SHAPES and _numbers(file, name)]
+    datasets = {name: _check(path, file, name) for name in names}
+    count, sizes = finished(file), {}
+    for name, dataset in datasets.items():
+        for axis, (size, symbol) in enumerate(zip(dataset.shape, _expected(name, dataset)[1], strict=True)):
+            if symbol == "T":
+                wrong = f"{count} frames are finished" if size < count else ""
+            else:
+                known = sizes.setdefault(symbol, size) if isinstance(symbol, str) else symbol
+                wrong = f"{known} are expected" if size != known else ""
+            if wrong:
+                raise InputError(f"{path} is damaged: {name} is {size} long along axis {axis}, and {wrong}")
+    return datasets
+
+
+def _numbers(file: h5py.File, name: str) -> bool:
+    """Whether that is a series of numbers; a newer version may keep other things among the frames."""
+    found = file["frames"].get(name)
+    return isinstance(found, h5py.Dataset) and found.dtype.kind in "iuf"
+
+
+def _expected(name: str, dataset: h5py.Dataset) -> tuple[str, tuple]:
+    """Kinds and shape; of what is not known here, any numbers will do that are as many as the frames."""
+    return SHAPES.get(name) or ("iuf", ("T", *dataset.shape[1:]))
+
+
+def _check(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """The dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{path} is damaged: it has no dataset {name}")
+    kinds, shape = _expected(name, dataset) if dataset.shape else ("", ())
+    if dataset.dtype.kind not in kinds or len(dataset.shape) != len(shape):
+        raise InputError(f"{path} is damaged: {name} has type {dataset.dtype} and shape {dataset.shape}")
+    rows, claimed = " x ".join(map(str, dataset.shape)), dataset.size * dataset.dtype.itemsize
+    if claimed > path.stat().st_size * (DEFLATE_MOST if dataset.compression else 1):
+        raise InputError(f"{path} is damaged: {name} claims {rows} numbers, more than the file holds")
+    return dataset

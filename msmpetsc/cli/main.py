@@ -9,11 +9,11 @@ from itertools import pairwise
 from mpi4py import MPI
 
 from msmpetsc import __version__
-from msmpetsc.cli import fetch, plan, render, run, study
+from msmpetsc.cli import compare, fetch, plan, render, run, study
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
 
-COMMANDS = (run, study, plan, render, fetch)
+COMMANDS = (run, study, plan, compare, render, fetch)
 OUR_SHORT = ("-o", "-h")
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 

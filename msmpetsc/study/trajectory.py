@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.comparison import common_times
 from msmpetsc.output.frames import finished, open_result
-
-SAME_TIME = 1e-6  # of the spacing of the reference's frames
 
 
 def trajectory_error(result: Path, reference: Path) -> float:
@@ -37,15 +36,3 @@ def trajectory_error(result: Path, reference: Path) -> float:
     if moved == 0:
         raise InputError(f"{reference}: nothing moves in it")
     return float(np.sqrt(off / moved))
-
-
-def common_times(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
-    if not len(times) or not len(others):
-        return np.empty((0, 2), int)
-    slack = SAME_TIME * min((np.diff(others).min() if len(others) > 1 else 1.0), 1.0)
-    right = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
-    near = np.where(np.abs(others[right - 1] - times) <= np.abs(others[right % len(others)] - times), right - 1, right)
-    near = near.clip(0, len(others) - 1)
-    same = np.abs(others[near] - times) <= slack
-    return np.column_stack([np.nonzero(same)[0], near[same]])

@@ -49,7 +49,8 @@ def write(path: Path, frames: list[Frame] | None = None, surface: bool = True, *
     frames = [frame(index) for index in range(FRAMES)] if frames is None else frames
     s = len(springs())
     arrays = dict(nodes=NODES, cells=cells(), springs=springs(), mass=np.full(len(NODES), 0.25))
-    arrays |= dict(rest_length=np.full(s, H), stiffness=np.full(s, 100.0), pinned=np.array([0, 3]), cell_kind=np.ones(2, "u1"))
+    arrays |= dict(rest_length=np.full(s, H), stiffness=np.full(s, 100.0))
+    arrays |= dict(pinned=np.array([0, 3]), cell_kind=np.ones(2, "u1"))
     with ResultFile(path, MPI.COMM_SELF, {"scene": SCENE, "ranks": 1, "command": "msmpetsc run bar.toml"}) as file:
         for name, rows in (arrays | lattice).items():
             file.write(f"lattice/{name}", rows)

@@ -100,14 +100,12 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
 def test_rounding_is_no_difference(tmp_path: Path):
     """A body at rest: its displacements and energies are rounding, and the surface has single precision."""
     still = dict(kinetic=0.0, elastic=1e-30, potential=0.0, momentum=np.zeros(3))
-    one, other = (
-        small_result.write(
-            tmp_path / f"{sign}.h5",
-            [frame(i, position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 2e-8), **still | moving) for i in (0, 1)],
-        )
-        for sign, moving in ((1, dict(elastic=2e-30, momentum=np.full(3, 1e-20))), (-1, {}))
-    )
-    with Result(one) as a, Result(other) as b:
+
+    def written(sign: int, **other) -> Path:
+        places = dict(position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 2e-8))
+        return small_result.write(tmp_path / f"{sign}.h5", [frame(i, **places | still | other) for i in (0, 1)])
+
+    with Result(written(1, elastic=2e-30, momentum=np.full(3, 1e-20))) as a, Result(written(-1)) as b:
         assert all(field.first_above(1e-6) is None for field in compare(a, b).fields)
 
 
@@ -160,7 +158,8 @@ def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, cap
 
 
 def test_the_order_of_springs_does_not_matter(a: Path, tmp_path: Path, capsys):
-    assert told(capsys, a, small_result.write(tmp_path / "b.h5", springs=small_result.springs()[::-1, ::-1]))[0] == 0
+    b = small_result.write(tmp_path / "b.h5", springs=small_result.springs()[::-1, ::-1])
+    assert told(capsys, a, b)[0] == 0
 
 
 @pytest.mark.parametrize("options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--fields", ""], ["--field"]])

@@ -49,8 +49,9 @@ def test_what_was_written_is_read(whole: Path):
 @pytest.mark.parametrize(
     "key",
     [
-        3, -1, np.int64(2), slice(None), slice(None, None, -2), slice(4, 1), (slice(1, 3), 7), (slice(None), 7, 2), ..., (..., 1),
-        ([0, 2], 5), (slice(None), [3, 5]), (2, [1, 4]), [], np.array([[0, 1], [2, 3]]), [4, 0, 0], np.arange(FRAMES) > 2,
+        3, -1, np.int64(2), slice(None), slice(None, None, -2), slice(4, 1), (slice(1, 3), 7), (slice(None), 7, 2), ...,
+        (..., 1), ([0, 2], 5), (slice(None), [3, 5]), (2, [1, 4]), [], np.array([[0, 1], [2, 3]]), [4, 0, 0],
+        np.arange(FRAMES) > 2,
         (slice(None), slice(None, None, -3)), ([True, False, True, False, False], slice(2)), (slice(0), [1, 2]),
     ],
 )  # fmt: skip
@@ -91,7 +92,8 @@ def test_nothing_heavy_is_imported(whole: Path):
         "    run.frames.position[0], run.embedding, run.scene, run.checkpoint\n"
         "print(json.dumps([name.partition('.')[0] for name in sys.modules]))"
     )
-    done = subprocess.run([sys.executable, "-c", code, whole], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-c", code, whole]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
     loaded = set(json.loads(done.stdout))
     assert "h5py" in loaded and loaded.isdisjoint({"petsc4py", "mpi4py", "numba", "pyvista", "matplotlib", "trimesh"})
 
@@ -115,7 +117,9 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
 
 def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
     with h5py.File(copy, "r+") as file:
-        for name in ("frames/contact", "frames/true_error", "lattice/pinned", "embedding", "surface", "frames/surface", "checkpoint"):
+        for name in ("contact", "true_error", "surface"):
+            del file["frames"][name]
+        for name in ("lattice/pinned", "embedding", "surface", "checkpoint"):
             del file[name]
     with msmpetsc.open(copy) as run:
         assert "contact" not in run.frames and "points" not in run.surface
@@ -176,6 +180,11 @@ def linked_away(file: h5py.File) -> None:
     file["frames/position"] = h5py.ExternalLink("not_there.h5", "/x")
 
 
+def group_for_time(file: h5py.File) -> None:
+    del file["frames/time"]
+    file.create_group("frames/time")
+
+
 HUGE = dict(shape=(10**12,), dtype="f8", chunks=(1000,))
 BAD = {
     "cut in half": (cut(0.5), "is damaged or cut short: .*truncated"),
@@ -192,13 +201,13 @@ BAD = {
     "no frames": (damage(lambda file: file.__delitem__("frames")), "it has no frames"),
     "frames are data": (replaced("frames", [1.0]), "it has no frames"),
     "no time": (replaced("frames/time"), "no dataset frames/time"),
-    "time is a group": (damage(lambda file: (file.__delitem__("frames/time"), file.create_group("frames/time"))), "no dataset"),
+    "time is a group": (damage(group_for_time), "no dataset frames/time"),
     "no position": (replaced("frames/position"), "it has no frames/position"),
     "no nodes": (replaced("lattice/nodes"), "it has no lattice/nodes"),
     "10^12 times": (replaced("frames/time", **HUGE), "claims 1000000000000 numbers"),
     "10^12 energies": (replaced("frames/kinetic", **HUGE), "frames/kinetic claims"),
     "10^12 packed": (replaced("frames/kinetic", **HUGE, compression="gzip"), "frames/kinetic claims"),
-    "10^12 nodes": (replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(1000, 3))), "claims 1000000000000 x 3"),
+    "10^12 nodes": (replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))), "claims 1000000000000 x 3"),
     "text for positions": (replaced("frames/position", ["a", "b"]), "frames/position has type"),
     "whole numbers for nodes": (replaced("lattice/nodes", np.ones((12, 3), int)), "lattice/nodes has type int64"),
     "one number for all": (replaced("frames/time", 1.0), "frames/time has type float64 and shape ()"),
@@ -265,7 +274,8 @@ def test_xarray_has_coordinates_units_and_names(whole: Path):
         x = data.position.sel(axis="x").sel(time=2 * DT, method="nearest").isel(node=[11, 0])
         assert x.values.tolist() == position(2)[[11, 0], 0].tolist()
         assert np.array_equal(data.rest_position, NODES) and data.attrs["ranks"] == 1
-        assert float((data.mass * data.position).sum("node").isel(time=1, axis=2)) == pytest.approx(0.25 * NODES[:, 2].sum())
+        weight = (data.mass * data.position).sum("node").isel(time=1, axis=2)
+        assert float(weight) == pytest.approx(0.25 * NODES[:, 2].sum())
 
 
 def test_without_xarray_one_line_says_so(whole: Path, monkeypatch):

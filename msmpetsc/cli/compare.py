@@ -28,7 +28,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--fields", metavar="NAME,...", help="of /frames; position, surface, the energies and momentum if not given"
     )
-    parser.add_argument("--shared", action="store_true", help="times that only one of them has do not count as different")
+    parser.add_argument(
+        "--shared", action="store_true", help="times that only one of them has do not count as different"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,5 +90,5 @@ def tell_node(one: Result, found: Comparison, field: Field, first: int) -> None:
     number, array = field.worst[first], getattr(one, group).get(stored)
     rest = f", at rest at {place(array[number])}" if array is not None else ""
     kind = "node" if field.name == "position" else "surface point"
-    frame = found.pairs[first, 0]
-    print(f"{kind} {number}{rest}, is {field.errors[first] * field.scale:.3g} m off at frame {frame}, farther than any other")
+    off = f"{field.errors[first] * field.scale:.3g} m off at frame {found.pairs[first, 0]}"
+    print(f"{kind} {number}{rest}, is {off}, farther than any other")

@@ -3,13 +3,13 @@
 An error is the greatest difference at a frame over the scale of its field, which is the same for all frames:
 
     position, surface                       the largest displacement from rest, at least 1e-6 of the body's longest side
-    kinetic, elastic, potential, contact    the largest |energy| among these, at least that of the stiffest spring
-                                            strained by 1e-6
-    momentum                                sqrt(2 m K): of the whole mass m at the largest kinetic energy K, or that least one
+    kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
+                                            at least that of the stiffest spring strained by 1e-6
+    momentum                                sqrt(2 m K) of the whole mass m, K the largest kinetic energy or that least one
     anything else                           its own largest |value|
 
-each over both runs and all frames compared. What the digits of the coarser of the two stored types cannot tell apart is
-equal, and so are two NaN, or two infinities of one sign.
+each over both runs and all frames compared. What the digits of the coarser of the two stored types cannot tell apart
+is equal, and so are two NaN, or two infinities of one sign.
 """
 
 from collections.abc import Sequence
@@ -145,9 +145,11 @@ def _scales(one: Result, other: Result, measured: dict, pairs: np.ndarray) -> di
 
 
 def _largest(one: Result, other: Result, pairs: np.ndarray, names: Sequence[str]) -> float:
-    """The largest size of these numbers at the frames compared, of both runs."""
+    """The largest size of these energies at the frames compared, of both runs."""
     runs = (one, pairs[:, 0]), (other, pairs[:, 1])
-    values = [run.frames[name][frames] for run, frames in runs for name in names if name in run.frames]
+    found = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
+    # the potential energy's zero means nothing
+    values = [energy - energy[0] if name == "potential" else energy for name, energy in found]
     values = np.abs(np.concatenate([np.empty(0), *values]))
     return float(values[np.isfinite(values)].max(initial=0.0))
 

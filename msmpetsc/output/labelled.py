@@ -75,6 +75,7 @@ def _when_used(array: LazyArray):
         shape, dtype = array.shape, array.dtype
 
         def __getitem__(self, key):
-            return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, array.__getitem__)
+            basic = indexing.IndexingSupport.BASIC
+            return indexing.explicit_indexing_adapter(key, self.shape, basic, array.__getitem__)
 
     return indexing.LazilyIndexedArray(OfAResult())

@@ -70,8 +70,9 @@ class Result:
             with _damage_told(self.path):
                 self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
                 datasets = _checked_datasets(self._file)
+                groups = ("lattice", "surface", "frames", "embedding", "checkpoint")
                 self.lattice, self.surface, self.frames, self._embedding, self._checkpoint = (
-                    self._arrays(group, datasets) for group in ("lattice", "surface", "frames", "embedding", "checkpoint")
+                    self._arrays(group, datasets) for group in groups
                 )
         except BaseException:
             self.close()

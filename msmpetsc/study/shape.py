@@ -23,6 +23,8 @@ def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> flo
     R is a rotation: a mirrored body is not in its rest shape. (Kabsch 1976, as scipy has it.)
     """
     side = np.ptp(rest, axis=0).max()
+    if side == 0:  # one node
+        return 0.0
     x, rest = (points - mass @ points / mass.sum() for points in (x, rest))
     size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
     with warnings.catch_warnings():

@@ -135,7 +135,8 @@ def draw(chart: Chart, axes: Axes, rows: list[Row], x: Scale, y: Scale) -> None:
     for i, j, row in shown:
         color = "white" if row["outcome"] in DARK else INK
         at = x.places.index(i) + 0.5, y.places.index(j) + 0.5
-        axes.text(*at, mark(row), color=color, fontsize=FONT, ha="center", va="center", zorder=5)
+        behind = {"facecolor": COLORS[row["outcome"]], "edgecolor": "none", "pad": 0.8}  # no line runs through it
+        axes.text(*at, mark(row), color=color, fontsize=FONT, ha="center", va="center", zorder=5, bbox=behind)
     look = Look(INK, "s")
     at = [x.places.index(i) + 0.5 for i, _, _ in shown], [y.places.index(j) + 0.5 for _, j, _ in shown]
     chart.mark(axes, *at, [point(row, x, y) for _, _, row in shown], look, markersize=CELL * 72 * 0.9, alpha=0)

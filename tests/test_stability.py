@@ -44,7 +44,8 @@ label = "explicit"
 integrator = "verlet"
 """
 X = 'x = { name = "time step", key = "time.step", unit = "s", values = [0.001, 5] }\n'
-Y = 'y = { name = "density", template = ["material.density={value}", "gravity.acceleration=[0, 0, -{value}]"], values = [10, 20] }\n'
+CHANGES = '["material.density={value}", "gravity.acceleration=[0, 0, -{value}]"]'
+Y = f'y = {{ name = "density", template = {CHANGES}, values = [10, 20] }}\n'
 GRID = '[[map]]\nname = "g"\nfile = "scene.toml"\nsteps = 4\n'
 NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nsteps = 4\n'
 
@@ -72,7 +73,8 @@ def test_a_map_is_each_method_at_each_place(tmp_path: Path):
 
 def test_a_duration_holds_as_many_steps_as_fit(tmp_path: Path):
     text = METHODS + GRID.replace("steps = 4", "duration = 0.5") + X + Y
-    assert ["duration = 0.5" in shown_command(one) for one in all_cases(tmp_path, text)[:4]] == [True, True, False, False]
+    found = ["duration = 0.5" in shown_command(one) for one in all_cases(tmp_path, text)[:4]]
+    assert found == [True, True, False, False]
 
 
 def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
@@ -186,7 +188,8 @@ def result(path: Path, shift: float, **series) -> Path:
 
 
 def test_figures_of_a_file_that_lacks_what_came_later(tmp_path: Path):
-    row = of_frames(result(tmp_path / "x.h5", 3.0, iterations=[0, 5, 9, 1], kinetic=[4, 4, 2, 1], elastic=[0, 0, 0, 2]), 0.1)
+    series = {"iterations": [0, 5, 9, 1], "kinetic": [4, 4, 2, 1], "elastic": [0, 0, 0, 2]}
+    row = of_frames(result(tmp_path / "x.h5", 3.0, **series), 0.1)
     assert row["most_iterations"] == 9 and row["shape_error"] < 1e-12
     assert row["energy_left"] == pytest.approx(3 / 4)
 
@@ -208,8 +211,11 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
     assert [(row["x"], row["outcome"], row["status"]) for row in rows] == [
-        ("good", "ok", "ok"), ("bad", "energy", "failed"), ("worse", "refused", "failed"), ("worst", "crashed", "failed"),
-    ]  # fmt: skip
+        ("good", "ok", "ok"),
+        ("bad", "energy", "failed"),
+        ("worse", "refused", "failed"),
+        ("worst", "crashed", "failed"),
+    ]
     assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
     assert counted(rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
     with caplog.at_level("INFO", log.name):

@@ -134,7 +134,9 @@ class Axis(Table):
     one_of = ("key", "template")
     name: str = Field(min_length=1, description="what it is, for the reader")
     key: str | None = Field(None, min_length=1, description='what is set: "material.young_modulus"')
-    template: ListOf[Override] = Field((), description='or changes: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"')
+    template: ListOf[Override] = Field(
+        (), description='or changes: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"'
+    )
     values: ListOf[float] = Field(min_length=1, description="in the order of the axis")
     unit: str = Field("", description='for the reader; "%" shows 0.2 as 20% and s as 10 ms')
 

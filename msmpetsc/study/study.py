@@ -45,7 +45,12 @@ class Findings:
 
 
 def run_study(
-    path: Path, folder: Path, presets: Collection[str], full: bool = False, jobs: int | None = None, restart: bool = False
+    path: Path,
+    folder: Path,
+    presets: Collection[str],
+    full: bool = False,
+    jobs: int | None = None,
+    restart: bool = False,
 ) -> list[Row]:
     """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
 

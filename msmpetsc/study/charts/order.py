@@ -15,9 +15,9 @@ from msmpetsc.study.rows import Row, grouped, measured, succeeded
 KIND = "Convergence in time"
 CAPTION = (
     "The steps are solved to many digits, so that what is seen is the error of the time step alone. Of verlet the step "
-    "is the substep. In the legend: the slope of the error, fitted to the shorter half of the steps; a "
-    "start that is not smooth lowers it, for there are always vibrations that the steps are too long for. Energy left: where "
-    "no load acts; overtones lose theirs sooner than the slowest vibration, whose closed form is dashed."
+    "is the substep. In the legend: the slope of the error, fitted to the shorter half of the steps; a start that is not "
+    "smooth lowers it, for there are always vibrations that the steps are too long for. Energy left: where no load acts; "
+    "overtones lose theirs sooner than the slowest vibration, whose closed form is dashed."
 )
 CLOSED = "(1 + ω²t²)^(−n), implicit Euler, slowest vibration"
 

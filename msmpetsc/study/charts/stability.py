@@ -151,7 +151,9 @@ def mark(row: Row) -> str:
     if row["outcome"] in MARKS:
         return MARKS[row["outcome"]]
     count = row["iterations"]
-    return "" if count is None else f"{count:.0f}" if count < 995 else f"{count / 1000:.3g}"[:3].rstrip(".") + "k"
+    if count is None:
+        return ""
+    return f"{count:.0f}" if count < 1000 else f"{count / 1000:.{1 if count < 9950 else 0}f}k"
 
 
 def point(row: Row, x: Scale, y: Scale) -> Point:

@@ -316,6 +316,6 @@ def test_verlet_gains_energy_where_cells_fold_over_each_other_unless_its_substep
     """A spring that is nearly of no length turns about within a substep: the limit of stability, which is that of small
     swings, does not know of it. Substeps of a fifth of the limit keep the energy within a part in a hundred."""
     alone, short = (play("stretched", *OTHERS["verlet"], *more) for more in ([], ["time.substep=1e-3"]))
-    ratio = [played.energy(played.last) / played.frames[0].elastic for played in (alone, short)]
-    assert ratio[0] > 2 and ratio[1] == pytest.approx(1, abs=0.02)
-    assert not alone.words  # and nothing tells
+    assert "J from nowhere" in alone.words and "cells are inside out" in alone.words
+    assert not short.words
+    assert short.energy(short.last) / short.frames[0].elastic == pytest.approx(1, abs=0.02)

@@ -68,7 +68,7 @@ def play(name: str, *changes: str) -> Played:
     """A case, in this process; by newton, to 1e-3, if nothing else is said."""
     case = CASES[name]
     path, changes = STUDIES / case["file"], [*case.get("set", ()), *changes]
-    if "steps" in case:
+    if "steps" in case and not any(change.startswith("time.duration") for change in changes):
         changes.append(f"time.duration={case['steps'] * load_scene(path, changes).time.step!r}")
     scene, frames, words = load_scene(path, changes), [], ""
     model = build_model(MPI.COMM_SELF, scene)
@@ -103,6 +103,19 @@ SURVIVED = sorted(CASES.keys() - FAILS.keys() - TOO_LONG)
 def test_newton_is_to_survive(name: str):
     assert FAILS[name] in play(name).words or not play(name).words
     assert not play(name).words
+
+
+RESCUED = {name: 1 for name in FAILS} | {"pressed flat": 8}  # steps until the first that fails is done
+MANY = {"cloud, stiffening", "mirrored, stiffening", "stiff half, twisted"}  # survive too, in 5 to 15 s each
+
+
+@pytest.mark.parametrize("name", sorted(FAILS.keys() - MANY))
+def test_shorter_steps_rescue_it(name: str):
+    """Inertia then holds the nodes where they are, which makes the step's energy convex."""
+    duration = RESCUED[name] * play(name).scene.time.step
+    played = play(name, "safety.on_failure=substep", f"time.duration={duration!r}")
+    assert not played.words and len(played.frames) == 1 + RESCUED[name]
+    assert played.last.substeps > 0 and np.isfinite(played.last.position).all()
 
 
 @pytest.mark.parametrize("name", SURVIVED)
@@ -316,6 +329,5 @@ def test_verlet_gains_energy_where_cells_fold_over_each_other_unless_its_substep
     """A spring that is nearly of no length turns about within a substep: the limit of stability, which is that of small
     swings, does not know of it. Substeps of a fifth of the limit keep the energy within a part in a hundred."""
     alone, short = (play("stretched", *OTHERS["verlet"], *more) for more in ([], ["time.substep=1e-3"]))
-    assert "J from nowhere" in alone.words and "cells are inside out" in alone.words
-    assert not short.words
-    assert short.energy(short.last) / short.frames[0].elastic == pytest.approx(1, abs=0.02)
+    assert "from nowhere" in alone.words and len(alone.frames) < len(short.frames)
+    assert not short.words and short.energy(short.last) == pytest.approx(short.frames[0].elastic, rel=0.02)

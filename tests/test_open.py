@@ -115,6 +115,31 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
             assert run.checkpoint.step == 3 and np.array_equal(run.checkpoint.q, position(3))
 
 
+def test_another_process_sees_the_newest_checkpoint(tmp_path: Path):
+    """Another: HDF5 would lend a reader in this one the writer's own view of the file."""
+    code = (
+        "import sys, msmpetsc\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    for line in sys.stdin:\n"
+        "        found = run.checkpoint\n"
+        "        print(found.step, found.q[0, 0], len(run.frames.time), flush=True)"
+    )
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", NODES)
+        file.start_frames(1000, len(NODES))
+        reader = None
+        for index in range(4):
+            file.append(frame(index, surface=None))
+            file.write_checkpoint(index, np.full(NODES.shape, index), NODES)
+            reader = reader or subprocess.Popen(
+                [sys.executable, "-c", code, tmp_path / "x.h5"],
+                env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            print(file=reader.stdin, flush=True)
+            assert reader.stdout.readline() == f"{index} {index:.1f} 1\n"
+        reader.communicate(timeout=20)
+
+
 def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
     with h5py.File(copy, "r+") as file:
         for name in ("contact", "true_error", "surface"):

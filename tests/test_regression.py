@@ -74,6 +74,11 @@ def test_each_changed_number_is_noticed_and_named(script: ModuleType, stored: di
             assert (f"{SCENE}: {name}: " in capsys.readouterr().out) == bool(status)
 
 
+def test_the_tolerance_is_ten_times_the_sum_of_the_steps_errors(script: ModuleType):
+    assert script.allowed(6, "m") == pytest.approx(10 * 1e-9 * (1 + 2 + 3 + 4 + 5 + 6))
+    assert script.allowed(6, "J") == script.allowed(6, "kg m/s") == 2 * script.allowed(6, "m")
+
+
 @pytest.mark.parametrize("name", ["cells", "nodes", "springs", "pinned", "frames"])
 def test_counts_are_exact(script: ModuleType, stored: dict, instead, capsys, name: str):
     instead(stored | {"counts": stored["counts"] | {name: stored["counts"][name] + 1}})

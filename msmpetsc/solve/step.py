@@ -366,7 +366,7 @@ class Stepper:
     def _failure(self, iterations: int) -> StepFailed:
         """What is known of it, in one line (collective)."""
         reason, kind = REASON.get(self.snes.reason, str(self.snes.reason)), KINDS.get(self.snes.reason, "iterations")
-        other = "" if self.preset.true_hessian else "the preset newton, "
+        other = "" if self.preset.true_hessian else "another preset (newton), "
         advice = f'a smaller time.step, {other}a looser solver.error, or safety.on_failure = "substep"'
         if kind == "linear solve":
             ksp = KSP_REASON.get(self.ksp.reason, str(self.ksp.reason))

@@ -179,8 +179,7 @@ def test_the_linear_law_keeps_cells_to_look_at_alone():
     linear, stiffening = lattice_of(3, 2, 2, stiffening=0.0), lattice_of(3, 2, 2)
     for lattice in (linear, stiffening):
         assert lattice.local_cells.shape == (12, 8) and lattice.cells_owned == 12
-    assert Elasticity(COMM, linear).cells is None and len(Elasticity(COMM, linear).resisting(-linear.nodes)) == 0
-    material = load_scene(path, ["material.law=stiffening"]).material
+    assert Elasticity(COMM, linear).cells is None
     assert material.law_stiffening == 10.0
 
 

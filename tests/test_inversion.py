@@ -174,12 +174,15 @@ def test_products_with_the_hessian_look_at_resisting_cells_only(q: np.ndarray):
     assert len(elasticity.resisting(REST)) == 0 < len(elasticity.resisting(q))
 
 
-def test_the_linear_law_keeps_cells_to_look_at_alone():
+def test_the_linear_law_keeps_cells_to_look_at_alone(tmp_path: Path):
     """None of them resists, and none belongs to another rank."""
     linear, stiffening = lattice_of(3, 2, 2, stiffening=0.0), lattice_of(3, 2, 2)
     for lattice in (linear, stiffening):
         assert lattice.local_cells.shape == (12, 8) and lattice.cells_owned == 12
     assert Elasticity(COMM, linear).cells is None
+    path = block_scene(tmp_path, time={"step": T, "duration": T})
+    assert Elasticity(COMM, play(path)[0].lattice).cells is None
+    material = load_scene(path, ["material.law=stiffening"]).material
     assert material.law_stiffening == 10.0
 
 

@@ -4,6 +4,7 @@ import csv
 import math
 import re
 import tomllib
+from logging import INFO
 from pathlib import Path
 
 import numpy as np
@@ -218,9 +219,9 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
     ]
     assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
     assert counted(rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
-    with caplog.at_level("INFO", log.name):
+    with caplog.at_level(INFO, log.name):
         tell_of(rows)
-    assert [record.levelname for record in caplog.records if "map n: 1 ok" in record.message] == ["INFO"]
+    assert [record.levelno for record in caplog.records if "map n: 1 ok" in record.message] == [INFO]
     assert not any("without figures" in record.message for record in caplog.records)
     page = write_report(tmp_path / "out").read_text()
     assert "Failed cases" not in page and "4: 1 ok, 1 energy, 1 refused, 1 crashed" in page

@@ -18,7 +18,7 @@ class Preset:
     """about: when to use it. options: PETSc's, without the dash.
 
     true_hessian : the Jacobian is the true Hessian of g, not the constant A
-    projected    : and always without its negative parts
+    projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
     start_from_b : CG starts from x = b, as in the paper's Algorithm 1
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None iterates to the error target
@@ -29,7 +29,7 @@ class Preset:
     about: str
     options: dict[str, str]
     true_hessian: bool = False
-    projected: bool = False
+    projected: int = 0
     start_from_b: bool = False
     extrapolate: bool = True
     iterations: int | None = None
@@ -41,12 +41,13 @@ CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_
 JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
 PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
+MANY = "3000"  # a hard step takes hundreds of newton's cheap iterations (tests/test_recovery.py), and gets there
 NEWTON = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
-    "snes_max_it": "100",
+    "snes_max_it": MANY,
     **NO_STOP_BY_SIZE,
-    "snes_max_linear_solve_fail": "100",
+    "snes_max_linear_solve_fail": MANY,  # of an indefinite Hessian: CG's direction leads down all the same
     **JACOBI_CG,
     "ksp_rtol": "3e-2",
 }
@@ -125,10 +126,10 @@ PRESETS = {
         inexact=True,
     ),
     "newton-projected": Preset(
-        "Newton's method with the Hessian's negative parts left out: slower, and what a hard step falls back on",
-        {**NEWTON, "snes_max_it": "1000"},
+        "Newton's method, for long without the Hessian's negative parts: slower, and what a hard step falls back on",
+        NEWTON,
         true_hessian=True,
-        projected=True,
+        projected=100,
         inexact=True,
     ),
     "fast-msm": Preset(

@@ -218,6 +218,7 @@ class Stepper:
         if its very first direction has negative curvature it climbs, and the line search says so: the
         projected Hessian takes over for some iterations (_linearise).
         """
+        self.projected = self.preset.projected > 0
         self.snes.solve(None, self.x)
         iterations, most = self.snes.its, self.snes.getTolerances()[3]
         while self._climbs() and iterations < most:
@@ -258,7 +259,7 @@ class Stepper:
         self.unknowns.to_nodes(x, self.base)
         contact = self.functional.contact
         if self.preset.true_hessian:
-            self.projected = self.preset.projected or self.projected and snes.its < PROJECTED
+            self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
             given = self.corrected and not self.projected  # the estimate has linearised at this very x
             if not given:
                 self.hessian.linearise(self.base, contact, self.projected)

@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
-LAYERS = [{"errors"}, {"scene", "scene_errors", "scene_reading", "comm"}, {"geometry"}, {"model"}, {"solve"}, {"output"}, {"study"}, {"cli"}]
+LAYERS = [
+    {"errors"}, {"scene", "scene_errors", "scene_reading", "comm"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
+    {"study"}, {"cli", "__main__"},
+]  # fmt: skip
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
 ONLY_IN = {"petsc4py": {"solve", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
 NEVER = {("output", "solve")}  # a result can be read and drawn where there is no PETSc

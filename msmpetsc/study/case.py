@@ -4,12 +4,12 @@ import hashlib
 import json
 import os
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from msmpetsc import __version__
+from msmpetsc.study.warm import COLD
 
 NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "place")
 
@@ -91,11 +91,10 @@ def launcher(ranks: int) -> list[str]:
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
     """The process of one run: its frames go to ``result``, its figures to ``measure``."""
-    program = [sys.executable, "-m", "msmpetsc.cli.main"]
     outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
     # before PETSc's options: the last of these may be one without a value
     name, scene, *rest = run_arguments(case)
-    return [*launcher(case.ranks), *program, name, scene, *outputs, *rest]
+    return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
 
 
 def shown_command(case: Case) -> str:

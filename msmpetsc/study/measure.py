@@ -67,9 +67,9 @@ class Bench:
 
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return self.processes.run(
-            command(case, path, path.with_suffix(".json")), path.with_suffix(".log"), case.timeout
-        )
+        figures, log = path.with_suffix(".json"), path.with_suffix(".log")
+        # no time is asked of a place in a map
+        return self.processes.run(command(case, path, figures), log, case.timeout, warm=case.place is not None)
 
     def _figures(self, case: Case, path: Path, ended: Ended) -> tuple[Row, str]:
         """Figures of a run, as far as it came; and what is missing, in words."""

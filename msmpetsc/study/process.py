@@ -10,6 +10,8 @@ from pathlib import Path
 from threading import Lock
 from time import perf_counter
 
+from msmpetsc.study.warm import COLD, Forked
+
 GRACE = 3.0  # [s] between the request to end and the end
 MARKS_OF_MPI = ("PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_")  # of a launcher around us: not for our children
 # a process alone needs neither Open MPI's daemon nor its search for a network: a third of a second at its start
@@ -29,14 +31,17 @@ class Processes:
     """Those under way; once stopped, none is started any more."""
 
     def __init__(self):
-        self._running: set[subprocess.Popen] = set()
+        self._running: set[subprocess.Popen | Forked] = set()
         self._stopped = False
         self._lock = Lock()
 
-    def run(self, command: Sequence[str], log: Path, timeout: float) -> Ended:
-        """Run to the end, or for ``timeout`` seconds; ``log`` gets what it says."""
+    def run(self, command: Sequence[str], log: Path, timeout: float, warm: bool = False) -> Ended:
+        """Run to the end, or for ``timeout`` seconds; ``log`` gets what it says.
+
+        warm : spare it the start of the program, if it is one
+        """
         begin = perf_counter()
-        process = self._start(command, log)
+        process = self._start(command, log, warm and list(command[:3]) == COLD)
         if process is None:
             return Ended(None, "stopped", 0.0)
         try:
@@ -61,14 +66,17 @@ class Processes:
     def stopped(self) -> bool:
         return self._stopped
 
-    def _start(self, command: Sequence[str], log: Path) -> subprocess.Popen | None:
+    def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen | Forked | None:
+        variables = environment(alone=command[0] != "mpiexec")
         with self._lock, open(log, "w") as out:
             if self._stopped:
                 return None
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True,
-                env=environment(alone=command[0] != "mpiexec"),
-            )  # fmt: skip
+            if warm:
+                process = Forked(command[3:], log, variables)
+            else:
+                process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True, env=variables
+                )
             self._running.add(process)
             return process
 
@@ -91,7 +99,7 @@ def last_error(told: str) -> str:
     return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 
 
-def end(process: subprocess.Popen) -> None:
+def end(process: subprocess.Popen | Forked) -> None:
     """End a process and all of its session: mpiexec gives each rank a process group of its own."""
     if process.poll() is None:
         with suppress(ProcessLookupError):

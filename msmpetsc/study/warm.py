@@ -1,0 +1,62 @@
+"""Runs of the program that need not start it: a process that has imported it forks one for each.
+
+A start takes 2 s of a core, which is most of a small case; a fork 0.4 s. What such a run costs says less of the
+program than a run of its own does, so only cases are run like this of which no time is asked.
+"""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+
+PROGRAM = "msmpetsc.cli.main"
+COLD = [sys.executable, "-m", "msmpetsc"]  # a command that starts it begins with this
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(["msmpetsc.study.preloaded", PROGRAM, "msmpetsc.model.build"])  # all but PETSc
+
+
+class Forked:
+    """``msmpetsc`` with these arguments, in a session of its own; used as subprocess.Popen is."""
+
+    def __init__(self, arguments: Sequence[str], log: Path, environment: Mapping[str, str]):
+        """environment: all of the run's. log: what it says goes there."""
+        self.process = SERVER.Process(target=_run, args=(list(arguments), str(log), dict(environment)), daemon=True)
+        self.process.start()
+        self.pid = self.process.pid
+
+    def poll(self) -> int | None:
+        return self.process.exitcode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Exit status; negative for a signal. Raises subprocess.TimeoutExpired."""
+        self.process.join(timeout)
+        if self.process.exitcode is None:
+            raise subprocess.TimeoutExpired("msmpetsc", timeout)
+        return self.process.exitcode
+
+    def kill(self) -> None:
+        self.process.kill()
+
+
+def _run(arguments: list[str], log: str, environment: Mapping[str, str]) -> None:
+    os.setsid()
+    for one in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
+        signal.signal(one, signal.SIG_DFL)
+    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(out, 1)
+    os.dup2(out, 2)
+    os.environ.clear()
+    os.environ.update(environment)
+    from mpi4py import MPI
+
+    MPI.Init()
+    sys.argv = ["msmpetsc", *arguments]
+    status = import_module(PROGRAM).main()
+    if "petsc4py.PETSc" in sys.modules:
+        sys.modules["petsc4py.PETSc"]._finalize()
+    MPI.Finalize()
+    sys.exit(status)

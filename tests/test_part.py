@@ -51,6 +51,15 @@ def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
     np.testing.assert_allclose(lattice.stiffness, expected, rtol=1e-14)
 
 
+def test_each_cell_resists_as_its_own_material(tmp_path: Path):
+    """Springs of a mirrored body have their lengths; its cells have 8 K (1 - (-1) / J_0)^3 = 216 K, K of E of each."""
+    law = {"material": {"young_modulus": YOUNG, "density": DENSITY, "law": "stiffening"}}
+    soft = of_parts(tmp_path, **law).lattice
+    lattice = of_parts(tmp_path, {"region": FAR, "young_modulus": 5 * YOUNG}, **law).lattice
+    energies = [Elasticity(MPI.COMM_SELF, one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]
+    assert energies[1] == pytest.approx((1 + 5) / 2 * energies[0], rel=1e-12)
+
+
 def test_with_one_stiffness_for_all_springs_a_part_s_counts_by_the_mean_of_the_cells(tmp_path: Path):
     material = {"stiffness": 10.0, "density": DENSITY}
     lattice = of_parts(tmp_path, {"region": FAR, "stiffness": 30.0}, material=material).lattice

@@ -17,10 +17,10 @@ from msmpetsc.model.inversion import (
     resistance_change,
     resistance_energy,
 )
-from msmpetsc.model.lattice import NO_CELLS, Lattice
+from msmpetsc.model.lattice import Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
-RESISTANCE = 1.0  # K of a corner, of the stiffest spring's stiffness times h^2: an eighth left a lung pressed to 30% torn
+RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
 
 
 class Elasticity:
@@ -37,8 +37,8 @@ class Elasticity:
         self.cells = self.own_cells = None
         if lattice.stiffening > 0:
             volume, h = ONSET * lattice.cell_size**3, lattice.cell_size
-            self.cells = lattice.local_cells, volume, RESISTANCE * lattice.stiffest(comm) * h**2
-            self.own_cells = lattice.local_cells[: lattice.cells_owned], *self.cells[1:]
+            self.cells = lattice.local_cells, RESISTANCE * lattice.cell_stiffness * h**2, volume
+            self.own_cells = *(array[: lattice.cells_owned] for array in self.cells[:2]), volume
 
     def energy(self, q: np.ndarray) -> float:
         """[J]"""
@@ -58,11 +58,11 @@ class Elasticity:
             add_resistance_gradient(q, *self.cells, gradient)
 
     def resisting(self, q: np.ndarray) -> np.ndarray:
-        """The cells (r, 8) that resist at q: few, so that products with the Hessian need not look at all."""
+        """The cells (r,) of all that resist at q: few, so that products with the Hessian need not look at the others."""
         if not self.cells:
-            return NO_CELLS
-        cells, volume, _ = self.cells
-        return cells[least_volumes(q, cells) < volume]
+            return np.empty(0, np.int64)
+        cells, _, volume = self.cells
+        return np.flatnonzero(least_volumes(q, cells) < volume)
 
     def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
         """The Hessian of E at q.
@@ -73,16 +73,17 @@ class Elasticity:
 
 
 class Hessian:
-    """The Hessian of E at one q, ready for many products; ``resisting``: the cells that do there."""
+    """The Hessian of E at one q, ready for many products; ``resisting``: which cells do there."""
 
     def __init__(self, elasticity: Elasticity, q: np.ndarray, resisting: np.ndarray, projected: bool):
         self.springs, self.blocks = elasticity.all[0], elastic_hessian(q, *elasticity.all, projected)
-        self.resisting, self.projected = resisting, projected
-        if len(resisting):
-            self.q, self.law = q.copy(), elasticity.cells[1:]
+        self.resisting, self.projected = len(resisting) > 0, projected
+        if self.resisting:
+            cells, resistance, volume = elasticity.cells
+            self.q, self.cells = q.copy(), (cells[resisting], resistance[resisting], volume)
 
     def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
         """Add Hessian v [N] to ``product`` (l, 3)."""
         add_elastic_product(self.springs, self.blocks, v, product)
-        if len(self.resisting):
-            add_resistance_hessian(self.q, self.resisting, *self.law, self.projected, v, product)
+        if self.resisting:
+            add_resistance_hessian(self.q, *self.cells, self.projected, v, product)

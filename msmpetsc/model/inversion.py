@@ -1,9 +1,9 @@
 """What keeps cells from turning inside out, which springs cannot see: a mirrored cell has springs of the same lengths.
 
 Each corner of a cell spans a box with the three edges that meet there; J is its signed volume over that at rest.
-Where J < J_0 the corner has the energy  K (1 - J / J_0)^3,  nothing elsewhere, with two continuous derivatives and
-a finite push even where J < 0: so a cell that has been turned is turned back, though its neighbours may then hold
-it creased.
+Where J < J_0 the corner has the energy  K (1 - J / J_0)^3,  K of its cell's material, nothing elsewhere, with two
+continuous derivatives and a finite push even where J < 0: so a cell that has been turned is turned back, though its
+neighbours may then hold it creased.
 
 All positions are local, (l, 3), and a gradient is right at the owned nodes, as in model.energy.
 """
@@ -85,34 +85,35 @@ def inverted_cells(q: np.ndarray, cells: np.ndarray) -> tuple[int, int, float]:
 
 
 @numba.njit(cache=True)
-def resistance_energy(q: np.ndarray, cells: np.ndarray, volume: float, resistance: float) -> float:
-    """Energy [J]. volume: J_0 h^3 [m^3]; resistance: K [J]."""
+def resistance_energy(q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float) -> float:
+    """Energy [J]. resistance: K (c,) [J]; volume: J_0 h^3 [m^3]."""
     energy = 0.0
     e, n = np.empty((3, 3)), np.empty((3, 3))
-    for cell in cells:
+    for i in range(len(cells)):
         for frame in FRAMES:
-            lack = 1.0 - _frame(q, cell, frame, e, n) / volume
+            lack = 1.0 - _frame(q, cells[i], frame, e, n) / volume
             if lack > 0.0:
-                energy += resistance * lack**3
+                energy += resistance[i] * lack**3
     return energy
 
 
 @numba.njit(cache=True)
 def resistance_change(
-    q: np.ndarray, base: np.ndarray, cells: np.ndarray, volume: float, resistance: float
+    q: np.ndarray, base: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float
 ) -> float:
     """Energy at q less that at base [J], corner by corner from how the nodes moved, so that a small change keeps
     its digits: with d_k = e_k - e'_k,  J - J' = d_1 . e_2 x e_3 + d_2 . e_3 x e'_1 + d_3 . e'_1 x e'_2."""
     change = 0.0
     e, n, before, moved = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for cell in cells:
+    for i in range(len(cells)):
+        cell, k_c = cells[i], resistance[i]
         for frame in FRAMES:
             lack_before = 1.0 - _frame(base, cell, frame, before, n) / volume
             lack = 1.0 - _frame(q, cell, frame, e, n) / volume
             if lack <= 0.0 and lack_before <= 0.0:
                 continue
             if lack <= 0.0 or lack_before <= 0.0:
-                change += resistance * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
+                change += k_c * (max(lack, 0.0) ** 3 - max(lack_before, 0.0) ** 3)
                 continue
             for k in range(3):
                 for c in range(3):
@@ -121,21 +122,22 @@ def resistance_change(
             _cross(e[2], before[0], n[1])
             _cross(before[0], before[1], n[2])  # n[0] is e_2 x e_3 from above
             larger = (moved * n).sum()
-            change -= resistance * larger / volume * (lack**2 + lack * lack_before + lack_before**2)
+            change -= k_c * larger / volume * (lack**2 + lack * lack_before + lack_before**2)
     return change
 
 
 @numba.njit(cache=True)
 def add_resistance_gradient(
-    q: np.ndarray, cells: np.ndarray, volume: float, resistance: float, gradient: np.ndarray
+    q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float, gradient: np.ndarray
 ) -> None:
     """Add the gradient [N] to ``gradient`` (l, 3)."""
     e, n = np.empty((3, 3)), np.empty((3, 3))
-    for cell in cells:
+    for i in range(len(cells)):
+        cell = cells[i]
         for frame in FRAMES:
             lack = 1.0 - _frame(q, cell, frame, e, n) / volume
             if lack > 0.0:
-                slope = -3.0 * resistance * lack * lack / volume
+                slope = -3.0 * resistance[i] * lack * lack / volume
                 for k in range(3):
                     for c in range(3):
                         gradient[cell[frame[k + 1]], c] += slope * n[k, c]
@@ -146,20 +148,21 @@ def add_resistance_gradient(
 def add_resistance_hessian(
     q: np.ndarray,
     cells: np.ndarray,
+    resistance: np.ndarray,
     volume: float,
-    resistance: float,
     projected: bool,
     v: np.ndarray,
     product: np.ndarray,
 ) -> None:
     """Add (Hessian at q) v [N] to ``product`` (l, 3); ``projected`` leaves out what the curvature of J adds."""
     e, n, w, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    for cell in cells:
+    for number in range(len(cells)):
+        cell, k_c = cells[number], resistance[number]
         for frame in FRAMES:
             lack = 1.0 - _frame(q, cell, frame, e, n) / volume
             if lack <= 0.0:
                 continue
-            slope, curvature = -3.0 * resistance * lack * lack / volume, 6.0 * resistance * lack / volume**2
+            slope, curvature = -3.0 * k_c * lack * lack / volume, 6.0 * k_c * lack / volume**2
             change = 0.0
             for k in range(3):
                 _edge(v, cell, frame, k + 1, w[k])

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.model.material import CellMaterial, calibrated_stiffness
+from msmpetsc.model.material import CellMaterial, calibrated_stiffness, edge_stiffness
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
@@ -41,6 +41,7 @@ class Lattice:
     stiffening  : of the springs' law (model.energy) [-]; 0 for Hooke's
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
                   first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
+    cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
     """
 
     table: SortedKeys
@@ -58,6 +59,7 @@ class Lattice:
     stiffening: float = 0.0
     local_cells: np.ndarray = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
+    cell_stiffness: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def owned(self) -> int:
@@ -102,15 +104,18 @@ def build_lattice(
     numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
     springs, owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
     mass, of_spring = density * h**3 / 8 * octants.sum(axis=1), young_modulus or float(stiffness)
+    of_cell = np.full(len(local_cells), of_spring)
     if of_cells is not None:
         made_of = of_cells(ijk[local_cells[:, 0]])
         mass = h**3 / 8 * _sums_of_nodes(local_cells, made_of.density, len(mass))
         of_spring = _sums_of_springs(local_cells, made_of.spring, ijk, springs, len(mass)) / sharing
+        of_cell = made_of.spring
     if stiffness is None:
-        k = calibrated_stiffness(of_spring, h, kind, sharing)
+        k, of_cell = calibrated_stiffness(of_spring, h, kind, sharing), edge_stiffness(of_cell, h)
     else:
         k = np.full(len(springs), of_spring)
     first_owned = local_cells[:, 0] < len(table.keys)
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & (stiffening > 0))])
     return Lattice(
         table=table,
         cell_size=h,
@@ -125,8 +130,9 @@ def build_lattice(
         stiffness=k,
         pinned=np.zeros(len(ijk), bool),
         stiffening=stiffening,
-        local_cells=np.concatenate([local_cells[first_owned], local_cells[~first_owned & (stiffening > 0)]]),
+        local_cells=local_cells[kept],
         cells_owned=int(first_owned.sum()),
+        cell_stiffness=of_cell[kept],
     )
 
 

@@ -34,5 +34,9 @@ def calibrated_stiffness(
     kind          : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
     cells         : (s,) number of valid cells that share the spring
     """
-    edge = 4 / 7 * young_modulus * cell_size
-    return edge * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+    return edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+
+
+def edge_stiffness(young_modulus: float | np.ndarray, cell_size: float) -> float | np.ndarray:
+    """k1 [N/m] of an edge inside a body of E [Pa], cells of h [m]."""
+    return 4 / 7 * young_modulus * cell_size

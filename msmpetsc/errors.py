@@ -40,3 +40,9 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
     """", did you mean 'x'?" with the nearest valid name; empty where none is near."""
     near = nearest(name, valid)
     return f", did you mean {near!r}?" if near else ""
+
+
+def one_line(error: Exception, length: int = 160) -> str:
+    """The first line of what a library says went wrong, of printable characters: files speak through it, too."""
+    told = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return "".join(c if c.isprintable() else "?" for c in told[:length])

@@ -1,7 +1,7 @@
 """The schema of a scene: frozen, validated tables. What a key means and its unit stand in its description."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
@@ -54,10 +54,16 @@ def _has_a_volume(box: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
     return box
 
 
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise rule("must be of printable characters")
+    return name
+
+
 def _painted(value: Any) -> str | tuple[int, ...]:
     """A file's name, or numbers of points."""
-    if isinstance(value, str) and value:
-        return value
+    if isinstance(value, str) and 0 < len(value) <= 1000:
+        return _printable(value)
     numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
     if not numbers or not value:
         raise rule("must be a list of point numbers, from 0, or the name of a file that has them")
@@ -89,6 +95,7 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
     return name
 
 
+FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
 Integrator = Literal["implicit-euler", "bdf2", "verlet"]
 Preset = Annotated[str, AfterValidator(_known_preset)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
@@ -153,7 +160,7 @@ Step = Annotated[str | dict[str, Any], BeforeValidator(_step)]
 class Mesh(Table):
     """The closed surface."""
 
-    source: str = Field(min_length=1, description="registry name, or path beside this file")
+    source: FileName = Field(description="registry name, or path beside or below this file")
     prepare: ListOf[Step] = Field(
         (),
         description="steps in this order: merge, largest_part, union, repair, orient, "
@@ -455,6 +462,14 @@ class SceneFile(Table):
     picture: Picture = Field(Picture(), description="how the result is drawn")
 
     _of_one_kind = field_validator("part")(_as_the_material)
+
+    def named_files(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
+        yield ("mesh", "source"), self.mesh.source
+        for kind in ("part", "pin", "anchor", "force"):
+            for number, table in enumerate(getattr(self, kind)):
+                if isinstance(table.region.painted, str):
+                    yield (kind, number, "region", "painted"), table.region.painted
 
 
 class Scene(SceneFile):

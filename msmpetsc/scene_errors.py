@@ -23,6 +23,7 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "int_type": "must be a whole number, got {got}",
     "string_type": "must be a string, got {got}",
     "string_too_short": "must not be empty",
+    "string_too_long": "must have at most {max_length} characters, got {got}",
     "bool_type": "must be true or false, got {got}",
     "tuple_type": "must be a list, got {got}",
     "model_type": "must be a table, got {got}",

@@ -12,13 +12,18 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene import Scene, SceneFile
 from msmpetsc.scene_errors import as_given, problem_lines
 
+LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
-def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None) -> Scene:
+
+def load_scene(
+    path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None, by_user: bool = True
+) -> Scene:
     """Read and check a scene file.
 
     overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
         number; they replace or insert before anything is checked.
     presets: the known names of solver presets; any name will do if None.
+    by_user: whether the overrides are a user's own words, which may name files out of the scene's folder; a file's may not.
 
     Raises InputError naming every problem of the file, one a line.
     """
@@ -29,6 +34,7 @@ def load_scene(path: str | Path, overrides: Iterable[str] = (), presets: Collect
         checked = SceneFile.model_validate(data, context={"presets": presets})
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
+    _refuse_outside(path, checked, keys if by_user else ())
     return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
 
 
@@ -38,9 +44,34 @@ def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
     return text, _parse(path, text)
 
 
+def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]]) -> None:
+    """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name."""
+    for keys, name in scene.named_files():
+        if any(keys[: len(own)] == own for own in given) or lies_below(path.parent, name):
+            continue
+        key = ".".join(map(str, keys))
+        raise InputError(
+            f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it; --set {key}=PATH allows it"
+        )
+
+
+def lies_below(folder: Path, name: str) -> bool:
+    """Whether a path from ``folder`` leads to what lies in it, links followed."""
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a name too long
+        return False
+
+
 def _read(path: Path, kind: str) -> str:
     try:
-        return path.read_bytes().decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: is a pipe or a device, not a {kind} file")
+        with open(path, "rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            raise InputError(f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB")
+        return content.decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
     except FileNotFoundError:
         raise InputError(f"{path}: no such {kind} file") from None
     except IsADirectoryError:
@@ -49,6 +80,8 @@ def _read(path: Path, kind: str) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not UTF-8 text (byte {error.start})") from None
+    except ValueError:
+        raise InputError(f"{as_given(str(path))}: no path has a null character") from None
 
 
 def _parse(path: Path, text: str) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
-What it does is ruled by the options: -fail ends it with an error, -hang never ends it, -children starts another
-process before that, -exit N ends it with that status, -kind K tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion is off by the time step.
+What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it, -ksp_children starts another
+process before that, -ksp_exit N ends it with that status, -ksp_kind K tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion is off by the time step.
 """
 
 import json
@@ -35,20 +35,20 @@ def main() -> None:
         with open(calls, "a") as file:
             file.write(" ".join(words) + "\n")
     count = len(calls.read_text().splitlines()) if calls.exists() else 0
-    if "-children" in words:
+    if "-ksp_children" in words:
         child = subprocess.Popen(["sleep", "60"])
         (out.parent.parent / "child").write_text(str(child.pid))
-    if "-hang" in words:
+    if "-ksp_hang" in words:
         sleep(60)
-    if "-fail" in words:
+    if "-ksp_fail" in words:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
     write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
     if comm.rank == 0:
-        kind = words[words.index("-kind") + 1] if "-kind" in words else None
+        kind = words[words.index("-ksp_kind") + 1] if "-ksp_kind" in words else None
         failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
         measure.write_text(json.dumps(told(comm.size, count, "--trace" in words) | failure))
-    if "-exit" in words:
-        sys.exit(int(words[words.index("-exit") + 1]))
+    if "-ksp_exit" in words:
+        sys.exit(int(words[words.index("-ksp_exit") + 1]))
 
 
 def write(comm, out: Path, table: dict, every: int, count: int) -> None:

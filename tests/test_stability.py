@@ -208,7 +208,7 @@ def method(label: str, options: str = "") -> str:
 
 
 def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noqa: F811
-    methods = {"good": "", "bad": "-exit 3 -kind energy", "worse": "-exit 2", "worst": "-fail"}
+    methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
     assert [(row["x"], row["outcome"], row["status"]) for row in rows] == [

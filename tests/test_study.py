@@ -264,10 +264,10 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
     rows = carry_out(
-        tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-fail", ""]', jobs=2
+        tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]', jobs=2
     )
     assert [(row["status"], row["reason"]) for row in rows] == [("failed", "planted, with reason"), ("ok", "")]
-    assert rows[0]["time_frame"] is None and rows[0]["options"] == "-fail"
+    assert rows[0]["time_frame"] is None and rows[0]["options"] == "-ksp_fail"
     assert len(calls(tmp_path)) == 3  # what fails is not repeated
 
 
@@ -280,7 +280,7 @@ def alive(pid: int) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_case_that_takes_too_long_is_ended_with_all_it_started(tmp_path: Path, stand_in):
-    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-children -hang"]\n'
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_children -ksp_hang"]\n'
     begin = time.monotonic()
     (row,) = carry_out(tmp_path, "timeout = 2\n" + text)
     assert time.monotonic() - begin < 20
@@ -309,7 +309,7 @@ run_study(Path(sys.argv[2]), Path(sys.argv[3]), None)
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
-    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-children -hang", "-never"]'
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
     words = [
         sys.executable,
         "-c",

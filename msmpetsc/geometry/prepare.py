@@ -15,6 +15,7 @@ from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
 LEAST_AREA_KEPT = 0.5
+FARTHEST = 1e12  # in the file's own unit
 
 
 def prepare(
@@ -78,6 +79,8 @@ def repair(surface: Surface) -> Surface:
     except ImportError:
         raise InputError("repair needs pymeshfix: pip install msmpetsc[repair]") from None
     surface = merge(surface)
+    if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
+        raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
     fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))

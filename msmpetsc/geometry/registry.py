@@ -79,7 +79,11 @@ def locate(source: str, folder: str | Path) -> Path:
     if source in MODELS:
         return _require(source).path
     path = Path(folder) / source
-    if not path.exists():
+    try:
+        there = path.exists()
+    except OSError:  # a name too long, a folder that may not be looked into
+        there = False
+    if not there:
         raise InputError(f"mesh '{source}' is no model{_nearest(source)} and no file: {path}")
     return path
 

@@ -15,14 +15,17 @@ from pathlib import Path
 import meshio
 import numpy as np
 import trimesh
+from trimesh.resolvers import FilePathResolver
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, one_line
+from msmpetsc.scene_reading import lies_below
 
 Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
 
 # Coordinates are often stored in single precision (1.2e-7): thinner than this, relative to its
 # longest side, a body cannot be told from a flat sheet. A plate of 1:1000 lies far above.
 FLAT = 1e-6
+MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def read_surface(path: str | Path) -> Surface:
             if faces.ndim != 2 or faces.shape[1] != 3:
                 faces = trimesh.geometry.triangulate_quads(faces)
     except Exception as error:  # on garbage the readers raise whatever comes
-        reason = (str(error).splitlines() or [""])[0][:120] or type(error).__name__
+        reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
     _check_arrays(path, points, faces)
     return Surface(
@@ -117,6 +120,8 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
     Raises InputError if the surface encloses no volume.
     """
     points = surface.points[np.unique(surface.triangles)]
+    if len(points) < 4:
+        raise InputError("the mesh encloses no volume: it has fewer than four points")
     sides = np.ptp(points @ np.linalg.svd(np.cov(points.T))[0], axis=0)
     if sides.min() <= FLAT * sides.max():
         raise InputError("the mesh encloses no volume: it is flat")
@@ -187,6 +192,8 @@ def _check_arrays(path: Path, points: np.ndarray, triangles: np.ndarray) -> None
     """Raise InputError unless the arrays make a mesh."""
     if len(triangles) == 0:
         raise InputError(f"{path}: holds no triangles")
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(f"{path}: its points are not of three numbers each")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: has coordinates that are NaN or infinite")
     if triangles.min() < 0 or triangles.max() >= len(points):
@@ -202,6 +209,8 @@ def _kind(path: Path) -> str:
     kind = Path(name.removesuffix(".gz")).suffix.removeprefix(".")
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a mesh file")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is a pipe or a device, not a mesh file")
     if kind not in _READERS:
         raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
     if name.endswith(".gz") and kind in _NEED_PATH:
@@ -213,7 +222,7 @@ def _content(path: Path) -> bytes:
     """The file's bytes, decompressed."""
     try:
         data = path.read_bytes()
-        data = gzip.decompress(data) if data.startswith(b"\x1f\x8b") else data
+        data = _decompressed(data) if data.startswith(b"\x1f\x8b") else data
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, EOFError, MemoryError, gzip.zlib.error) as error:
@@ -222,6 +231,16 @@ def _content(path: Path) -> bytes:
     if not data:
         raise InputError(f"{path}: is empty")
     return data
+
+
+def _decompressed(data: bytes) -> bytes:
+    """Not more than a mesh can shrink: gzip packs zeros a thousandfold."""
+    most = max(LEAST_LIMIT, MOST_PACKED * len(data))
+    with gzip.open(BytesIO(data)) as file:
+        found = file.read(most + 1)
+    if len(found) > most:
+        raise OSError(f"decompressed it is more than {MOST_PACKED} times as long")
+    return found
 
 
 @contextmanager
@@ -280,11 +299,20 @@ def _read_mixed_ply(data: bytes) -> Arrays:
     return mesh.points, trimesh.geometry.triangulate_quads(polygons)
 
 
+class _Beside(FilePathResolver):
+    """Hands out the files that a glTF names: those in its folder or below it, links followed, and no others."""
+
+    def get(self, name: str) -> bytes:
+        path = Path(self.parent, name)
+        if not lies_below(Path(self.parent), name) or not path.is_file():
+            raise ValueError(f"it names {name}, which is no file in its folder")
+        return path.read_bytes()
+
+
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
     kind = _kind(path)
-    source = path if kind in _NEED_PATH else BytesIO(data)  # a glTF names files beside it
     scene = trimesh.load_scene(
-        source, file_type=kind, process=False, skip_materials=True, maintain_order=True
+        BytesIO(data), file_type=kind, resolver=_Beside(path), process=False, skip_materials=True, maintain_order=True
     )
     if not scene.geometry:
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -337,4 +365,4 @@ _READERS = {
     "vtk": _read_meshio,
     **dict.fromkeys(("obj", "stl", "off", "glb", "gltf"), _read_trimesh),
 }
-_NEED_PATH = ("gltf", "vtu", "vtk")
+_NEED_PATH = ("gltf", "vtu", "vtk")  # the one names files beside it, the others' readers open it themselves

@@ -65,6 +65,8 @@ class Finder:
             return list(painted)
         path = self.folder / painted
         try:
+            if path.exists() and not path.is_file():
+                raise InputError(f"{key}.region.painted: {path} is not a file of numbers")
             numbers = [int(word) for word in path.read_text().split()]
         except OSError as error:
             raise InputError(f"{key}.region.painted: {path} cannot be read: {error.strerror}") from None

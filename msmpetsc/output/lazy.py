@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 import h5py
 import numpy as np
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, one_line
 
 
 class LazyArray:
@@ -99,12 +99,6 @@ class Arrays(Mapping):
 
     def __repr__(self) -> str:
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
-
-
-def one_line(error: Exception) -> str:
-    """What went wrong, of HDF5's many words."""
-    told = str(error).strip().splitlines() or [type(error).__name__]
-    return told[0][:160]
 
 
 def _one_an_axis(key, ndim: int) -> tuple:

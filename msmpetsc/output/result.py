@@ -15,8 +15,8 @@ import h5py
 import numpy as np
 from scipy.sparse import csr_array
 
-from msmpetsc.errors import InputError
-from msmpetsc.output.lazy import Arrays, LazyArray, one_line
+from msmpetsc.errors import InputError, one_line
+from msmpetsc.output.lazy import Arrays, LazyArray
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")

@@ -102,8 +102,8 @@ def shown_command(case: Case) -> str:
     return shlex.join([*launcher(case.ranks), "msmpetsc", *run_arguments(case)])
 
 
-def digest(scene: Path, texts: Sequence[str]) -> str:
-    """Of a scene file and of those ``texts`` in it that name files beside it."""
-    files = [scene, *(scene.parent / text for text in sorted(set(texts)))]
+def digest(scene: Path, names: Sequence[str]) -> str:
+    """Of a scene file and of those ``names`` in it that are files beside it."""
+    files = [scene, *(scene.parent / name for name in sorted(set(names)))]
     found = [path.read_bytes() for path in files if path.is_file()]
     return hashlib.sha256(b"\0".join(found)).hexdigest()[:16]

@@ -34,7 +34,7 @@ def map_cases(study: Study, of: Map, folder: Path, presets: Collection[str] | No
     methods = [method for method in study.method if not of.methods or method.label in of.methods]
     for spot in named(of) if of.case else grid(of):
         file = folder / spot.file
-        scene = load_scene(file, spot.set, presets)
+        scene = load_scene(file, spot.set, presets, by_user=False)
         told = content(file, scene)
         for method in methods:
             yield at(spot, method, of.name, study, file, told, scene)

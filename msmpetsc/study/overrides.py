@@ -1,8 +1,6 @@
 """What a case changes in its scene file, as --set takes it, and what the file and its changes amount to."""
 
 import json
-import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from msmpetsc.study.case import Case, digest
 
 def content(file: Path, scene: Scene) -> str:
     """Digest of a scene file and of the files that it names."""
-    return digest(file, list(_texts(tomllib.loads(scene.text))))
+    return digest(file, [name for _, name in scene.named_files()])
 
 
 def time_changes(case: Case, duration: float, every: int, scene: Scene) -> tuple[str, ...]:
@@ -36,12 +34,3 @@ def solver_changes(case: Case, scene: Scene) -> tuple[str, ...]:
 def inline(table: dict[str, Any]) -> str:
     """A TOML inline table of plain values; None is left out."""
     return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
-
-
-def _texts(data: Any) -> Iterator[str]:
-    """All strings in a TOML value."""
-    if isinstance(data, str):
-        yield data
-    elif isinstance(data, dict | list):
-        for item in data.values() if isinstance(data, dict) else data:
-            yield from _texts(item)

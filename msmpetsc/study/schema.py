@@ -1,16 +1,20 @@
 """The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
 
+import re
 import shlex
 from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.errors import did_you_mean
-from msmpetsc.scene import Count, Integrator, ListOf, Positive, Preset, Table
+from msmpetsc.scene import Count, FileName, Integrator, ListOf, Positive, Preset, Table
 from msmpetsc.scene_errors import rule
 
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]
+SOLVER_OPTION = re.compile(r"-(npc_|inner_|sub_|mg_\w*|esteig_)?(snes|ksp|pc|mat|mg|sub)_\w+")
+PLAIN_VALUE = re.compile(r"([-+]?\.?\d|[^\W\d])[\w.,+-]*")  # no path, no file:name, no module:class
+BESIDE_SOLVING = re.compile(r"^-\w*_(python|view|monitor|dump|load|file|filename|reason|plot|tmpdir|prefix)(_|$)")
 
 
 def _not_empty(values: tuple) -> tuple:
@@ -20,10 +24,14 @@ def _not_empty(values: tuple) -> tuple:
 
 
 def _words(options: str) -> str:
+    """A study file may choose solvers; it may not make PETSc, or us, run code, read files or write them."""
     try:
-        shlex.split(options)
+        words = shlex.split(options)
     except ValueError as error:
         raise rule(f"cannot be taken apart: {str(error).lower()}") from None
+    for word in words:
+        if not (SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)) or word == "python" or BESIDE_SOLVING.search(word):
+            raise rule(f"has {word!r}: only options of solvers, and plain values, may stand in a file")
     return options
 
 
@@ -79,7 +87,7 @@ class StudyScene(Length):
     """A scene of the study, and what of it is run and measured."""
 
     name: str = Field(min_length=1, description="what charts call it")
-    file: str = Field(min_length=1, description="scene file, beside the study file")
+    file: FileName = Field(description="scene file, a path from the study file")
     set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
     frame: Positive | None = Field(
         None, description="moments compared with the reference lie this far apart [s]; the scene's time step if absent"
@@ -150,7 +158,7 @@ class MapCase(Length):
     """A named case: a line of a map whose columns are the methods."""
 
     name: str = Field(min_length=1, description="what the map calls it")
-    file: str = Field(min_length=1, description="scene file, beside the study file")
+    file: FileName = Field(description="scene file, a path from the study file")
     set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
     recovers: bool = Field(False, description="the body should be in its rest shape at the end")
     options: Options = Field("", description="PETSc options for all methods that solve")
@@ -162,7 +170,7 @@ class Map(Length):
     one_of: ClassVar[tuple[str, ...]] = ("file", "case")
     name: str = Field(min_length=1, description="of its files and of its rows")
     title: str = Field("", description="for the reader; the name if absent")
-    file: str | None = Field(None, min_length=1, description="scene file, beside the study file")
+    file: FileName | None = Field(None, description="scene file, a path from the study file")
     set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
     methods: ListOf[str] = Field((), description="labels of the methods; all if absent")
     x: Axis | None = Field(None, description="what changes from left to right")

@@ -37,7 +37,7 @@ def _cases(
 ) -> Iterator[Case]:
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
-    as_given = load_scene(file, changes, presets)
+    as_given = load_scene(file, changes, presets, by_user=False)
     for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
         sized = (*changes, *((f"cages.count={cells}",) if cells else ()))
         base = Case(
@@ -46,7 +46,7 @@ def _cases(
         )  # fmt: skip
         reference = _reference(base, scene, scene.reference, as_given) if scene.reference else None
         for case in _methods(replace(base, reference=reference), scene, sweep, as_given):
-            load_scene(file, case.set, presets)  # what is wrong is said before anything is run
+            load_scene(file, case.set, presets, by_user=False)  # what is wrong is said before anything is run
             yield case
 
 

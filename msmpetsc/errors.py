@@ -44,5 +44,9 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 def one_line(error: Exception, length: int = 160) -> str:
     """The first line of what a library says went wrong, of printable characters: files speak through it, too."""
-    told = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return "".join(c if c.isprintable() else "?" for c in told[:length])
+    return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)
+
+
+def printable(text: str, length: int = 160) -> str:
+    """The text, cut, without what would act on a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text[:length])

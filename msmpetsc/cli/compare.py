@@ -8,7 +8,7 @@ import numpy as np
 from msmpetsc.cli.study import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.output.comparison import AT_REST, Comparison, Field, compare, place
-from msmpetsc.output.result import Result
+from msmpetsc.output.result import Result, refuse_deadly
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
@@ -39,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
     if not 0 <= args.rtol < np.inf:
         raise InputError(f"--rtol must be a number from 0 on, not {args.rtol:g}")
     names = None if args.fields is None else [name.strip() for name in args.fields.split(",")]
+    refuse_deadly(args.one)
+    refuse_deadly(args.other)
     with Result(args.one) as one, Result(args.other) as other:
         found = compare(one, other, names)
         tell_what_is_not_shared(one, other, found)

@@ -24,6 +24,7 @@ def add_parser(subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw and name the picture; returns the exit status."""
     from msmpetsc.output.render import contact_sheet  # here: the other commands need no graphics
+    from msmpetsc.output.result import refuse_deadly
 
     if args.count is not None and args.count < 1:
         raise InputError(f"--count must be at least 1, not {args.count}")
@@ -32,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
     eye = _numbers("--eye", args.eye, float, "1,-2,0.6")
     if eye is not None and not (len(eye) == 3 and any(eye) and np.isfinite(eye).all()):
         raise InputError(f"--eye takes three numbers, not all zero, not {args.eye!r}")
+    refuse_deadly(args.result)
     print(contact_sheet(args.result, picture, frames, args.count, eye))
     return 0
 

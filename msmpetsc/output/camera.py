@@ -62,4 +62,6 @@ def _across(points: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def unit(vector: Sequence[float]) -> np.ndarray:
-    return np.asarray(vector, float) / np.linalg.norm(vector)
+    vector = np.asarray(vector, float)
+    vector = vector / np.abs(vector).max()  # the squares of very large or small components leave the range
+    return vector / np.linalg.norm(vector)

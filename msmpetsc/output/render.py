@@ -22,6 +22,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.camera import Camera, place_camera
 from msmpetsc.output.frames import finished, open_result
 from msmpetsc.output.marks import MARGIN, Ground, Marks, Rest, held, marks_at
+from msmpetsc.output.result import checked_datasets, damage_told
 from msmpetsc.scene import SceneFile
 
 BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
@@ -29,6 +30,9 @@ GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
 GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.22
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
 CAPTION = 94  # [px]
+DRAWN = ("lattice/cells", "surface/points", "surface/triangles", "embedding/indptr", "embedding/indices")
+DRAWN += ("frames/kinetic", "frames/elastic", "frames/potential")
+FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must be numbers, too
 COUNT = 5  # moments, where nothing is said
 
 
@@ -54,13 +58,14 @@ def contact_sheet(
     frames : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
     eye    : direction from the body to the eye (3,); the scene's picture.eye if None
     """
-    with open_result(h5_path) as file:
+    with damage_told(Path(h5_path)), open_result(h5_path) as file:
         scene = read_scene(file)
-        if "embedding" not in file:
-            raise InputError(f"{h5_path} has no surface to draw: its scene says output.surface = false")
+        refuse_what_cannot_be_drawn(file, scene)
         moments = _moments(file, scene, frames, count)
         bodies = {index: surface_points(file, index) for index in moments}
         everywhere = np.concatenate(list(bodies.values()))
+        if not (np.abs(everywhere) < FARTHEST).all() or np.ptp(everywhere, axis=0).max() == 0:
+            raise InputError(f"{h5_path}: the surface at these moments has no extent, or none that can be drawn")
         gravity = scene.gravity and scene.gravity.acceleration
         camera = place_camera(everywhere, gravity, scene.picture.eye if eye is None else eye)
         rest = Rest(*(file[name][...] for name in ("lattice/nodes", "lattice/cells", "surface/points")))
@@ -75,11 +80,34 @@ def contact_sheet(
     return Path(png_path)
 
 
+def refuse_what_cannot_be_drawn(file: h5py.File, scene: SceneFile) -> None:
+    """Raise InputError unless what is drawn is there, of matching shapes, and names points and nodes that exist."""
+    there = checked_datasets(file)
+    if "embedding/weights" not in there:
+        raise InputError(f"{file.filename} has no surface to draw: its scene says output.surface = false")
+    for name in DRAWN:
+        if name not in there:
+            raise InputError(f"{file.filename} is damaged: it has no {name}")
+    nodes, points = len(there["lattice/nodes"]), len(there["surface/points"])
+    for name, count in {"lattice/cells": nodes, "surface/triangles": points, "embedding/indices": nodes}.items():
+        numbers = there[name][...]
+        if numbers.size == 0 or not 0 <= numbers.min() <= numbers.max() < count:
+            raise InputError(f"{file.filename} is damaged: {name} is empty, or names what is not among its {count}")
+    regions = [table.region.painted for table in (*scene.pin, *scene.anchor, *scene.force)]
+    if any(max(painted) >= points for painted in regions if isinstance(painted, tuple)):
+        raise InputError(f"{file.filename} is damaged: its scene names painted points beyond its {points}")
+    if not (np.abs(there["lattice/nodes"][...]) < FARTHEST).all() or not np.isfinite(there["embedding/weights"][...]).all():
+        raise InputError(f"{file.filename} is damaged: its lattice or its embedding has numbers that are none")
+    rows, weights = there["embedding/indptr"][...], len(there["embedding/weights"])
+    if len(rows) != points + 1 or rows[0] != 0 or rows[-1] != weights or (rows[1:] < rows[:-1]).any():
+        raise InputError(f"{file.filename} is damaged: embedding/indptr is none of {points} rows and {weights} weights")
+
+
 def read_scene(file: h5py.File) -> SceneFile:
     """The scene of a result, as run."""
     try:
         return SceneFile.model_validate(tomllib.loads(file.attrs.get("scene", "")))
-    except ValueError as error:  # pydantic's and tomllib's
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:  # pydantic's, tomllib's, of what is no text
         raise InputError(f"{file.filename} was run by another version, with a scene unknown to this one") from error
 
 

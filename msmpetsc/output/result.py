@@ -4,6 +4,10 @@ What a file claims is checked when it is opened, before anything of that size is
 an InputError of one line, or its arrays have the shapes and types of format_version 1.
 """
 
+import math
+import os
+import resource
+import signal
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +19,7 @@ import h5py
 import numpy as np
 from scipy.sparse import csr_array
 
-from msmpetsc.errors import InputError, one_line
+from msmpetsc.errors import InputError, one_line, printable
 from msmpetsc.output.lazy import Arrays, LazyArray
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
@@ -43,6 +47,8 @@ SHAPES = {
     "frames/surface": ("f", ("T", "v", 3)),
     "frames/momentum": ("f", ("T", 3)),
 }
+PATIENCE = 20  # [s] for a look at a file's tables
+CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
 
 
@@ -67,9 +73,9 @@ class Result:
         self.path = Path(path)
         self._file = open_result(path)
         try:
-            with _damage_told(self.path):
+            with damage_told(self.path):
                 self.attributes = {name: _plain(value) for name, value in self._file.attrs.items()}
-                datasets = _checked_datasets(self._file)
+                datasets = checked_datasets(self._file)
                 groups = ("lattice", "surface", "frames", "embedding", "checkpoint")
                 self.lattice, self.surface, self.frames, self._embedding, self._checkpoint = (
                     self._arrays(group, datasets) for group in groups
@@ -153,19 +159,50 @@ def open_result(path: str | Path) -> h5py.File:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} is a folder, not a file" if path.is_dir() else f"{path}: no such file")
-    with _damage_told(path):
+    with damage_told(path):
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file")
         # No lock, no cache: it may be written just now. What is read is what stands in the file.
         file = h5py.File(path, "r", locking=False, rdcc_nbytes=0)
     try:
-        with _damage_told(path):
+        with damage_told(path):
             _check_is_result(path, file)
     except BaseException:
         file.close()
         raise
     return file
+
+
+def refuse_deadly(path: Path) -> None:
+    """Raise InputError for a file on which the HDF5 library itself crashes or hangs: a child process looks at it first.
+
+    For commands: a process that has threads should not be forked.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            for number in (*CRASHES, signal.SIGALRM):
+                signal.signal(number, signal.SIG_DFL)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            signal.alarm(PATIENCE)
+            _look_at_all(path)
+        except BaseException:  # noqa: S110 - what can be told is told by who reads it
+            pass
+        finally:
+            os._exit(0)
+    status = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(status):
+        does = "hangs" if os.WTERMSIG(status) == signal.SIGALRM else "crashes"
+        raise InputError(f"{path} is damaged: the HDF5 library {does} on it")
+
+
+def _look_at_all(path: Path) -> None:
+    """Every table of the file and of each dataset a row; of the frames one row of each."""
+    with Result(path) as run:
+        for arrays in (run.lattice, run.surface, run.frames, run._embedding, run._checkpoint):
+            for array in arrays.values():
+                array[:, :1] if array.ndim == 3 else array[:1]
 
 
 def finished(file: h5py.File) -> int:
@@ -175,11 +212,20 @@ def finished(file: h5py.File) -> int:
 
 
 def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np.ndarray, np.ndarray] | None:
-    """The newest checkpoint, or None: step index, q_n and q_(n-1) of these rows of nodes (n,3) [m]."""
-    checkpoint = file["checkpoint"]
-    slot = int(np.argmax(checkpoint["step"]))
-    step = int(checkpoint["step"][slot])
-    return None if step < 0 else (step, checkpoint["q"][slot, rows], checkpoint["q_previous"][slot, rows])
+    """The newest checkpoint, or None: step index, q_n and q_(n-1) of these rows of nodes (n,3) [m].
+
+    Raises InputError, one line, for a checkpoint that no run wrote so.
+    """
+    path = Path(file.filename)
+    with damage_told(path):
+        if _held(path, file, "checkpoint") is None:
+            return None
+        steps, q, q_previous = (_check(path, file, f"checkpoint/{name}") for name in ("step", "q", "q_previous"))
+        if steps.shape != (2,) or not q.shape == q_previous.shape == (2, q.shape[1], 3):
+            raise InputError(f"{path} is damaged: its checkpoint has shapes {steps.shape}, {q.shape}, {q_previous.shape}")
+        slot = int(np.argmax(steps))
+        step = int(steps[slot])
+        return None if step < 0 else (step, q[slot, rows], q_previous[slot, rows])
 
 
 def _check_is_result(path: Path, file: h5py.File) -> None:
@@ -187,14 +233,15 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
     if not (isinstance(name, str) and name == FORMAT):
         raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
     if not (isinstance(version, int) and version == FORMAT_VERSION):
+        version = printable(str(version), 20)
         raise InputError(f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here")
-    if not isinstance(file.get("frames"), h5py.Group):
+    if not isinstance(_held(path, file, "frames"), h5py.Group):
         raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
     _check(path, file, "frames/time")
 
 
 @contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
+def damage_told(path: Path) -> Iterator[None]:
     """One line for what HDF5 and h5py raise on files that no one wrote so."""
     try:
         yield
@@ -211,13 +258,13 @@ def _plain(value):
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
+def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
     """All that belong to a result, "frames/time" and the like; InputError if one is not what it should be."""
     path = Path(file.filename)
     for name in NEEDED:
-        if name not in file:
+        if _held(path, file, name) is None:
             raise InputError(f"{path} is damaged: it has no {name}")
-    names = [name for name in SHAPES if name in file]
+    names = [name for name in SHAPES if _held(path, file, name) is not None]
     names += [f"frames/{name}" for name in file["frames"] if f"frames/{name}" not in SHAPES and _numbers(file, name)]
     datasets = {name: _check(path, file, name) for name in names}
     count, sizes = finished(file), {}
@@ -235,8 +282,11 @@ def _checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 def _numbers(file: h5py.File, name: str) -> bool:
     """Whether that is a series of numbers; a newer version may keep other things among the frames."""
-    found = file["frames"].get(name)
-    return isinstance(found, h5py.Dataset) and found.dtype.kind in "iuf"
+    frames = file["frames"]
+    if not name.isprintable() or frames.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+        return False
+    found = frames[name]
+    return isinstance(found, h5py.Dataset) and not _elsewhere(found) and found.dtype.kind in "iuf"
 
 
 def _expected(name: str, dataset: h5py.Dataset) -> tuple[str, tuple]:
@@ -244,15 +294,37 @@ def _expected(name: str, dataset: h5py.Dataset) -> tuple[str, tuple]:
     return SHAPES.get(name) or ("iuf", ("T", *dataset.shape[1:]))
 
 
+def _held(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
+    """What stands in the file under a name, None if nothing does; InputError if a link on the way leads elsewhere."""
+    here = file
+    for part in name.split("/"):
+        # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
+        if not isinstance(here, h5py.Group) or not here.id.links.exists(part.encode()):
+            return None
+        if here.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
+            raise InputError(f"{path}: {name} is a link to another place, which is not followed")
+        here = here[part]
+    return here
+
+
+def _elsewhere(dataset: h5py.Dataset) -> bool:
+    """Whether its numbers are in other files. To be asked before its shape, which HDF5 may look for there."""
+    return dataset.is_virtual or bool(dataset.external)
+
+
 def _check(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """The dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
-    dataset = file.get(name)
+    dataset = _held(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")
+    if _elsewhere(dataset):
+        raise InputError(f"{path}: {name} is kept in another file, which is not opened")
     kinds, shape = _expected(name, dataset) if dataset.shape else ("", ())
     if dataset.dtype.kind not in kinds or len(dataset.shape) != len(shape):
-        raise InputError(f"{path} is damaged: {name} has type {dataset.dtype} and shape {dataset.shape}")
-    rows, claimed = " x ".join(map(str, dataset.shape)), dataset.size * dataset.dtype.itemsize
-    if claimed > path.stat().st_size * (DEFLATE_MOST if dataset.compression else 1):
+        kind = printable(str(dataset.dtype), 40)
+        raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
+    rows = " x ".join(map(str, dataset.shape))
+    claimed = max(dataset.size, math.prod(dataset.chunks or ())) * dataset.dtype.itemsize  # a packed chunk is read whole
+    if claimed > file.id.get_filesize() * (DEFLATE_MOST if dataset.compression else 1):
         raise InputError(f"{path} is damaged: {name} claims {rows} numbers, more than the file holds")
     return dataset

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from msmpetsc.errors import nearest
+from msmpetsc.errors import nearest, printable
 
 KeyPath = tuple[str | int, ...]
 
@@ -108,7 +108,7 @@ def as_given(value: Any) -> str:
             shown = json.dumps(value, ensure_ascii=False, default=str)
         except (ValueError, RecursionError):
             return "a value too long to show"
-    return shown if len(shown) <= 60 else shown[:57] + "..."
+    return printable(shown, 60) if len(shown) <= 60 else printable(shown, 57) + "..."
 
 
 def _got(value: Any) -> str:

@@ -100,6 +100,8 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
 def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
     """Carry out one "key.path=value" in ``data``; returns the key path."""
     try:
+        if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
+            raise InputError("is not UTF-8 text")
         name, equals, raw = override.partition("=")
         path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
         if not equals or not raw.strip() or "" in path:

@@ -47,7 +47,7 @@ SHAPES = {
     "frames/surface": ("f", ("T", "v", 3)),
     "frames/momentum": ("f", ("T", 3)),
 }
-PATIENCE = 20  # [s] for a look at a file's tables
+PATIENCE = 10  # [s] for a look at a file's tables
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
 

@@ -49,7 +49,7 @@ TYPES = st.sampled_from(["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string
 VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
 
 
-@settings(TRIALS, max_examples=40)
+@settings(TRIALS, max_examples=25)
 @given(
     edits=st.lists(st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2)
 )

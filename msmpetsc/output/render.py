@@ -96,7 +96,8 @@ def refuse_what_cannot_be_drawn(file: h5py.File, scene: SceneFile) -> None:
     regions = [table.region.painted for table in (*scene.pin, *scene.anchor, *scene.force)]
     if any(max(painted) >= points for painted in regions if isinstance(painted, tuple)):
         raise InputError(f"{file.filename} is damaged: its scene names painted points beyond its {points}")
-    if not (np.abs(there["lattice/nodes"][...]) < FARTHEST).all() or not np.isfinite(there["embedding/weights"][...]).all():
+    places, shares = (there[name][...] for name in ("lattice/nodes", "embedding/weights"))
+    if not (np.abs(places) < FARTHEST).all() or not np.isfinite(shares).all():
         raise InputError(f"{file.filename} is damaged: its lattice or its embedding has numbers that are none")
     rows, weights = there["embedding/indptr"][...], len(there["embedding/weights"])
     if len(rows) != points + 1 or rows[0] != 0 or rows[-1] != weights or (rows[1:] < rows[:-1]).any():

@@ -175,7 +175,7 @@ def open_result(path: str | Path) -> h5py.File:
 
 
 def refuse_deadly(path: Path) -> None:
-    """Raise InputError for a file on which the HDF5 library itself crashes or hangs: a child process looks at it first.
+    """Raise InputError for a file on which the HDF5 library itself crashes or hangs: a child process looks first.
 
     For commands: a process that has threads should not be forked.
     """
@@ -324,7 +324,8 @@ def _check(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
         kind = printable(str(dataset.dtype), 40)
         raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
     rows = " x ".join(map(str, dataset.shape))
-    claimed = max(dataset.size, math.prod(dataset.chunks or ())) * dataset.dtype.itemsize  # a packed chunk is read whole
+    most = max(dataset.size, math.prod(dataset.chunks or ()))  # a packed chunk is read whole
+    claimed = most * dataset.dtype.itemsize
     if claimed > file.id.get_filesize() * (DEFLATE_MOST if dataset.compression else 1):
         raise InputError(f"{path} is damaged: {name} claims {rows} numbers, more than the file holds")
     return dataset

@@ -30,7 +30,8 @@ def _words(options: str) -> str:
     except ValueError as error:
         raise rule(f"cannot be taken apart: {str(error).lower()}") from None
     for word in words:
-        if not (SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)) or word == "python" or BESIDE_SOLVING.search(word):
+        known = SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)
+        if not known or word == "python" or BESIDE_SOLVING.search(word):
             raise rule(f"has {word!r}: only options of solvers, and plain values, may stand in a file")
     return options
 

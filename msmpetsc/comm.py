@@ -80,6 +80,22 @@ def starts(counts: np.ndarray) -> np.ndarray:
     return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int64)
 
 
+SAMPLES = 128  # a rank: keeps the shares within some percent of each other
+
+
+def sample_of(keys: np.ndarray, total: int, size: int) -> np.ndarray:
+    """A regular sample of one rank's ascending keys, of ``total`` that ``size`` ranks have together."""
+    step = max(1, total // (size * SAMPLES))
+    return keys[step // 2 :: step]
+
+
+def splitters_of(sample: np.ndarray, size: int) -> np.ndarray:
+    """The keys at which the next rank's share begins, (size - 1,): at equal steps of all ranks' samples."""
+    if size == 1 or len(sample) == 0:
+        return np.zeros(size - 1, np.int64)
+    return np.sort(sample)[np.arange(1, size) * len(sample) // size]
+
+
 class SortedKeys:
     """Distinct int64 keys in ascending order over all ranks; a key's place is its global index.
 
@@ -90,8 +106,6 @@ class SortedKeys:
     first : global index of ``keys[0]``
     total : number of keys on all ranks
     """
-
-    SAMPLES = 128  # a rank: keeps the shares within some percent of each other
 
     def __init__(self, comm: MPI.Comm, keys: np.ndarray):
         self.comm = comm
@@ -105,13 +119,10 @@ class SortedKeys:
         self.total = int(counts.sum())
 
     def _split(self, keys: np.ndarray) -> np.ndarray:
-        """Sample sort: the keys at equal steps of a regular sample, (size - 1,)."""
+        """Sample sort, (size - 1,)."""
         size = self.comm.size
-        step = max(1, self.comm.allreduce(len(keys)) // (size * self.SAMPLES))
-        sample = np.sort(np.concatenate(self.comm.allgather(keys[step // 2 :: step])))
-        if size == 1 or len(sample) == 0:
-            return np.zeros(size - 1, np.int64)
-        return sample[np.arange(1, size) * len(sample) // size]
+        sample = sample_of(keys, self.comm.allreduce(len(keys)), size)
+        return splitters_of(np.concatenate(self.comm.allgather(sample)), size)
 
     def owner(self, keys: np.ndarray) -> np.ndarray:
         """Rank that holds each key, or would hold it."""

@@ -9,11 +9,11 @@ from itertools import pairwise
 from mpi4py import MPI
 
 from msmpetsc import __version__
-from msmpetsc.cli import compare, fetch, plan, render, run, study
+from msmpetsc.cli import compare, fetch, inspect, plan, render, run, study
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
 
-COMMANDS = (run, study, plan, compare, render, fetch)
+COMMANDS = (run, inspect, study, plan, compare, render, fetch)
 OUR_SHORT = ("-o", "-h")
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 
@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in COMMANDS:
         command.add_parser(commands)
         sub = commands.choices[command.__name__.rpartition(".")[2]]
-        sub.set_defaults(run=command.run, parser=sub, takes_petsc_options=command is run)
+        sub.set_defaults(run=command.run, parser=sub, takes_petsc_options=command in (run, inspect))
     return parser
 
 

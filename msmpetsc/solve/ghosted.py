@@ -5,12 +5,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.limits import refuse_unknowns
 
 
 class Ghosted:
     """values (l, 3): the owned nodes, then the ghosts, in the memory of a ghosted PETSc vector."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        refuse_unknowns(lattice.table.total)
         self.values = np.zeros_like(lattice.nodes)
         self.vector = PETSc.Vec().createGhostWithArray(
             lattice.ghosts.astype(PETSc.IntType),

@@ -8,6 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
+from msmpetsc.solve.limits import refuse_nonzeros
 from msmpetsc.solve.unknowns import Unknowns
 
 
@@ -17,6 +18,8 @@ def assemble(
     """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
 
     columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A
+
+    Raises InputError for more nonzeros than PETSc can count.
     """
     lattice = unknowns.lattice
     row = np.full(len(lattice.nodes), -1)
@@ -26,6 +29,7 @@ def assemble(
     diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[unknowns.free]
     diagonal += lattice.mass[unknowns.free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
+    refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
     nodes = np.concatenate([unknowns.free, ends[kept, 1]])
     values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.comm import Route
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.limits import refuse_unknowns
 
 
 class Unknowns:
@@ -21,6 +22,8 @@ class Unknowns:
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
     places  : (l, 3) where its x, y and z stand in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
+
+    Raises InputError for more of them than PETSc can number.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
@@ -29,6 +32,7 @@ class Unknowns:
         self.size = len(self.free)
         first = comm.exscan(self.size) or 0
         self.total = comm.allreduce(self.size)
+        refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
         own[self.free] = first + np.arange(self.size)
         to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))

@@ -1,0 +1,203 @@
+"""What a run would need on R ranks, from two short runs of its scene here, on one rank and coarser lattices.
+
+    memory of a rank  =  program + f (bytes of the arrays that it holds while A is assembled),
+    time of a step    =  its (a + b s) + (iterations + 1) (c + d s) + messages,       s the springs of a rank
+
+f, a, b, c and d go through the two runs, ``its`` and ``iterations`` are those of the finer one.
+"""
+
+import hashlib
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pooch
+import trimesh
+
+from msmpetsc import __version__
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.shares import Shares
+from msmpetsc.scene import Scene
+from msmpetsc.study.case import Case
+from msmpetsc.study.figures import Row
+from msmpetsc.study.measure import Bench
+from msmpetsc.study.overrides import content, inline
+from msmpetsc.study.process import Processes
+
+COARSE, FINE = 1000, 20_000  # cells of the two runs, at most
+LONGEST = 300.0  # [s] a run
+POSITION = 24  # bytes of three doubles
+# Bytes held at once when memory is at its greatest, in solve.system.assemble: the lattice's own arrays (model.lattice),
+AT_CELL = 8 * 8 + 8 * 8 + 1 + 8  # cells, local_cells, cell_kind, key
+AT_NODE = POSITION + 8 + 8 + 1 + 8 + POSITION + 8  # nodes, key, mass, pinned, numbers, places, row
+AT_SPRING = 16 + 8 + 8 + 8 + 32 + 2  # springs, rest_length, stiffness, weight, both ends, kept
+AT_NONZERO = 5 * 8 + 2 * 4 + 12  # rows, nodes, values, the last two again, COO's and CSR's numbers, PETSc's entry
+# Of one step, counted in solve.step and PETSc's CG: exchanges of ghosts and sums over all ranks
+EXCHANGES_OF_ITS, EXCHANGES_OF_ITERATION = 1, 4
+SUMS_OF_ITS, SUMS_OF_ITERATION = 3, 10
+
+
+class Network(NamedTuple):
+    """latency [s] of a message, bandwidth [byte/s] of a rank."""
+
+    latency: float
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One short run on one rank; iterations and its are means a step."""
+
+    cells: float
+    nodes: float
+    springs: float
+    nonzeros: float
+    memory: float  # [byte]
+    of_its: float  # [s] a KSP iteration
+    of_iteration: float  # [s] of all else, an outer iteration, and one more a step
+    iterations: float
+    its: float
+
+    @classmethod
+    def of(cls, row: Row) -> "Trial":
+        its = row["ksp_its"] * row["steps"]
+        of_its = row["time_ksp"] / its if its else 0.0
+        rest = max(0.0, row["time_frame"] - of_its * row["ksp_its"]) / (row["iterations"] + 1)
+        counts = row["cells"], row["nodes"], row["springs"], row["unknowns"] + 2 * row["springs"]
+        return cls(*counts, row["memory"], of_its, rest, row["iterations"], row["ksp_its"])
+
+    @property
+    def held(self) -> float:
+        """[byte]"""
+        return held(self.cells, self.nodes, self.springs, self.nonzeros)
+
+
+def held(cells, nodes, springs, nonzeros):
+    """Bytes of arrays that a rank holds of so many."""
+    return AT_CELL * cells + AT_NODE * nodes + AT_SPRING * springs + AT_NONZERO * nonzeros
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """From a run on a coarse and one on a fine lattice."""
+
+    coarse: Trial
+    fine: Trial
+
+    @property
+    def program(self) -> float:
+        """Bytes of a rank that holds nothing."""
+        return max(0.0, self.coarse.memory - self._memory_of_byte * self.coarse.held)
+
+    @property
+    def _memory_of_byte(self) -> float:
+        return max(0.0, _slope(self.coarse.held, self.coarse.memory, self.fine.held, self.fine.memory))
+
+    def memory(self, shares: Shares, mesh: float = 0.0) -> np.ndarray:
+        """(R,) [byte]; ``mesh`` is what the surface needs on rank 0 while it is prepared."""
+        arrays = held(shares.cells, shares.nodes + shares.ghosts, shares.springs, shares.nonzeros)
+        needed = self._memory_of_byte * arrays
+        needed[0] = max(needed[0], mesh)
+        return self.program + needed
+
+    def computing(self, shares: Shares) -> float:
+        """[s] a step, of the rank that has most springs."""
+        springs, coarse, fine = shares.springs.max(), self.coarse, self.fine
+        its = _line(springs, coarse.springs, coarse.of_its, fine.springs, fine.of_its)
+        iteration = _line(springs, coarse.springs, coarse.of_iteration, fine.springs, fine.of_iteration)
+        return fine.its * its + (fine.iterations + 1) * iteration
+
+    def messages(self, shares: Shares, network: Network) -> float:
+        """[s] a step, of the rank whose ghosts take longest."""
+        its, iterations = self.fine.its, self.fine.iterations + 1
+        exchange = (shares.neighbours * network.latency + shares.ghosts * POSITION / network.bandwidth).max()
+        total = 2 * math.ceil(math.log2(shares.ranks)) * network.latency  # a sum: there and back through a tree
+        exchanges = EXCHANGES_OF_ITS * its + EXCHANGES_OF_ITERATION * iterations
+        return exchanges * exchange + (SUMS_OF_ITS * its + SUMS_OF_ITERATION * iterations) * total
+
+
+def _slope(x0: float, y0: float, x1: float, y1: float) -> float:
+    return (y1 - y0) / (x1 - x0) if x1 > x0 else 0.0
+
+
+def _line(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
+    """At x, on the line through two points; never falling with x, nor below zero at none."""
+    slope = min(max(_slope(x0, y0, x1, y1), 0.0), y1 / x1)
+    return y1 + slope * (x - x1)
+
+
+def forecast(
+    file: Path, changes: Sequence[str], options: str, scene: Scene, surface: Surface, cells: float, frames: int, again: bool
+) -> Forecast:
+    """From two runs of the first ``frames`` steps of a scene of so many ``cells``; those that were made here before
+    stand in the user's cache, unless they are to be made ``again``. Raises InputError where a run fails.
+
+    surface : prepared
+    """
+    known = _known(file, options, scene, frames)
+    if known.is_file() and not again:
+        rows = json.loads(known.read_text())
+    else:
+        rows = _measured(file, changes, options, scene, surface, cells, frames)
+        known.parent.mkdir(parents=True, exist_ok=True)
+        known.write_text(json.dumps(rows))
+    return Forecast(*map(Trial.of, rows))
+
+
+def _known(file: Path, options: str, scene: Scene, frames: int) -> Path:
+    """Where the figures of these runs on this processor are kept."""
+    what = [content(file, scene), scene.text, options, frames, __version__, _processor(), COARSE, FINE]
+    name = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:16]
+    return Path(pooch.os_cache("msmpetsc")) / "trials" / f"{name}.json"
+
+
+def _processor() -> list[str]:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    return [line for line in lines if line.startswith("model name")]
+
+
+def _measured(
+    file: Path, changes: Sequence[str], options: str, scene: Scene, surface: Surface, cells: float, frames: int
+) -> list[Row]:
+    """The rows of both runs."""
+    fine, processes = min(int(cells), FINE), Processes()
+    with tempfile.TemporaryDirectory(prefix="msmpetsc-inspect-") as folder:
+        mesh = Path(folder) / "surface.obj"
+        trimesh.Trimesh(surface.points, surface.triangles, process=False).export(mesh)
+        bench = Bench(Path(folder), processes)
+        try:
+            return [
+                _run(bench, _case(file, changes, options, scene, mesh, count, frames))
+                for count in (min(COARSE, max(1, fine // 8)), fine)
+            ]
+        finally:
+            processes.stop()
+
+
+def _run(bench: Bench, case: Case) -> Row:
+    row = bench.measure(case).row
+    if row["status"] != "ok":
+        raise InputError(f"the short run on {case.cells} cells that times are taken from: {row['reason']}")
+    return row
+
+
+def _case(
+    file: Path, changes: Sequence[str], options: str, scene: Scene, mesh: Path, cells: int, frames: int
+) -> Case:
+    """The scene's first frames on so many cells, its surface as it was prepared."""
+    cages = scene.cages.model_dump(exclude_unset=True, exclude={"cell_size", "max_cells"}) | {"count": cells}
+    time = scene.time
+    all_changes = (
+        *changes, f"mesh={inline({'source': str(mesh)})}", f"cages={inline(cages)}",
+        f"time.duration={min(frames, time.steps) * time.step!r}", "output.surface=false", "output.every=1",
+    )  # fmt: skip
+    return Case(
+        scene.title or file.stem, file, "", all_changes, time.integrator, "", options, cells, time.step, None, None, None,
+        timeout=LONGEST,
+    )  # fmt: skip

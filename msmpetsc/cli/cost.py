@@ -46,7 +46,7 @@ class Cost:
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         told["time"] = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
         told["time"]["setup"] -= min(told["time"]["factor"], told["time"]["setup"])
-        told["memory"] = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        told["memory"] = comm.allreduce(peak_memory())
         told["trace"] = simulation.trace
         told["explicit_limit"] = explicit_limit(comm, simulation.model.lattice, simulation.elasticity)
         told["failure"] = failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)}
@@ -69,6 +69,15 @@ def _write(path: Path, text: str, mode: str = "w") -> None:
             file.write(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def peak_memory() -> int:
+    """The most of this process that ever was resident [byte]; getrusage would count that of its parent, too, as it
+    was when this process was started."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    found = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
+    return 1024 * (found[0] if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def machine() -> dict:

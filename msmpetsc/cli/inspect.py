@@ -1,7 +1,6 @@
 """``msmpetsc inspect``: what a scene would need on so many ranks, without running it there."""
 
 import argparse
-import resource
 import shlex
 import signal
 from pathlib import Path
@@ -11,6 +10,7 @@ import petsc4py
 from mpi4py import MPI
 from scipy.optimize import brentq
 
+from msmpetsc.cli.cost import peak_memory
 from msmpetsc.cli.study import refuse_ranks, stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -80,9 +80,9 @@ def build(scene: Scene):
     from msmpetsc.model.build import read_body
     from msmpetsc.model.lattice import build_lattice
 
-    before = peak()
+    before = peak_memory()
     body = read_body(MPI.COMM_WORLD, scene)
-    mesh = peak() - before
+    mesh = peak_memory() - before
     wanted, h = scene.cages.count, scene.cages.cell_size
     volume = abs(body.report.volume) if body.report.closed else 0.0
     if h and max(volume / h**3, body.report.area / h**2) < 2 * MOST_BUILT or wanted and wanted <= MOST_BUILT:
@@ -100,11 +100,6 @@ def build(scene: Scene):
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
     return body, build_lattice(cages, 1.0, 1.0), cages, cells, mesh
-
-
-def peak() -> int:
-    """Of this process's resident memory [byte]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def tell_counts(args: argparse.Namespace, shares, built: int, scene: Scene) -> None:
@@ -140,7 +135,7 @@ def tell_needs(args: argparse.Namespace, scene: Scene, body, shares, cells: int,
         found = forecast(args.scene, args.set, options, scene, body.surface, cells, args.frames, args.measure_here)
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
-    memory = found.memory(shares, mesh)
+    memory = found.memory(shares, len(body.surface.points) if scene.output.surface else 0, mesh)
     print(f"{'memory [GB]':34}{memory.sum() / GB:15.3g}{memory.mean() / GB:15.3g}{memory.max() / GB:15.3g}")
     computing, messages = found.computing(shares), found.messages(shares, Network(args.latency, args.bandwidth))
     every = scene.output.every
@@ -148,15 +143,11 @@ def tell_needs(args: argparse.Namespace, scene: Scene, body, shares, cells: int,
         f"\ntime of a frame {every * (computing + messages):.3g} s: computing {every * computing:.3g} s, "
         f"messages {every * messages:.3g} s; without writing it"
     )
-    fine = found.fine
+    coarse, fine = found.coarse, found.fine
     print(
-        f"  expected with {fine.its:.1f} KSP iterations and {fine.iterations:.1f} outer ones a step, as in the first "
-        f"{args.frames} steps on {fine.cells:.0f} cells"
+        f"  expected with {found.its(shares.cells.sum()):.1f} KSP iterations and {fine.iterations:.1f} outer ones a step: "
+        f"the first {args.frames} steps took {coarse.its:.1f} on {coarse.cells:.0f} cells and {fine.its:.1f} on {fine.cells:.0f}"
     )
-    more = (cells / fine.cells) ** (1 / 3)
-    if more > 1.05 and fine.its:
-        computing += fine.its * (more - 1) * (computing + messages) / max(fine.its, 1)
-        print(f"  up to {more:.1f} times that if KSP iterations grow with the cells along a side, as those of Jacobi and ICC")
     print(
         f"  on cores, and memory for each, as here; messages of {args.latency:g} s and {args.bandwidth:g} byte/s "
         "(--latency, --bandwidth)"

@@ -1,9 +1,10 @@
 """What a run would need on R ranks, from two short runs of its scene here, on one rank and coarser lattices.
 
-    memory of a rank  =  program + f (bytes of the arrays that it holds while A is assembled),
-    time of a step    =  its (a + b s) + (iterations + 1) (c + d s) + messages,       s the springs of a rank
+    memory of a rank  =  program + f (bytes of the arrays that it holds while A is assembled), or W is made if more,
+    time of a step    =  (its + w (iterations + 1)) (a + b s) + messages,       s the springs of a rank
 
-f, a, b, c and d go through the two runs, ``its`` and ``iterations`` are those of the finer one.
+f, a and b go through the two runs; so do ``its`` of KSP, as a power of the cells; outer ``iterations`` are those of the
+finer run, and w KSP iterations are counted for what is done spring by spring in each of them.
 """
 
 import hashlib
@@ -38,6 +39,9 @@ AT_CELL = 8 * 8 + 8 * 8 + 1 + 8  # cells, local_cells, cell_kind, key
 AT_NODE = POSITION + 8 + 8 + 1 + 8 + POSITION + 8  # nodes, key, mass, pinned, numbers, places, row
 AT_SPRING = 16 + 8 + 8 + 8 + 32 + 2  # springs, rest_length, stiffness, weight, both ends, kept
 AT_NONZERO = 5 * 8 + 2 * 4 + 12  # rows, nodes, values, the last two again, COO's and CSR's numbers, PETSc's entry
+AT_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
+STEEPEST = 1 / 3  # power of the cells that its may grow with: the cells along a side, as with Jacobi
+OTHER = 5  # w: a gradient, a Hessian, two or more energies, sums over vectors
 # Of one step, counted in solve.step and PETSc's CG: exchanges of ghosts and sums over all ranks
 EXCHANGES_OF_ITS, EXCHANGES_OF_ITERATION = 1, 4
 SUMS_OF_ITS, SUMS_OF_ITERATION = 3, 10
@@ -59,23 +63,29 @@ class Trial:
     springs: float
     nonzeros: float
     memory: float  # [byte]
-    of_its: float  # [s] a KSP iteration
-    of_iteration: float  # [s] of all else, an outer iteration, and one more a step
+    time: float  # [s] of a step
     iterations: float
     its: float
 
     @classmethod
     def of(cls, row: Row) -> "Trial":
-        its = row["ksp_its"] * row["steps"]
-        of_its = row["time_ksp"] / its if its else 0.0
-        rest = max(0.0, row["time_frame"] - of_its * row["ksp_its"]) / (row["iterations"] + 1)
         counts = row["cells"], row["nodes"], row["springs"], row["unknowns"] + 2 * row["springs"]
-        return cls(*counts, row["memory"], of_its, rest, row["iterations"], row["ksp_its"])
+        return cls(*counts, row["memory"], row["time_frame"], row["iterations"], row["ksp_its"])
+
+    @property
+    def unit(self) -> float:
+        """[s] a KSP iteration."""
+        return self.time / units(self.its, self.iterations)
 
     @property
     def held(self) -> float:
         """[byte]"""
         return held(self.cells, self.nodes, self.springs, self.nonzeros)
+
+
+def units(its: float, iterations: float) -> float:
+    """KSP iterations that a step is worth."""
+    return its + OTHER * (iterations + 1)
 
 
 def held(cells, nodes, springs, nonzeros):
@@ -99,23 +109,34 @@ class Forecast:
     def _memory_of_byte(self) -> float:
         return max(0.0, _slope(self.coarse.held, self.coarse.memory, self.fine.held, self.fine.memory))
 
-    def memory(self, shares: Shares, mesh: float = 0.0) -> np.ndarray:
-        """(R,) [byte]; ``mesh`` is what the surface needs on rank 0 while it is prepared."""
+    def memory(self, shares: Shares, points: int = 0, mesh: float = 0.0) -> np.ndarray:
+        """(R,) [byte].
+
+        points : of the surface, where it is stored
+        mesh   : bytes that the surface needs on rank 0 while it is prepared
+        """
         arrays = held(shares.cells, shares.nodes + shares.ghosts, shares.springs, shares.nonzeros)
-        needed = self._memory_of_byte * arrays
+        needed = np.maximum(self._memory_of_byte * arrays, AT_POINT * points / shares.ranks)
         needed[0] = max(needed[0], mesh)
         return self.program + needed
 
+    def its(self, cells: float) -> float:
+        """KSP iterations of a step of so many cells."""
+        coarse, fine = self.coarse, self.fine
+        if not min(coarse.its, fine.its) > 0 or fine.cells <= coarse.cells:
+            return fine.its
+        power = math.log(fine.its / coarse.its) / math.log(fine.cells / coarse.cells)
+        return fine.its * (cells / fine.cells) ** min(max(power, 0.0), STEEPEST)
+
     def computing(self, shares: Shares) -> float:
         """[s] a step, of the rank that has most springs."""
-        springs, coarse, fine = shares.springs.max(), self.coarse, self.fine
-        its = _line(springs, coarse.springs, coarse.of_its, fine.springs, fine.of_its)
-        iteration = _line(springs, coarse.springs, coarse.of_iteration, fine.springs, fine.of_iteration)
-        return fine.its * its + (fine.iterations + 1) * iteration
+        coarse, fine = self.coarse, self.fine
+        unit = _line(shares.springs.max(), coarse.springs, coarse.unit, fine.springs, fine.unit)
+        return units(self.its(shares.cells.sum()), fine.iterations) * unit
 
     def messages(self, shares: Shares, network: Network) -> float:
         """[s] a step, of the rank whose ghosts take longest."""
-        its, iterations = self.fine.its, self.fine.iterations + 1
+        its, iterations = self.its(shares.cells.sum()), self.fine.iterations + 1
         exchange = (shares.neighbours * network.latency + shares.ghosts * POSITION / network.bandwidth).max()
         total = 2 * math.ceil(math.log2(shares.ranks)) * network.latency  # a sum: there and back through a tree
         exchanges = EXCHANGES_OF_ITS * its + EXCHANGES_OF_ITERATION * iterations

@@ -54,20 +54,25 @@ class Shares:
 
     def scaled(self, cells: float) -> "Shares":
         """Those of the same body with more cells on as many ranks: what fills it grows with the cells, the surface
-        with their power 2/3, and ghosts with the shell around a cube of as many nodes as a rank has."""
+        with their power 2/3; ghosts and cut springs as they do around a cube of as many nodes as a rank has."""
         f = cells / self.cells.sum()
         nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
-        per_rank = nodes / self.nodes.sum()
-        shell = _shell(self.nodes.mean() * per_rank) / _shell(self.nodes.mean())
-        cut = self.cut * shell
-        inner = self.inner * (springs - cut.sum() / 2) / self.inner.sum()
-        return Shares(self.cells * f, self.nodes * per_rank, self.ghosts * shell, inner, cut, self.neighbours)
+        before, after = np.cbrt(self.nodes.mean()), np.cbrt(nodes / self.ranks)
+        cut = self.cut * _cut_springs(after) / _cut_springs(before)
+        inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
+        ghosts = self.ghosts * _shell(after) / _shell(before)
+        return Shares(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
 
 
-def _shell(nodes: float) -> float:
-    """Nodes around a cube of ``nodes``."""
-    return (np.cbrt(nodes) + 2) ** 3 - nodes
+def _shell(side: float) -> float:
+    """Nodes around a cube of side^3 nodes."""
+    return (side + 2) ** 3 - side**3
+
+
+def _cut_springs(side: float) -> float:
+    """Springs from a cube of side^3 nodes to those around it: 26 a node, less twice those within."""
+    return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
 
 
 def count_shares(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Shares:

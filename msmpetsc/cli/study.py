@@ -23,6 +23,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--full", action="store_true", help="also what is marked full = true: the long cases")
     parser.add_argument("--jobs", type=int, metavar="N", help="cases at a time (they slow each other)")
     parser.add_argument("--restart", action="store_true", help="forget the cases that are done")
+    only = parser.add_mutually_exclusive_group()
+    only.add_argument("--part", metavar="I/N", help="only the I-th of N parts, for another machine or array task")
+    only.add_argument("--list", action="store_true", help="only say which cases there are, and which are done")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,6 +33,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_ranks("study")
     if args.jobs is not None and args.jobs < 1:
         raise InputError(f"--jobs must be at least 1, not {args.jobs}")
+    part = part_of(args.part)
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.study import run_study
 
@@ -37,15 +41,45 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
+    if args.list:
+        tell_cases(args, folder)
+        return 0
     try:
-        rows = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart)
+        rows = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart, part)
     except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename or folder}: {error.strerror}") from None
     tell_of(rows)
+    if part:
+        print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report
+        return 0
     from msmpetsc.study.report import write_report  # loads the charts: a second that refused files need not wait
 
     print(write_report(folder))
     return 0
+
+
+def part_of(text: str | None):
+    """"3/16" as the third of 16 parts. Raises InputError."""
+    from msmpetsc.study.study import Part
+
+    if text is None:
+        return None
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
+        raise InputError(f"--part must read I/N, 1 <= I <= N, not {text}")
+    return Part(int(index), int(count))
+
+
+def tell_cases(args: argparse.Namespace, folder: Path) -> None:
+    """A line a case; its number is the I of --part I/N, where N is the number of cases."""
+    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.study.case import shown_command
+    from msmpetsc.study.study import list_study
+
+    listed = list_study(args.study, folder, PRESETS, args.full)
+    for number, (case, done) in enumerate(listed, 1):
+        print(f"{number:4} {'done' if done else 'open'}  {case.scene}: {case.label}  {shown_command(case)}")
+    print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
 
 
 def tell_of(rows: list[dict]) -> None:

@@ -26,7 +26,7 @@ from msmpetsc.study.figures import of_frames, together
 from msmpetsc.study.plan import Method, Trial, cheapest, plan_step, plan_trajectory
 from msmpetsc.study.reading import load_study
 from msmpetsc.study.scene_lines import put_into
-from msmpetsc.study.study import run_study
+from msmpetsc.study.study import Part, list_study, run_study
 from msmpetsc.study.sweep import cases
 from msmpetsc.study.table import COLUMNS, read_table, write_table
 from msmpetsc.study.trajectory import common_times, trajectory_error
@@ -260,6 +260,47 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
     assert [row["error"] for row in again] == [0.2, 0.01] and again[1] == first[1]
     carry_out(tmp_path, text + "[0.2, 0.01]", restart=True)
     assert len(calls(tmp_path)) == 5
+
+
+def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
+    """Three cases in two parts of 1 and 2; one part is run twice, its cases once."""
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = [0.3, 0.2, 0.1]'
+    path, out = study_file(tmp_path, text), tmp_path / "out"
+    found = {index: run_study(path, out, None, part=Part(index, 2)) for index in (2, 1, 2)}
+    assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3], [0.2, 0.1]]
+    assert not (out / "table.csv").exists() and [done for _, done in list_study(path, out, None)] == [True] * 3
+    assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [1, 2]
+    rows = carry_out(tmp_path, text)
+    assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
+    assert rows == [row for part in ("1-of-2", "2-of-2") for row in read_table(out / "parts" / part)]
+
+
+def test_what_a_part_lacks_the_whole_runs(tmp_path: Path, stand_in):
+    text = ONE_SCENE + 'trace = 2\n[[sweep]]\ntrace = true\npresets = ["newton"]\nerrors = [0.2, 0.1]'
+    path, out = study_file(tmp_path, text), tmp_path / "out"
+    run_study(path, out, None, part=Part(2, 2))
+    assert [done for _, done in list_study(path, out, None)] == [False, True]
+    assert run_study(path, out, None, part=Part(9, 9))[0]["error"] == 0.1  # done by another part
+    assert not (out / "parts" / "9-of-9" / "calls.txt").exists()
+    assert run_study(path, out, None, part=Part(1, 9)) == []  # more parts than cases
+    carry_out(tmp_path, text)
+    assert len(calls(tmp_path)) == 1
+    assert len(json.loads((out / "traces.json").read_text())) == 2
+
+
+@pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3", "1/", "-1/3"])
+def test_a_part_that_is_none_is_refused(tmp_path: Path, capsys, own_log, part: str):
+    path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
+    assert main(["study", str(path), "-o", str(tmp_path / "out"), f"--part={part}"]) == 2
+    assert capsys.readouterr().err == f"msmpetsc: error: --part must read I/N, 1 <= I <= N, not {part}\n"
+
+
+def test_the_list_names_each_case_and_runs_none(tmp_path: Path, capsys, own_log):
+    path = study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton", "anderson"]')
+    assert main(["study", str(path), "-o", str(tmp_path / "out"), "--list"]) == 0
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("   1 open  a: newton  msmpetsc run ") and second.startswith("   2 open  a: anderson  ")
+    assert last == "2 cases, 0 done" and not (tmp_path / "out").exists()
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):

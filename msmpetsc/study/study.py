@@ -76,8 +76,8 @@ def run_study(
     """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
 
     The folder gets table.csv, table.h5, traces.json, study.toml, references/. Cases that are done and still in the
-    file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in its own folder,
-    and only its rows are returned. Raises InputError before anything is run.
+    file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
+    its own, and only its rows are returned. Raises InputError before anything is run.
     """
     study = load_study(path, presets)
     every, wanted = _cases(study, path, full, presets)

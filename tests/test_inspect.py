@@ -191,7 +191,7 @@ def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log, 
     monkeypatch.setattr(forecast, "forecast", None)
     found = counted(scene, 300, 3)
     assert main(["inspect", str(scene), "--ranks", "3", "--no-times"]) == 0
-    told = {line[:34].strip(): line[34:].split() for line in capsys.readouterr().out.splitlines()}
+    told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
     assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
     assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
 

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc import scene
 from msmpetsc.comm import sample_of, splitters_of
-from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.cages import Body, Cages, fill
+from msmpetsc.geometry.cell_size import choose_cell_size
 from msmpetsc.geometry.interior import Slab
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.lattice import Lattice, build_lattice
 
+MOST = 1 << 40  # cells: the scene's own limit is for runs
 INNER_SPRINGS = 13  # of each cell, where cells have neighbours on all sides
 
 
@@ -73,6 +76,26 @@ def _shell(side: float) -> float:
 def _cut_springs(side: float) -> float:
     """Springs from a cube of side^3 nodes to those around it: 26 a node, less twice those within."""
     return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
+
+
+def shares_of(body: Body, wanted: scene.Cages, ranks: int, most: int) -> tuple[Shares, int]:
+    """The shares of ``ranks`` ranks, and the cells of the lattice that they were counted on: one with about ``most``
+    cells, and scaled, where more are wanted."""
+    h, report = wanted.cell_size, body.report
+    guess = wanted.count or _cells(abs(report.volume), 3 / 4 * report.area, h)  # as choose_cell_size does
+    size = h if h and guess <= most else choose_cell_size(body, min(wanted.count or most, most), wanted.method, MOST)
+    cages = fill(body, size, wanted.method, MOST)
+    shares = count_shares(body, cages, build_lattice(cages, 1.0, 1.0), ranks)
+    found = int(shares.cells.sum())
+    if guess > most:
+        volume = abs(report.volume) if report.closed else found * size**3
+        shares = shares.scaled(wanted.count or round(_cells(volume, (found * size**3 - volume) / size, h)))
+    return shares, found
+
+
+def _cells(volume: float, area: float, h: float) -> float:
+    """How many of side h fill a volume and stick out of an area, whose share h decides."""
+    return volume / h**3 + area / h**2
 
 
 def count_shares(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Shares:

@@ -154,7 +154,14 @@ def _line(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
 
 
 def forecast(
-    file: Path, changes: Sequence[str], options: str, scene: Scene, surface: Surface, cells: float, frames: int, again: bool
+    file: Path,
+    changes: Sequence[str],
+    options: str,
+    scene: Scene,
+    surface: Surface,
+    cells: float,
+    frames: int,
+    again: bool,
 ) -> Forecast:
     """From two runs of the first ``frames`` steps of a scene of so many ``cells``; those that were made here before
     stand in the user's cache, unless they are to be made ``again``. Raises InputError where a run fails.
@@ -219,6 +226,6 @@ def _case(
         f"time.duration={min(frames, time.steps) * time.step!r}", "output.surface=false", "output.every=1",
     )  # fmt: skip
     return Case(
-        scene.title or file.stem, file, "", all_changes, time.integrator, "", options, cells, time.step, None, None, None,
-        timeout=LONGEST,
+        scene.title or file.stem, file, "", all_changes, time.integrator, "", options, cells, time.step, None, None,
+        None, timeout=LONGEST,
     )  # fmt: skip

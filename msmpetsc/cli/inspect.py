@@ -123,7 +123,7 @@ def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", share
         f"\ntime of a frame {computing + messages:.3g} s: computing {computing:.3g} s, messages {messages:.3g} s; "
         "without writing it\n"
         f"  expected with {found.its(cells):.1f} KSP iterations and {fine.iterations:.1f} outer ones a step: the first "
-        f"{args.frames} steps took {coarse.its:.1f} on {coarse.cells:.0f} cells and {fine.its:.1f} on {fine.cells:.0f},\n"
+        f"{args.frames} took {coarse.its:.1f} on {coarse.cells:.0f} cells and {fine.its:.1f} on {fine.cells:.0f},\n"
         f"  on cores, and memory for each, as here; messages of {network.latency:g} s and {network.bandwidth:g} byte/s "
         "(--latency, --bandwidth)"
     )

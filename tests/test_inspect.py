@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,7 +157,13 @@ def test_the_laws_of_memory_and_time_are_found():
 def test_its_grow_no_faster_than_the_side_and_never_fall():
     assert Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 500)).its(40**3) == pytest.approx(1000)
     assert Forecast(trial(8, 0, 1, 30), trial(20, 0, 1, 20)).its(40**3) == 20
-    assert Forecast(trial(8, 0, 1, 0), trial(20, 0, 1, 0)).its(40**3) == 0
+    solved = Forecast(trial(8, 0, 1, 0), trial(20, 0, 1, 0))
+    assert solved.its(40**3) == 0 and solved.iterations(40**3) == 2
+
+
+def test_substeps_of_verlet_grow_as_the_side():
+    coarse, fine = (replace(trial(side, 0, 1, 0), iterations=side) for side in (8, 20))
+    assert Forecast(coarse, fine).iterations(40**3) == pytest.approx(40)
 
 
 def test_messages_cost_latency_and_bandwidth():

@@ -118,12 +118,15 @@ def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", share
     print(f"{'memory [GB]':{WIDTH}}{memory.sum() / GB:15.3g}{memory.mean() / GB:15.3g}{memory.max() / GB:15.3g}")
     every, network = scene.output.every, Network(args.latency, args.bandwidth)
     computing, messages = every * found.computing(shares), every * found.messages(shares, network)
-    coarse, fine = found.coarse, found.fine
+    trials = found.coarse, found.fine
+    explicit = scene.time.integrator == "verlet"
+    first, second = (f"{t.iterations if explicit else t.its:.1f} on {t.cells:.0f}" for t in trials)
+    work = f"{found.iterations(cells):.1f} {'substeps' if explicit else 'outer ones'} a step"
+    work = work if explicit else f"{found.its(cells):.1f} KSP iterations and {work}"
     print(
         f"\ntime of a frame {computing + messages:.3g} s: computing {computing:.3g} s, messages {messages:.3g} s; "
         "without writing it\n"
-        f"  expected with {found.its(cells):.1f} KSP iterations and {fine.iterations:.1f} outer ones a step: the first "
-        f"{args.frames} took {coarse.its:.1f} on {coarse.cells:.0f} cells and {fine.its:.1f} on {fine.cells:.0f},\n"
+        f"  expected with {work}: the first {args.frames} took {first} cells and {second},\n"
         f"  on cores, and memory for each, as here; messages of {network.latency:g} s and {network.bandwidth:g} byte/s "
         "(--latency, --bandwidth)"
     )

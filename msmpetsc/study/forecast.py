@@ -4,7 +4,7 @@
     time of a step    =  (its + w (iterations + 1)) (a + b s) + messages,       s the springs of a rank
 
 f, a and b go through the two runs; so do ``its`` of KSP, as a power of the cells; outer ``iterations`` are those of the
-finer run, and w KSP iterations are counted for what is done spring by spring in each of them.
+finer run (verlet's substeps grow as its do), and w KSP iterations are counted for what is done spring by spring in each of them.
 """
 
 import hashlib
@@ -122,21 +122,31 @@ class Forecast:
 
     def its(self, cells: float) -> float:
         """KSP iterations of a step of so many cells."""
-        coarse, fine = self.coarse, self.fine
-        if not min(coarse.its, fine.its) > 0 or fine.cells <= coarse.cells:
-            return fine.its
-        power = math.log(fine.its / coarse.its) / math.log(fine.cells / coarse.cells)
-        return fine.its * (cells / fine.cells) ** min(max(power, 0.0), STEEPEST)
+        return self._grown("its", cells)
+
+    def iterations(self, cells: float) -> float:
+        """Outer ones; where nothing is solved they are substeps, and grow as the cells along a side do."""
+        return self.fine.iterations if self.fine.its else self._grown("iterations", cells)
+
+    def _grown(self, name: str, cells: float) -> float:
+        """As the power of the cells that goes through the two runs."""
+        coarse, fine = getattr(self.coarse, name), getattr(self.fine, name)
+        if not min(coarse, fine) > 0 or self.fine.cells <= self.coarse.cells:
+            return fine
+        power = math.log(fine / coarse) / math.log(self.fine.cells / self.coarse.cells)
+        return fine * (cells / self.fine.cells) ** min(max(power, 0.0), STEEPEST)
 
     def computing(self, shares: Shares) -> float:
         """[s] a step, of the rank that has most springs."""
         coarse, fine = self.coarse, self.fine
         unit = _line(shares.springs.max(), coarse.springs, coarse.unit, fine.springs, fine.unit)
-        return units(self.its(shares.cells.sum()), fine.iterations) * unit
+        cells = shares.cells.sum()
+        return units(self.its(cells), self.iterations(cells)) * unit
 
     def messages(self, shares: Shares, network: Network) -> float:
         """[s] a step, of the rank whose ghosts take longest."""
-        its, iterations = self.its(shares.cells.sum()), self.fine.iterations + 1
+        cells = shares.cells.sum()
+        its, iterations = self.its(cells), self.iterations(cells) + 1
         exchange = (shares.neighbours * network.latency + shares.ghosts * POSITION / network.bandwidth).max()
         total = 2 * math.ceil(math.log2(shares.ranks)) * network.latency  # a sum: there and back through a tree
         exchanges = EXCHANGES_OF_ITS * its + EXCHANGES_OF_ITERATION * iterations

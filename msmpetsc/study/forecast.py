@@ -3,8 +3,8 @@
     memory of a rank  =  program + f (bytes of the arrays that it holds while A is assembled), or W is made if more,
     time of a step    =  (its + w (iterations + 1)) (a + b s) + messages,       s the springs of a rank
 
-f, a and b go through the two runs; so do ``its`` of KSP, as a power of the cells; outer ``iterations`` are those of the
-finer run (verlet's substeps grow as its do), and w KSP iterations are counted for what is done spring by spring in each of them.
+f, a and b go through the two runs; so do ``its`` of KSP, as a power of the cells. Outer ``iterations`` are those of the
+finer run (verlet's substeps grow as its do); w KSP iterations are counted for what is done spring by spring in each.
 """
 
 import hashlib

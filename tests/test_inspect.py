@@ -1,6 +1,7 @@
 """What inspect says of R ranks, against what R ranks hold; and where integers end."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -33,12 +34,13 @@ SELF = MPI.COMM_SELF
 def scene(ball: Path, tmp_path: Path) -> Path:
     """A ball of 300 cells, struck by the ground: its steps need iterations."""
     path = tmp_path / "scene.toml"
-    path.write_text(f"""
-        mesh = {{ source = "{ball}" }}
-        cages = {{ count = 300 }}
-        material = {{ young_modulus = 1e5, density = 1000 }}
-        time = {{ step = 0.01, duration = 0.1 }}
-        start = {{ scale = [1, 1, 0.8] }}
+    shutil.copy(ball, tmp_path / "ball.ply")
+    path.write_text("""
+        mesh = { source = "ball.ply" }
+        cages = { count = 300 }
+        material = { young_modulus = 1e5, density = 1000 }
+        time = { step = 0.01, duration = 0.1 }
+        start = { scale = [1, 1, 0.8] }
     """)
     return path
 

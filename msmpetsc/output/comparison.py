@@ -59,6 +59,7 @@ class Comparison:
     left_out: list[str]
 
 
+@np.errstate(all="ignore")  # what overflows differs, and is told of as that
 def compare(one: Result, other: Result, names: Sequence[str] | None = None) -> Comparison:
     """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
 

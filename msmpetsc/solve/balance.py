@@ -19,6 +19,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.model.worst import inside_out, place_of_greatest
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 
@@ -105,6 +106,16 @@ class EnergyBalance:
     def keep(self, after: Energies, ledger: Ledger, result: StepResult) -> None:
         """The step is taken."""
         self.known, self.ledger = (result.position, after.elastic), ledger
+
+    def save(self, saved: Saved, state: State) -> None:
+        known = self.known is not None and state.q is self.known[0]
+        saved.numbers |= vars(self.ledger) | {"elastic": self.known[1] if known else np.nan}
+
+    def restore(self, saved: Saved, state: State) -> None:
+        numbers = saved.numbers
+        self.ledger = Ledger(**{name: numbers[name] for name in vars(Ledger()) if name in numbers})
+        elastic = numbers.get("elastic", np.nan)
+        self.known = None if np.isnan(elastic) else (state.q, elastic)
 
     def _start(self, before: State, result: StepResult, time: float, time_step: float) -> tuple[float, float]:
         """Right side of the balance, and the work in it: of loads, and of obstacles that drag [J] (collective)."""

@@ -2,7 +2,10 @@
 
 import numpy as np
 
+from msmpetsc.solve.checkpoint import Saved, with_ghosts
 from msmpetsc.solve.functional import StepFunctional
+
+SAVED = ("correction", "correction_before")
 
 
 class FirstGuess:
@@ -39,6 +42,21 @@ class FirstGuess:
     def learn(self, x: np.ndarray) -> None:
         """The step has come to x (l, 3) [m]."""
         self.corrections = [x - self.functional.y, *self.corrections[:1]]
+
+    def save(self, saved: Saved) -> None:
+        if not self.extrapolate:
+            return
+        lattice = self.functional.lattice
+        missing = [np.zeros((lattice.owned, 3))] * (2 - len(self.corrections))
+        saved.numbers["corrections"] = len(self.corrections)
+        for name, rows in zip(SAVED, [*self.corrections, *missing], strict=True):
+            saved.rows[name] = rows[: lattice.owned]
+
+    def restore(self, saved: Saved) -> None:
+        """Collective."""
+        names = SAVED[: int(saved.numbers.get("corrections", 0))]
+        comm, lattice = self.functional.comm, self.functional.lattice
+        self.corrections = [with_ghosts(comm, lattice, saved.rows[name]) for name in names]
 
     def _held(self, guess: np.ndarray) -> np.ndarray:
         """The guess, but with the held nodes where they will be."""

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from msmpetsc import scene
 from msmpetsc.model.build import Model
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.measured import Measured, Trace
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
@@ -31,6 +32,7 @@ class ImplicitEuler:
     """
 
     SHARE = 1.0  # tau / t
+    looks_back = False  # whether it has a use for State.history
 
     def __init__(
         self,
@@ -114,6 +116,18 @@ class ImplicitEuler:
             self.stepper, self.reference = self._new_stepper(time), None
             self.stepper.set_up()
 
+    def save(self, saved: Saved, _: State) -> None:
+        self.stepper.save(saved)
+
+    def restore(self, saved: Saved, _: State, time: float) -> None:
+        """Go on after a step that ended at ``time`` (collective)."""
+        self._let_go(time)
+        self.stepper.restore(saved)
+
+    def forget(self) -> None:
+        """Let the steps so far leave no trace in the next (collective)."""
+        self.stepper.restore(Saved())
+
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective).
 
@@ -141,6 +155,7 @@ class Bdf2(ImplicitEuler):
     """
 
     SHARE = 2 / 3
+    looks_back = True
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """As of implicit Euler. A node that bounces off forgets what was before."""

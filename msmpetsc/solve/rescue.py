@@ -10,6 +10,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.implicit import ImplicitEuler
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
@@ -72,6 +73,8 @@ class Rescue:
             told = str(failure).split("; try ")[0]
             log.warning("t = %.6g s: the step %s: it is %s", time, told, WORDS[self.on_failure])
         self.rescued += 1
+        for integrator in self.spare.values():
+            integrator.forget()  # so that a checkpoint need not remember them
         done = Done()
         if self.on_failure == "fallback":
             result, after = self._take(0, state, time, done)
@@ -80,6 +83,12 @@ class Rescue:
             result, after = self._in_pieces(state, time, max(self.level, 1) if failure else self.level, done)
         result = replace(result, error=done.error, iterations=done.iterations, ksp_its=done.ksp_its)
         return result, after, done
+
+    def save(self, saved: Saved) -> None:
+        saved.numbers |= {"level": self.level, "rescued": self.rescued}
+
+    def restore(self, saved: Saved) -> None:
+        self.level, self.rescued = (int(saved.numbers.get(name, 0)) for name in ("level", "rescued"))
 
     def sum_up(self) -> None:
         """At the end of a run: how often it was."""

@@ -14,6 +14,7 @@ from msmpetsc.model.frame import Frame
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Scene
 from msmpetsc.solve.balance import EnergyBalance
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.rescue import Done, Rescue
@@ -70,12 +71,17 @@ class Simulation:
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        self.state = State(q.copy(), q - self.time_step * velocity)
+        self.state, self.effort = State(q.copy(), q - self.time_step * velocity), Effort()
+        self.step = 0  # steps taken
 
     @property
     def stored(self) -> int:
         """Number of frames, frame 0 included."""
-        return 1 + -(-self.steps // self.every)
+        return self.stored_until(self.steps)
+
+    def stored_until(self, step: int) -> int:
+        """Number of frames of the first steps."""
+        return 1 + (-(-step // self.every) if step == self.steps else step // self.every)
 
     def frames(self) -> Iterator[Frame]:
         """Frame 0, then one frame for every ``every``-th step and for the last (collective). ``state`` always goes
@@ -83,10 +89,14 @@ class Simulation:
 
         Raises StepFailed on all ranks, naming the step.
         """
-        state, self.effort = self.state, Effort()
-        self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0)
-        yield self._frame(0, state.q)
-        for index in range(1, self.steps + 1):
+        return (frame for frame in self.advance() if frame is not None)
+
+    def advance(self) -> Iterator[Frame | None]:
+        """The same, with None after the steps between: after each the run may stop, or be saved (collective)."""
+        if self.step == 0:
+            self.energies = self.balance.energies(self.state.q, self.state.velocity(self.time_step), 0.0)
+            yield self._frame(0, self.state.q)
+        for index in range(self.step + 1, self.steps + 1):
             if index == self.measured.trace:
                 self.integrator.follow()
             begin = perf_counter()
@@ -96,10 +106,32 @@ class Simulation:
                 errors, trace = self.integrator.true_errors(index, result)
                 self.effort.measure(errors)
                 self.trace = trace or self.trace
-            if index % self.every == 0 or index == self.steps:
-                yield self._frame(index, result.position)
+            self.step = index
+            yield self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
         self.watch.sum_up()
         self.rescue.sum_up()
+
+    def saved(self) -> Saved:
+        """All that the next step depends on; to be stored or copied before that is taken."""
+        saved = Saved(self.step)
+        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back)
+        for part in (self.integrator, self.balance):
+            part.save(saved, self.state)
+        for part in (self.rescue, self.watch):
+            part.save(saved)
+        saved.numbers |= vars(self.effort)
+        return saved
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from there (collective)."""
+        self.step, time = saved.step, saved.step * self.time_step
+        self.state = State.restored(self.comm, self.model.lattice, saved)
+        self.integrator.restore(saved, self.state, time)
+        self.balance.restore(saved, self.state)
+        for part in (self.rescue, self.watch):
+            part.restore(saved)
+        fields = {name: type(value) for name, value in vars(Effort()).items() if name in saved.numbers}
+        self.effort = Effort(**{name: kind(saved.numbers[name]) for name, kind in fields.items()})
 
     def _step(self, index: int) -> tuple[StepResult, Done]:
         """The step that ends at index * t; ``state`` moves on (collective)."""

@@ -3,6 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.checkpoint import Saved, with_ghosts
+
+HISTORY = ("history_q", "history_v")
 
 
 @dataclass(frozen=True)
@@ -24,3 +30,18 @@ class State:
     def over(self, time_step: float, shorter: float) -> "State":
         """The same for steps of another length."""
         return State(self.q, self.q - shorter / time_step * (self.q - self.q_previous))
+
+    def save(self, saved: Saved, owned: int, looks_back: bool) -> None:
+        """looks_back : whether the integrator has a use for the history"""
+        saved.rows |= {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
+        if looks_back:
+            saved.numbers["history"] = self.history is not None
+            history = self.history or (np.zeros((owned, 3)),) * 2
+            saved.rows |= {name: rows[:owned] for name, rows in zip(HISTORY, history, strict=True)}
+
+    @staticmethod
+    def restored(comm: MPI.Comm, lattice: Lattice, saved: Saved) -> "State":
+        """Collective."""
+        names = ("q", "q_previous", *HISTORY) if saved.numbers.get("history") else ("q", "q_previous")
+        q, q_previous, *history = (with_ghosts(comm, lattice, saved.rows[name]) for name in names)
+        return State(q, q_previous, tuple(history) or None)

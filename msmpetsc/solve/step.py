@@ -12,6 +12,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
 from msmpetsc.model.worst import inside_out, place_of_greatest
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
@@ -196,6 +197,22 @@ class Stepper:
         self.first_guess.learn(functional.q)
         return StepResult(functional.q.copy(), q, self.last_error, iterations, self.its - its_before)
 
+    def save(self, saved: Saved) -> None:
+        """What the next step depends on beside what it is given."""
+        self.first_guess.save(saved)
+        saved.numbers["ratio"] = self.ratio
+        if self.touches:
+            bound = saved.rows["contact_bound"] = np.zeros(self.lattice.owned)
+            bound[self.unknowns.free] = self.added[: self.unknowns.size]
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from there; from nothing saved as if no step had been taken (collective)."""
+        self.first_guess.restore(saved)
+        self.ratio = saved.numbers.get("ratio", FIRST_RATIO)
+        if self.touches:
+            bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))[self.unknowns.free]
+            self._add_to_preconditioner(np.tile(bound, len(self.diagonal) // max(len(bound), 1)))
+
     def all_its(self) -> int:
         """KSP iterations of all steps so far, and of their estimates."""
         return total_iterations(self.ksp) + total_iterations(self.estimate.ksp)
@@ -281,10 +298,13 @@ class Stepper:
         bound = np.tile(bound, len(self.diagonal) // max(len(bound), 1))
         changed = self.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR)
         if changed:
-            self.added = bound
-            self.scalar.array[:] = self.diagonal + self.t2 * bound
-            self.preconditioned.setDiagonal(self.scalar)
+            self._add_to_preconditioner(bound)
         return changed
+
+    def _add_to_preconditioner(self, bound: np.ndarray) -> None:
+        self.added = bound
+        self.scalar.array[:] = self.diagonal + self.t2 * bound
+        self.preconditioned.setDiagonal(self.scalar)
 
     def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
         """CG solves A z = F for z = x - x_new; x_new = b = A x - F (Algorithm 1) is z = x - A x + F."""

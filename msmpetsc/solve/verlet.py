@@ -18,6 +18,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.frequency import HighestMode
 from msmpetsc.solve.ghosted import Ghosted
 from msmpetsc.solve.measured import Measured
@@ -33,6 +34,8 @@ TORN = 100.0  # of the energy that presses every spring to a point: no body live
 
 class Verlet:
     """The substeps of one model. ``time.substep`` may only shorten them."""
+
+    looks_back = False
 
     def __init__(
         self,
@@ -70,6 +73,32 @@ class Verlet:
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
+
+    def save(self, saved: Saved, state: State) -> None:
+        """grad E is found again from q, if it is known of that."""
+        saved.rows["mode"] = self.highest.mode.values[: self.lattice.owned]
+        if self.anchors is not None:  # it has taken a step
+            saved.numbers |= {"squared": self.highest.squared, "known": state.q is self.known}
+        else:
+            saved.numbers |= {"squared": -1.0, "known": False}
+        saved.numbers["substep"] = self.substep
+
+    def restore(self, saved: Saved, state: State, time: float) -> None:
+        """Go on after a step that ended at ``time`` (collective)."""
+        if saved.numbers.get("squared", -1.0) < 0:
+            return
+        self._hold(time)
+        self.highest.mode.values[: self.lattice.owned] = saved.rows["mode"]
+        self.highest.mode.update()
+        self.highest.squared, self.substep = saved.numbers["squared"], saved.numbers["substep"]
+        if saved.numbers["known"]:
+            self.known = state.q
+            self.position.values[:] = state.q
+            self._pull(time)
+
+    def forget(self) -> None:
+        """Let the steps so far leave no trace in the next."""
+        self.known = self.anchors = None
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.

@@ -6,6 +6,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.worst import inverted
+from msmpetsc.solve.checkpoint import Saved
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 
@@ -41,6 +42,15 @@ class Watch:
                 )  # fmt: skip
             self.far += 1
             self.worst_error = max(self.worst_error, error)
+
+    def save(self, saved: Saved) -> None:
+        saved.numbers |= {"frames_inverted": self.frames, "most_inverted": self.most, "now_inverted": self.now}
+        saved.numbers |= {"frames_far": self.far, "worst_error": self.worst_error}
+
+    def restore(self, saved: Saved) -> None:
+        names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far")
+        self.frames, self.most, self.now, self.far = (int(saved.numbers.get(name, 0)) for name in names)
+        self.worst_error = saved.numbers.get("worst_error", 0.0)
 
     def sum_up(self) -> None:
         """At the end of a run: how often it was."""

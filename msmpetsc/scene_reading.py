@@ -27,8 +27,15 @@ def load_scene(
 
     Raises InputError naming every problem of the file, one a line.
     """
-    path, overrides = Path(path), list(overrides)
-    file_text, data = read_toml(path)
+    path = Path(path)
+    return scene_of(path, _read(path, "scene"), overrides, presets)
+
+
+def scene_of(
+    path: Path, file_text: str, overrides: Iterable[str] = (), presets: Collection[str] | None = None
+) -> Scene:
+    """The same of a text that stood in the file."""
+    overrides, data = list(overrides), _parse(path, file_text)
     keys = {_override(data, override): override for override in overrides}
     try:
         checked = SceneFile.model_validate(data, context={"presets": presets})

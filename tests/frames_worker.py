@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.saved import Saved
 from msmpetsc.output import frames
 from msmpetsc.output.frames import ResultFile
 
@@ -46,7 +47,7 @@ def write_all(path: str) -> None:
         file.start_frames(STEPS + 1, nodes.stop - nodes.start, points.stop - points.start)
         for index in range(STEPS + 1):
             file.append(frame(index, nodes, points))
-            file.write_checkpoint(index, positions(index, NODES)[nodes], positions(index - 1, NODES)[nodes])
+            file.write_checkpoint(Saved(index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]}))
 
 
 def write_forever(path: str) -> None:
@@ -56,7 +57,7 @@ def write_forever(path: str) -> None:
         for index in range(100_000):
             file.append(frame(index))
             print(index, flush=True)
-            file.write_checkpoint(index, positions(index, NODES), positions(index - 1, NODES))
+            file.write_checkpoint(Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}))
 
 
 def refuse(path: str) -> None:

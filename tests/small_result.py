@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.saved import Saved
 from msmpetsc.output.frames import ResultFile
 
 H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
@@ -63,5 +64,5 @@ def write(path: Path, frames: list[Frame] | None = None, surface: bool = True, *
         file.start_frames(len(frames), len((arrays | lattice)["nodes"]), len(POINTS) if surface else None)
         for one in frames:
             file.append(one)
-            file.write_checkpoint(one.index, one.position, one.position - 1)
+            file.write_checkpoint(Saved(one.index, {"q": one.position, "q_previous": one.position - 1}))
     return path

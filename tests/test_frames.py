@@ -17,6 +17,7 @@ from frames_worker import NODES, POINTS, STEPS, frame, positions
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
+from msmpetsc.model.saved import Saved
 from msmpetsc.output import frames
 from msmpetsc.output.frames import SERIES, ResultFile, finished, open_result, read_checkpoint
 from msmpetsc.output.xdmf import write_xdmf
@@ -93,7 +94,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         marks[len(disk.log)] = index, index - 1
         file.append(frame(index))
         marks[len(disk.log)] = index + 1, index - 1
-        file.write_checkpoint(index, positions(index, NODES), positions(index - 1, NODES))
+        file.write_checkpoint(Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}))
     marks[len(disk.log)] = 12, 11
     file.close()
     assert len(disk.log) > max(marks)  # the trimming wrote

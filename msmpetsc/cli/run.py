@@ -5,6 +5,7 @@ import json
 import shlex
 import sys
 from pathlib import Path
+from signal import Signals as Signal
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -13,14 +14,17 @@ import petsc4py
 from mpi4py import MPI
 
 from msmpetsc import __version__
+from msmpetsc.cli import resume
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
+from msmpetsc.cli.resume import Resumed
+from msmpetsc.cli.signals import STATUS, Interval, Signals
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.output.earlier import Earlier
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene import Scene
-from msmpetsc.scene_reading import load_scene
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
@@ -34,7 +38,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="simulate a scene",
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT.h5", help="default: out/SCENE.h5")
     parser.add_argument("--preset", metavar="NAME", help="solver preset (see --list-presets)")
     parser.add_argument("--error", metavar="E", help="relative error at which a step is done")
@@ -44,6 +48,14 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
+    parser.add_argument(
+        "--resume", type=Path, metavar="OUT.h5",
+        help="go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
+    )  # fmt: skip
+    parser.add_argument("--force", action="store_true", help="resume with another scene or other options than before")
+    parser.add_argument(
+        "--checkpoint-every", metavar="N", help="frames, or 30s, 5min, 2h; default: as takes 1%% of the time at most"
+    )
     parser.add_argument(
         "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
     )
@@ -69,27 +81,42 @@ class ListPresets(argparse.Action):
 
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
+    comm = MPI.COMM_WORLD
+    earlier = resume.look(comm, args)
     petsc4py.init(["msmpetsc", *args.petsc_options])
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
-    comm = MPI.COMM_WORLD
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
 
     began = perf_counter()
-    measured = what_is_measured(args)
-    scene = comm.bcast(on_root(comm, lambda: read_scene(args)))
-    refuse_steps_beyond(scene.time.steps, args)
+    measured, interval = what_is_measured(args), Interval(args.checkpoint_every)
+    scene = comm.bcast(on_root(comm, lambda: read_scene(args, earlier)))
+    refuse_steps_beyond(scene.time.steps, args, earlier.step if earlier else 0)
     on_root(comm, lambda: refuse_unwritable(args.measure))
     path = args.output or Path("out") / f"{args.scene.stem}.h5"
+    about = attributes(comm, scene, args)
+    resumed = earlier and Resumed(earlier, scene, given_options(), args.force)
+    if resumed and resumed.is_done:
+        on_root(comm, lambda: finish(path, args.picture))
+        log.info("%s has all its %d frames: nothing left to do", path, earlier.finished)
+        return 0
     try:
-        with ResultFile(path, comm, attributes(comm, scene), args.overwrite) as file:
+        with (
+            Signals(comm) as signals,
+            resumed.file(comm, about) if resumed else ResultFile(path, comm, about, args.overwrite) as file,
+        ):
             model = build_model(comm, scene)
             describe(comm, model)
+            if resumed:
+                resumed.refuse_other_lattice(comm, model)
             with Simulation(comm, scene, model, measured) as simulation:
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - began)
                 write_model(comm, file, model)
-                write_frames(comm, file, simulation, cost)
+                if resumed:
+                    resumed.restore(comm, file, simulation)
+                stopped = write_frames(comm, file, simulation, cost, signals, interval)
+                file.close(trim=not stopped)
     except StepFailed as failure:
         on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
         if args.measure:
@@ -97,7 +124,9 @@ def run(args: argparse.Namespace) -> int:
         raise
     if args.measure:
         cost.write(args.measure)
-    on_root(comm, lambda: finish(path, args.picture))
+    on_root(comm, lambda: finish(path, args.picture and not stopped))
+    if stopped:
+        return tell_stop(stopped, path, simulation)
     simulation.refuse_unused_options(at_end=True)
     return 0
 
@@ -116,23 +145,38 @@ def what_is_measured(args: argparse.Namespace) -> "Measured":
     return Measured(args.true_error, args.trace)
 
 
-def refuse_steps_beyond(steps: int, args: argparse.Namespace) -> None:
-    """Raises InputError for steps to be measured that the run does not come to."""
+def tell_stop(number: int, path: Path, simulation: "Simulation") -> int:
+    """One line, and the exit status of that signal."""
+    log.warning(
+        "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",
+        Signal(number).name, simulation.step, simulation.steps, simulation.step * simulation.time_step,
+        shlex.quote(str(path)),
+    )  # fmt: skip
+    return STATUS[number]
+
+
+def refuse_steps_beyond(steps: int, args: argparse.Namespace, taken: int) -> None:
+    """Raises InputError for steps to be measured that the run does not come to, or that it took before."""
+    if args.trace is not None and args.trace <= taken:
+        raise InputError(f"--trace {args.trace}: the run goes on after step {taken}")
     for option, number in {"--true-error": args.true_error, "--trace": args.trace}.items():
         if number is not None and number > steps:
             raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
 
 
 def finish(path: Path, picture: bool) -> None:
-    """What stands beside the result file."""
-    write_xdmf(path)
+    """What stands beside the result file. Raises InputError where that cannot be written."""
+    try:
+        write_xdmf(path)
+    except OSError as error:
+        raise InputError(f"{path.with_suffix('.xdmf')} cannot be written: {error.strerror}") from None
     if picture:
         from msmpetsc.output.render import contact_sheet  # loads VTK: a second that other runs need not wait
 
         contact_sheet(path, path.with_suffix(".png"))
 
 
-def read_scene(args: argparse.Namespace) -> Scene:
+def read_scene(args: argparse.Namespace, earlier: Earlier | None) -> Scene:
     """The scene with what the command line changes; --set comes last and wins."""
     from msmpetsc.solve.presets import PRESETS
 
@@ -142,26 +186,33 @@ def read_scene(args: argparse.Namespace) -> Scene:
     if args.error is not None:
         changes.append(f"solver.error={args.error}")
     changes += args.set
-    scene = load_scene(args.scene, changes, PRESETS)
+    scene = resume.read_scene(args, earlier, changes, PRESETS)
     if args.frames is not None:
         if args.frames < 1:
             raise InputError(f"--frames must be at least 1, not {args.frames}")
-        scene = load_scene(args.scene, [*changes, f"time.duration={args.frames * scene.time.step!r}"], PRESETS)
+        changes.append(f"time.duration={args.frames * scene.time.step!r}")
+        scene = resume.read_scene(args, earlier, changes, PRESETS)
     return scene
 
 
-def attributes(comm: MPI.Comm, scene: Scene) -> dict:
-    """What the file says of the run that made it."""
+def given_options() -> dict[str, str]:
+    """PETSc's, before any of ours are among them."""
     from petsc4py import PETSc
 
-    given = PETSc.Options().getAll()
+    return PETSc.Options().getAll()
+
+
+def attributes(comm: MPI.Comm, scene: Scene, args: argparse.Namespace) -> dict:
+    """What the file says of the run that made it."""
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
-        "petsc_options": " ".join(f"-{name} {value}".strip() for name, value in given.items()),
+        "petsc_options": " ".join(f"-{name} {shlex.quote(value) if value else ''}".strip() for name, value in given_options().items()),
         "ranks": comm.size,
         "command": shlex.join(["msmpetsc", *sys.argv[1:]]),
         "scene": scene.text,
+        "scene_file": str(args.scene.resolve()) if args.scene else "",
+        "true_error": args.true_error or 0,
     }
 
 
@@ -200,19 +251,35 @@ def write_model(comm: MPI.Comm, file: ResultFile, model: "Model") -> None:
     file.write("embedding/weights", embedding.weights)
 
 
-def write_frames(comm: MPI.Comm, file: ResultFile, simulation: "Simulation", cost: Cost) -> None:
-    """Run, and store each frame when it is done; those before a failure stay (collective)."""
+def write_frames(
+    comm: MPI.Comm, file: ResultFile, simulation: "Simulation", cost: Cost, signals: Signals, interval: Interval
+) -> int:
+    """Run, and store each frame when it is done; those before a failure stay. Returns the signal that ended it, or 0
+    (collective)."""
     lattice, embedding = simulation.model.lattice, simulation.model.embedding
-    owned = slice(lattice.owned)
-    file.start_frames(simulation.stored, lattice.owned, embedding.points if embedding else None)
+    points = embedding.points if embedding else None
+    file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
     progress = Progress(simulation.steps, enabled=comm.rank == 0)
+    count = simulation.stored_until(simulation.step) if simulation.step else 0  # frames of the steps taken
+    signal = 0
+    signals.begin()
     try:
-        for frame in simulation.frames():
+        for frame in simulation.advance():
             begun = perf_counter()
-            file.append(frame)
-            state = simulation.state
-            file.write_checkpoint(frame.index, state.q[owned], state.q_previous[owned])
-            cost.add(frame.wall_time, begun)
-            progress.update(frame)
+            if frame is not None:
+                if count >= file.finished:  # else it was written before
+                    file.append(frame)
+                count += 1
+                progress.update(frame)
+            due = comm.rank == 0 and interval.due(frame is not None) or simulation.step in (0, simulation.steps)
+            due, signal = signals.agree(due)
+            if due:
+                began = perf_counter()
+                file.write_checkpoint(simulation.saved())
+                interval.done(began)
+            cost.add(frame.wall_time if frame else 0.0, begun)
+            if signal:
+                break
     finally:
         progress.close()
+    return signal if simulation.step < simulation.steps else 0

@@ -5,16 +5,22 @@ All metadata is on disk before the first frame and does not change while frames 
 A frame is its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is
 finite (`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
 
-``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``. The older slot is written,
-with its step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
+``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``, and what else the run goes on from,
+``numbers (2,k)`` with their names as an attribute and rows of nodes (2,n,...). The older slot is written, with its
+step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
+
+A run that goes on (`Continued`) writes into the file as it lies there, if all that it needs is laid out in it: so no
+metadata change then either. Else it writes a new one, takes the frames over, and renames it when it holds them.
 """
 
+import fcntl
 import math
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from errno import EACCES, EAGAIN
 from pathlib import Path
 
 import h5py
@@ -23,6 +29,7 @@ import numpy as np
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.saved import Saved
 from msmpetsc.output.result import FORMAT, FORMAT_VERSION, finished, open_result, read_checkpoint  # noqa: F401
 
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
@@ -34,6 +41,7 @@ STATIC_UNITS = {
     "lattice/mass": "kg",
     "surface/points": "m",
 }
+CHECKPOINT_UNITS = {"checkpoint/contact_bound": "N/m", "checkpoint/history_v": "m/s", "checkpoint/mode": "1"}
 # The numbers of a frame, named as in Frame and in /frames: dtype, shape, unit.
 SERIES = {
     "time": ("f8", (), "s"),
@@ -59,7 +67,10 @@ class ResultFile:
     """The result file of one run. Every rank of `comm` calls every method; errors are raised on all together.
 
     The file has a temporary name until `start_frames`; closed before that, it is dropped, and an old file of its
-    name stays. What cannot be written (full disk, no permission) raises InputError.
+    name stays. What cannot be written (full disk, no permission) raises InputError. A lock beside the file, where the
+    file system has locks, keeps a second run from writing it at the same time.
+
+    finished : number of frames that it holds
     """
 
     def __init__(self, path: str | Path, comm, attributes: dict, overwrite: bool = False):
@@ -69,10 +80,12 @@ class ResultFile:
         self._comm = comm
         self._overwrite = overwrite
         self._file: h5py.File | None = None  # open on rank 0 only
-        self._planned = self._finished = 0
+        self._lock: Lock | None = None  # the same
+        self._planned = self.finished = 0
+        self._failed = False  # to write
         with self._together():
             if comm.rank == 0:
-                self._create(attributes)
+                self._open(attributes)
 
     def __enter__(self) -> "ResultFile":
         return self
@@ -82,7 +95,7 @@ class ResultFile:
             self.close()
         else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
             with suppress(InputError), _plain_errors(self.path):
-                self._finish()
+                self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
     def write(self, name: str, rows: np.ndarray) -> None:
         """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes"."""
@@ -98,20 +111,34 @@ class ResultFile:
         self._collect(rows, dtype, counts, name)
 
     def start_frames(
-        self, count: int, nodes: int, surface_points: int | None = None, surface_dtype: str = "f4"
+        self,
+        count: int,
+        nodes: int,
+        surface_points: int | None = None,
+        surface_dtype: str = "f4",
+        saved: Saved | None = None,
     ) -> None:
-        """Plan `count` frames, frame 0 included, of this rank's `nodes` and `surface_points` (None: not stored)."""
+        """Plan `count` frames, frame 0 included, of this rank's `nodes` and `surface_points` (None: not stored), and
+        checkpoints like this one; of q and q_previous alone if None."""
         self._nodes, self._points = zip(*self._comm.allgather((nodes, surface_points)))
         self._surface_dtype = surface_dtype
+        self._rows = {"q": (3,), "q_previous": (3,)}
+        if saved:
+            self._rows |= {name: rows.shape[1:] for name, rows in saved.rows.items()}
+        self._numbers = list(saved.numbers) if saved else []
         with self._together():
             if self._file is not None:
-                self._plan(count)
-        self._planned = count
+                self._start(count)
+        self.finished, self._planned = self._comm.bcast(self.finished), count
+        self._take_over(saved)
+        with self._together():
+            if self._file is not None:
+                self._publish()
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
         self._check(frame)
-        here = self._finished
+        here = self.finished
         self._collect(frame.position, "f8", self._nodes, "frames/position", here)
         if self._points[0] is not None:
             self._collect(frame.surface, self._surface_dtype, self._points, "frames/surface", here)
@@ -123,41 +150,51 @@ class ResultFile:
                 self._file.flush()
                 frames["time"][here] = frame.time  # from here on the frame is there
                 self._file.flush()
-        self._finished += 1
+        self.finished += 1
 
-    def write_checkpoint(self, step: int, q: np.ndarray, q_previous: np.ndarray) -> None:
-        """Store q_n and q_(n-1), this rank's rows (n_local, 3) [m], as the state after `step` steps."""
-        self._check_rows("q", q, self._nodes)
-        self._check_rows("q_previous", q_previous, self._nodes)
+    def write_checkpoint(self, saved: Saved) -> None:
+        """Store what the run can go on from; rows and numbers named as those that were planned."""
+        if (saved.rows.keys(), list(saved.numbers)) != (self._rows.keys(), self._numbers):
+            raise ValueError(f"planned were checkpoints of {list(self._rows)} and {self._numbers}")
+        for name, rows in saved.rows.items():
+            self._check_rows(name, rows, self._nodes, self._rows[name])
         slot = None
         with self._together():
             if self._file is not None:
                 slot = int(np.argmin(self._file["checkpoint/step"]))
                 self._file["checkpoint/step"][slot] = -1
                 self._file.flush()
-        self._collect(q, "f8", self._nodes, "checkpoint/q", slot)
-        self._collect(q_previous, "f8", self._nodes, "checkpoint/q_previous", slot)
+        for name, rows in saved.rows.items():
+            self._collect(rows, "f8", self._nodes, f"checkpoint/{name}", slot)
         with self._together():
             if self._file is not None:
+                if self._numbers:
+                    self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
                 self._file.flush()
-                self._file["checkpoint/step"][slot] = step
+                self._file["checkpoint/step"][slot] = saved.step
                 self._file.flush()
 
-    def close(self) -> None:
-        """Trim the frames to the finished ones and close; a second call does nothing."""
+    def close(self, trim: bool = True) -> None:
+        """Close, a second call does nothing. Before, trim the frames to the finished ones, but where the run is to go
+        on: as it lies there the file has room for the rest."""
         with self._together():
-            self._finish()
+            self._finish(trim)
 
     # On rank 0 alone
 
-    def _create(self, attributes: dict) -> None:
+    def _open(self, attributes: dict) -> None:
         self._refuse_to_replace()
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = Lock(self.path)
+        self._create(attributes)
+
+    def _create(self, attributes: dict) -> None:
         try:
             self._file = _open_new(self._part)
             self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
         except Exception:
             self._part.unlink(missing_ok=True)
+            self._lock.free()
             raise
 
     def _refuse_to_replace(self) -> None:
@@ -166,49 +203,68 @@ class ResultFile:
         if self.path.exists() and not self._overwrite:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
-    def _plan(self, count: int) -> None:
-        datasets = _layout(count, sum(self._nodes), self._points, self._surface_dtype)
+    def _layout(self, count: int) -> list[tuple]:
+        return _layout(count, sum(self._nodes), self._points, self._surface_dtype, self._rows, len(self._numbers))
+
+    def _start(self, count: int) -> None:
+        datasets = self._layout(count)
         planned = sum(math.prod(shape) * np.dtype(dtype).itemsize for _, shape, _, dtype, _ in datasets)
-        _refuse_small_disk(self.path, planned)
+        refuse_small_disk(self.path, planned - _given_back(self.path))
         for name in ("frames", "checkpoint"):
             self._file.create_group(name)
         for dataset in datasets:
             _plan_dataset(self._file, *dataset)
         self._file["frames/time"][...] = np.nan
         self._file["checkpoint/step"][...] = -1
+        if self._numbers:
+            self._file["checkpoint/numbers"].attrs["names"] = " ".join(self._numbers)
+
+    def _publish(self) -> None:
         self._file.flush()
         self._refuse_to_replace()
         os.replace(self._part, self.path)
 
-    def _finish(self) -> None:
+    def _finish(self, trim: bool) -> None:
         file, self._file = self._file, None
         if file is None:
             return
         self._part.unlink(missing_ok=True)  # still there only if no frames were started
-        with file:
-            if self._finished < self._planned:
-                for dataset in file["frames"].values():
-                    dataset.resize(self._finished, axis=0)
+        try:
+            with file:
+                if trim and self.finished < self._planned:
+                    for dataset in file["frames"].values():
+                        dataset.resize(self.finished, axis=0)
+        finally:
+            self._lock.free()
 
     # What the ranks do together
 
     @contextmanager
     def _together(self) -> Iterator[None]:
         """What one rank cannot do in the block, all raise after it."""
-        with together(self._comm), _plain_errors(self.path):
-            yield
+        try:
+            with together(self._comm), _plain_errors(self.path):
+                yield
+        except InputError:
+            self._failed = True
+            raise
+
+    def _take_over(self, _: Saved | None) -> None:
+        """Nothing was there before."""
 
     def _check(self, frame: Frame) -> None:
-        if self._finished >= self._planned:
-            raise ValueError(f"frame {self._finished} was not planned: {self._planned} frames were")
+        if self.finished >= self._planned:
+            raise ValueError(f"frame {self.finished} was not planned: {self._planned} frames were")
         if not np.isfinite(frame.time):
-            raise ValueError(f"frame {self._finished} has time {frame.time}")
+            raise ValueError(f"frame {self.finished} has time {frame.time}")
         self._check_rows("position", frame.position, self._nodes)
         if self._points[0] is not None:
             self._check_rows("surface", frame.surface, self._points)
 
-    def _check_rows(self, name: str, rows: np.ndarray | None, counts: Sequence[int]) -> None:
-        planned = (counts[self._comm.rank], 3)
+    def _check_rows(
+        self, name: str, rows: np.ndarray | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)
+    ) -> None:
+        planned = (counts[self._comm.rank], *shape)
         if np.shape(rows) != planned:
             raise ValueError(f"{name} has shape {np.shape(rows)} on rank {self._comm.rank}, planned were {planned}")
 
@@ -222,7 +278,7 @@ class ResultFile:
 
         with self._together():
             if self._comm.rank > 0:
-                for part in _pieces(rows, len(rows)):
+                for part in pieces(rows, len(rows)):
                     self._comm.Send(rows[part], dest=0)
             else:
                 _receive(self._comm, rows, counts, store)
@@ -232,7 +288,7 @@ def _receive(comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int
     """Hand store(start, piece) this rank's rows, then the pieces that the other ranks send."""
     start, failure = 0, None
     for rank, count in enumerate(counts):
-        for part in _pieces(rows, count):
+        for part in pieces(rows, count):
             piece = rows[part]
             if rank > 0:
                 piece = np.empty((part.stop - part.start, *rows.shape[1:]), rows.dtype)
@@ -247,7 +303,7 @@ def _receive(comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int
         raise failure
 
 
-def _pieces(rows: np.ndarray, count: int) -> Iterator[slice]:
+def pieces(rows: np.ndarray, count: int) -> Iterator[slice]:
     """Parts of `count` rows like these, of at most PIECE_BYTES each."""
     row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
     most = max(1, PIECE_BYTES // row_bytes)
@@ -263,12 +319,22 @@ def _open_new(path: Path) -> h5py.File:
     return h5py.File(path, "w", libver="earliest", rdcc_nbytes=0, locking=False)
 
 
-def _layout(count: int, nodes: int, points: Sequence[int | None], surface_dtype: str) -> list[tuple]:
-    """Name, shape, chunks, dtype and unit of each dataset that is written frame by frame, in this order."""
+def _layout(
+    count: int,
+    nodes: int,
+    points: Sequence[int | None],
+    surface_dtype: str,
+    kept: Mapping[str, tuple[int, ...]],
+    kept_numbers: int,
+) -> list[tuple]:
+    """Name, shape, chunks, dtype and unit of each dataset that is written frame by frame, in this order.
 
-    def positions(name: str, times: int, rows: int, dtype: str) -> tuple:
-        most = CHUNK_BYTES // (3 * np.dtype(dtype).itemsize)
-        return name, (times, rows, 3), (1, min(max(1, rows), most), 3), dtype, "m"
+    kept, kept_numbers : shapes of a node's part of the checkpoint's rows; how many numbers it has
+    """
+
+    def positions(name: str, times: int, rows: int, dtype: str, shape: tuple[int, ...] = (3,)) -> tuple:
+        most = CHUNK_BYTES // (math.prod(shape) * np.dtype(dtype).itemsize)
+        return name, (times, rows, *shape), (1, min(max(1, rows), most), *shape), dtype, CHECKPOINT_UNITS.get(name, "m")
 
     numbers = [
         (f"frames/{name}", (count, *shape), (count, *shape), dtype, unit)
@@ -282,8 +348,8 @@ def _layout(count: int, nodes: int, points: Sequence[int | None], surface_dtype:
         positions("frames/position", count, nodes, "f8"),
         *surface,
         ("checkpoint/step", (2,), (2,), "i8", "1"),
-        positions("checkpoint/q", 2, nodes, "f8"),
-        positions("checkpoint/q_previous", 2, nodes, "f8"),
+        *([("checkpoint/numbers", (2, kept_numbers), (1, kept_numbers), "f8", "1")] if kept_numbers else []),
+        *(positions(f"checkpoint/{name}", 2, nodes, "f8", shape) for name, shape in kept.items()),
     ]
 
 
@@ -303,7 +369,30 @@ def _plan_dataset(file: h5py.File, name: str, shape: tuple, chunks: tuple, dtype
     file[name].attrs["unit"] = unit
 
 
-def _refuse_small_disk(path: Path, planned: int) -> None:
+def _given_back(path: Path) -> int:
+    """[byte] that the file there takes, which is to be replaced."""
+    return path.stat().st_blocks * 512 if path.exists() else 0
+
+
+class Lock:
+    """Held on a file beside ``path`` while that is written; taken from a run that is killed by the system itself."""
+
+    def __init__(self, path: Path):
+        """Raises InputError where another run has it."""
+        self.path = path.with_name(f".{path.name}.lock")
+        self._file = open(self.path, "a")
+        try:
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (EACCES, EAGAIN):  # else it is a file system without locks
+                raise InputError(f"{path} is being written by another run") from None
+
+    def free(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self._file.close()
+
+
+def refuse_small_disk(path: Path, planned: int) -> None:
     """Better now than hours later. planned: [byte]."""
     free = shutil.disk_usage(path.parent).free
     if planned > free:

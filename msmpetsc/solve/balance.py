@@ -17,9 +17,9 @@ from mpi4py import MPI
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.model.worst import inside_out, place_of_greatest
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 

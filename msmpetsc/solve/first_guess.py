@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from msmpetsc.solve.checkpoint import Saved, with_ghosts
+from msmpetsc.model.saved import Saved
 from msmpetsc.solve.functional import StepFunctional
+from msmpetsc.solve.ghosted import with_ghosts
 
 SAVED = ("correction", "correction_before")
 

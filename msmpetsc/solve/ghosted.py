@@ -28,3 +28,12 @@ class Ghosted:
 
     def destroy(self) -> None:
         self.vector.destroy()
+
+
+def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
+    """(l, 3) from the owned ones (owned, 3) (collective)."""
+    field = Ghosted(comm, lattice)
+    field.values[: lattice.owned] = rows
+    field.update()
+    field.destroy()
+    return field.values

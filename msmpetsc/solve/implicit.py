@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from msmpetsc import scene
 from msmpetsc.model.build import Model
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.measured import Measured, Trace
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset

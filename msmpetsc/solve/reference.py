@@ -10,7 +10,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
-from msmpetsc.solve.checkpoint import Saved
+from msmpetsc.model.saved import Saved
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.step import Stepper
 

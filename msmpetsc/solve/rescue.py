@@ -9,8 +9,8 @@ from msmpetsc import scene
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.implicit import ImplicitEuler
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult

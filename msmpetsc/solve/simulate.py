@@ -11,10 +11,10 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.scene import Scene
 from msmpetsc.solve.balance import EnergyBalance
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.rescue import Done, Rescue

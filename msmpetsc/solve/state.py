@@ -6,7 +6,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.checkpoint import Saved, with_ghosts
+from msmpetsc.model.saved import Saved
+from msmpetsc.solve.ghosted import with_ghosts
 
 HISTORY = ("history_q", "history_v")
 

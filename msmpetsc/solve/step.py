@@ -11,8 +11,8 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.worst import inside_out, place_of_greatest
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
@@ -90,7 +90,7 @@ class Stepper:
         self.functional = StepFunctional(comm, self.unknowns, self.elasticity, time_step)
         self.base = np.empty_like(lattice.nodes)
         self.first_guess = FirstGuess(self.functional, preset.extrapolate)
-        self.ratio, self.its = FIRST_RATIO, 0
+        self.ratio = FIRST_RATIO
         self.local = PETSc.Log.Event(LOCAL_EVENT)
         self.owned_objects = [self.unknowns]
         self.defaults = set_defaults(preset, prefix, self.budget or 0)
@@ -186,16 +186,17 @@ class Stepper:
 
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
+        its_before = self.all_its()
         self.functional.begin(q, y, load, contact, led)
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
         self.early, self.corrected = EARLY, False
         self.unknowns.from_nodes(self.first_guess.best(q) if start is None else start, self.x)
         iterations = 0 if self._is_solved() else self._solve()
-        functional, its_before, self.its = self.functional, self.its, self.all_its()
+        functional = self.functional
         self.unknowns.to_nodes(self.x, functional.q)
         self.first_guess.learn(functional.q)
-        return StepResult(functional.q.copy(), q, self.last_error, iterations, self.its - its_before)
+        return StepResult(functional.q.copy(), q, self.last_error, iterations, self.all_its() - its_before)
 
     def save(self, saved: Saved) -> None:
         """What the next step depends on beside what it is given."""
@@ -224,6 +225,8 @@ class Stepper:
         self._residual(self.snes, self.x, self.work)
         self.last_error = self._error_of(self.work)
         solved = self.last_error <= (self.error or 0.0)
+        if self.adapts and not solved:
+            self._loosen()
         if solved and self.observer:
             self.observer(self)
         return solved
@@ -236,6 +239,7 @@ class Stepper:
         projected Hessian takes over for some iterations (_linearise).
         """
         self.projected = self.preset.projected > 0
+        self._begin_afresh()
         self.snes.solve(None, self.x)
         iterations, most = self.snes.its, self.snes.getTolerances()[3]
         while self._climbs() and iterations < most:
@@ -248,6 +252,13 @@ class Stepper:
         if self.snes.reason < 0:
             raise self._failure(iterations)
         return iterations
+
+    def _begin_afresh(self) -> None:
+        """SNESQN alone keeps what it has learnt, its pairs of the last step; a type set anew has none."""
+        if self.snes.getType() == PETSc.SNES.Type.QN:
+            self.snes.setType(PETSc.SNES.Type.KSPONLY)
+            self.snes.setType(PETSc.SNES.Type.QN)
+            self.snes.setFromOptions()
 
     def _climbs(self) -> bool:
         return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
@@ -270,8 +281,6 @@ class Stepper:
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: A is constant, only the true Hessian and contact depend on x."""
-        if self.preset.start_from_b:
-            self._start_from_b(snes, x)
         self.local.begin()
         self.unknowns.to_nodes(x, self.base)
         contact = self.functional.contact
@@ -287,6 +296,8 @@ class Stepper:
         if self.preset.true_hessian or changed:
             self.operator.assemble()
         self.local.end()
+        if self.preset.start_from_b:
+            self._start_from_b(snes, x)
 
     def _precondition_contact(self) -> bool:
         """Add to the preconditioner's diagonal what bounds the contact blocks; whether that changed it.

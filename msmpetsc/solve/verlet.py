@@ -17,8 +17,8 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
-from msmpetsc.solve.checkpoint import Saved
 from msmpetsc.solve.frequency import HighestMode
 from msmpetsc.solve.ghosted import Ghosted
 from msmpetsc.solve.measured import Measured

@@ -5,8 +5,8 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.saved import Saved
 from msmpetsc.model.worst import inverted
-from msmpetsc.solve.checkpoint import Saved
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 

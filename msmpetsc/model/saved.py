@@ -7,29 +7,17 @@ among it: they begin each step anew (solve.step).
 from dataclasses import dataclass, field
 
 import numpy as np
-from mpi4py import MPI
-
-from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.ghosted import Ghosted
 
 
 @dataclass
 class Saved:
     """After ``step`` steps. Empty, it is what a run begins with.
 
-    rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,)
+    rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
+        [m] among them
     numbers : by name, of the whole run
     """
 
     step: int = 0
     rows: dict[str, np.ndarray] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
-
-
-def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
-    """(l, 3) from the owned ones (owned, 3) (collective)."""
-    field = Ghosted(comm, lattice)
-    field.values[: lattice.owned] = rows
-    field.update()
-    field.destroy()
-    return field.values

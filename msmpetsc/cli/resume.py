@@ -1,0 +1,156 @@
+"""``msmpetsc run --resume``: what the earlier run was, whether this one is the same, and where it goes on."""
+
+import argparse
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mpi4py import MPI
+
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import InputError
+from msmpetsc.output.continued import Anew, InPlace
+from msmpetsc.output.earlier import Earlier, read_numbers, read_saved, refuse_other_lattice
+from msmpetsc.output.frames import ResultFile
+from msmpetsc.scene import Scene
+from msmpetsc.scene_reading import load_scene, scene_of
+
+if TYPE_CHECKING:  # these import PETSc, which must first be given its options
+    from msmpetsc.model.build import Model
+    from msmpetsc.solve.simulate import Simulation
+
+OF_NO_EFFECT = re.compile(r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc")  # on results
+FIXED = ("time.step", "time.integrator", "output.every", "output.surface")  # a file has one of each
+UNHEARD = {"text", "folder", "title", "picture"}  # what may differ in silence
+
+
+def look(comm: MPI.Comm, args: argparse.Namespace) -> Earlier | None:
+    """What is to be resumed; None for a run from the start (collective)."""
+    if args.resume is None:
+        if args.scene is None:
+            raise InputError("a SCENE is needed, or --resume OUT.h5")
+        return None
+    if args.overwrite or args.output not in (None, args.resume):
+        raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
+    args.output = args.resume
+    there = comm.bcast(on_root(comm, args.resume.exists))
+    if not there and args.scene:
+        return None  # the first start of a job that may be started again
+    earlier = comm.bcast(on_root(comm, lambda: Earlier.look(args.resume)))
+    args.petsc_options = [*shlex.split(earlier.attributes.get("petsc_options", "")), *args.petsc_options]
+    args.true_error = args.true_error or int(earlier.attributes.get("true_error", 0)) or None
+    return earlier
+
+
+def read_scene(args: argparse.Namespace, earlier: Earlier | None, changes: list[str], presets: Any) -> Scene:
+    """The scene file, or what the earlier run's file has of it, with changes."""
+    if args.scene is not None:
+        return load_scene(args.scene, changes, presets)
+    return _stored_scene(earlier, changes, presets)
+
+
+def _stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
+    text, file = (earlier.attributes.get(name) for name in ("scene", "scene_file"))
+    if text is None or file is None:
+        raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
+    return scene_of(Path(file), text, changes, presets)
+
+
+class Resumed:
+    """The way of one run that goes on.
+
+    differs : lines that tell what is not as it was
+    """
+
+    def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
+        """options: PETSc's, now. Raises InputError for what may not differ."""
+        self.earlier, self.force = earlier, force
+        self.stored = 1 + -(-scene.time.steps // scene.output.every)
+        self.differs = list(self._differences(scene, options))
+        if self.differs and not force:
+            raise InputError("\n".join([*self.differs, "--force goes on all the same"]))
+        fixed = [line for line in self.differs if line.startswith(FIXED)]
+        if fixed:
+            raise InputError("\n".join([*fixed, "that cannot change within a file"]))
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the file has all frames already."""
+        return self.earlier.finished >= self.stored
+
+    def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
+        earlier = self.earlier
+        if "scene" in earlier.attributes:
+            was = flat(scene_of(Path(earlier.attributes.get("scene_file", "scene")), earlier.attributes["scene"]))
+            now = flat(scene)
+            for key in sorted(was.keys() | now.keys()):
+                if was.get(key) != now.get(key):
+                    yield f"{key}: {_told(was.get(key))} in {earlier.path}, {_told(now.get(key))} now"
+        was = _as_options(shlex.split(earlier.attributes.get("petsc_options", "")))
+        for name in sorted(was.keys() | options.keys()):
+            if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
+                yield f"-{name}: {_told(was.get(name))} in {earlier.path}, {_told(options.get(name))} now"
+
+    def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
+        """To write into (collective)."""
+        earlier = self.earlier
+        if not self.differs and earlier.planned == self.stored and earlier.exact:
+            return InPlace(earlier.path, comm, attributes)
+        before = f"{earlier.attributes.get('command', '')} (to step {earlier.step})"
+        attributes["earlier"] = "\n".join(filter(None, [earlier.attributes.get("earlier"), before]))
+        attributes |= {name: earlier.attributes["scene_file"] for name in ("scene_file",) if name in earlier.attributes}
+        return Anew(earlier.path, comm, attributes, earlier.finished)
+
+    def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
+        """Raises InputError where the mesh makes another lattice than it did (collective)."""
+        lattice = model.lattice
+        found = {"lattice/nodes": lattice.nodes[: lattice.owned]}
+        if not self.differs:
+            found["lattice/mass"] = lattice.mass
+        refuse_other_lattice(comm, self.earlier.path, found)
+
+    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
+        """Put the simulation where the last checkpoint was (collective)."""
+        saved = read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
+        if saved is None:
+            return
+        if isinstance(file, Anew) and self.differs:  # later frames are of how it was
+            kept = simulation.stored_until(saved.step)
+            file.keep(kept)
+            if kept < self.earlier.finished and saved.step % simulation.every:
+                saved.numbers |= read_numbers(comm, self.earlier.path, kept)  # its last frame, which is none now
+        simulation.restore(saved)
+        log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, saved.step * simulation.time_step)
+
+
+def flat(scene: Scene) -> dict[str, Any]:
+    """Keys like "time.step" and "obstacle.0.point"; what is not given is not there."""
+    return dict(_leaves("", scene.model_dump(exclude=UNHEARD, exclude_none=True)))
+
+
+def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    items = value.items() if isinstance(value, dict) else ()
+    if isinstance(value, (list, tuple)) and any(isinstance(item, dict) for item in value):
+        items = enumerate(value)
+    for key, inner in items:
+        yield from _leaves(f"{name}.{key}" if name else str(key), inner)
+    if not isinstance(value, dict) and not items:
+        yield name, value
+
+
+def _told(value: Any) -> str:
+    return "none" if value is None else str(list(value) if isinstance(value, tuple) else value)
+
+
+def _as_options(words: list[str]) -> dict[str, str]:
+    """PETSc's, as its database has them."""
+    found, name = {}, None
+    for word in words:
+        if re.match(r"-[A-Za-z]", word):
+            name = word[1:]
+            found[name] = ""
+        elif name:
+            found[name] = word
+    return found

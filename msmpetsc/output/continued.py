@@ -1,0 +1,67 @@
+"""The result file of a run that goes on: the file that is there, or a new one that takes its frames over."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from msmpetsc.errors import InputError
+from msmpetsc.model.saved import Saved
+from msmpetsc.output.frames import ResultFile, refuse_small_disk
+from msmpetsc.output.result import finished, open_result
+
+
+class InPlace(ResultFile):
+    """The file as it lies there, laid out for all frames: nothing but numbers in their places is written, so it is as
+    safe as it was. Frames that it has already are not written again."""
+
+    def write(self, name: str, rows: np.ndarray) -> None:
+        """It is there."""
+
+    def _refuse_to_replace(self) -> None:
+        pass
+
+    def _create(self, _: dict) -> None:
+        try:
+            open_result(self.path).close()
+            self._file = h5py.File(self.path, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+        except Exception:
+            self._lock.free()
+            raise
+
+    def _start(self, count: int) -> None:
+        for name, shape, _, dtype, _ in self._layout(count):
+            found = self._file.get(name)
+            if found is None or found.shape != shape or found.dtype != np.dtype(dtype):
+                raise InputError(f"{self.path} has no room for {name} as it is now: --force writes the file anew")
+        there = self.path.stat()
+        refuse_small_disk(self.path, there.st_size - there.st_blocks * 512)  # what has no place on the disk yet
+        self.finished = finished(self._file)
+
+    def _publish(self) -> None:
+        pass
+
+
+class Anew(ResultFile):
+    """A new file with the first ``frames`` of the earlier one, which it replaces when it has them and a checkpoint."""
+
+    def __init__(self, path: Path, comm, attributes: dict, frames: int):
+        self._frames = frames
+        super().__init__(path, comm, attributes, overwrite=True)
+
+    def keep(self, frames: int) -> None:
+        """No more than so many."""
+        self._frames = min(self._frames, frames)
+
+    def _start(self, count: int) -> None:
+        super()._start(count)
+        with open_result(self.path) as earlier:
+            for index in range(self._frames):
+                for name, dataset in self._file["frames"].items():
+                    if name in earlier["frames"]:
+                        dataset[index] = earlier["frames"][name][index]
+        self.finished = self._frames
+
+    def _take_over(self, saved: Saved | None) -> None:
+        if saved is not None:
+            self.write_checkpoint(saved)

@@ -1,0 +1,149 @@
+"""A result file whose run is to go on: what it says of itself, its last checkpoint, whether a lattice is its own."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from msmpetsc.comm import together
+from msmpetsc.errors import InputError
+from msmpetsc.model.saved import Saved
+from msmpetsc.output.frames import SERIES, pieces
+from msmpetsc.output.result import Result, finished, open_result
+
+SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """step: of its last checkpoint, 0 if it has none; finished, planned: frames that are there, and have their place;
+    exact: whether a checkpoint has all that a run goes on from."""
+
+    path: Path
+    attributes: dict
+    step: int
+    finished: int
+    planned: int
+    exact: bool
+
+    @classmethod
+    def look(cls, path: Path) -> "Earlier":
+        """For one rank. Raises InputError for what is no result, or a damaged one."""
+        with Result(path) as result:  # which checks it
+            attributes = result.attributes
+        with open_result(path) as file:
+            step = max(0, int(np.max(file["checkpoint/step"]))) if "checkpoint/step" in file else 0
+            count, planned = finished(file), len(file["frames/time"])
+            exact = "names" in file["checkpoint/numbers"].attrs if "checkpoint/numbers" in file else False
+        return cls(path, attributes, step if count else 0, count, planned, exact)
+
+
+def read_saved(comm, path: Path, owned: int) -> Saved | None:
+    """The last checkpoint, this rank's rows of it; None if there is none (collective).
+
+    owned : nodes of this rank; the ranks' follow each other
+    """
+    with Source(comm, path) as source:
+        steps = source.value("checkpoint/step")
+        if steps is None or max(steps) < 0:
+            return None
+        slot = int(np.argmax(steps))
+        rows = {name: source.rows(f"checkpoint/{name}", owned, slot) for name in source.row_names()}
+        numbers, names = source.value("checkpoint/numbers"), source.names()
+        return Saved(int(steps[slot]), rows, dict(zip(names, numbers[slot].tolist(), strict=True)) if names else {})
+
+
+def read_numbers(comm, path: Path, index: int) -> dict[str, float]:
+    """Of a frame, all that the file has (collective)."""
+    with Source(comm, path) as source:
+        return {name: source.value(f"frames/{name}")[index] for name, (_, shape, _) in SERIES.items() if not shape}
+
+
+def refuse_other_lattice(comm, path: Path, found: dict[str, np.ndarray]) -> None:
+    """Raises InputError where ``found``, the ranks' rows by dataset, is not what the file has (collective)."""
+    with Source(comm, path) as source:
+        for name, rows in found.items():
+            there, here = source.value(name, "shape"), comm.allreduce(len(rows))
+            if there is None:
+                continue
+            same = there[0] == here
+            if same:
+                rows, stored = np.asarray(rows, float), source.rows(name, len(rows)).astype(float)
+                greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
+                same = all(comm.allgather(bool(np.abs(rows - stored).max(initial=0) <= SAME * greatest)))
+            if not same:
+                raise InputError(f"{path}: the mesh has changed: {name} is not what this run makes of it")
+
+
+class Source:
+    """A result file, open on rank 0, from which the ranks take their rows (all methods are collective)."""
+
+    def __init__(self, comm, path: Path):
+        self._comm, self._path, self._file = comm, path, None
+        with together(comm):
+            if comm.rank == 0:
+                self._file = open_result(path)
+
+    def __enter__(self) -> "Source":
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def value(self, name: str, part: str | None = None) -> np.ndarray | tuple | None:
+        """A small dataset, or its "shape"; None if it is not there."""
+        return self._asked(lambda file: None if name not in file else file[name].shape if part else file[name][...])
+
+    def names(self) -> list[str]:
+        """Of the checkpoint's numbers."""
+        numbers = "checkpoint/numbers"
+        return self._asked(lambda file: file[numbers].attrs["names"].split() if numbers in file else [])
+
+    def row_names(self) -> list[str]:
+        """Of what the checkpoint has of each node."""
+        return self._asked(lambda file: [name for name in file["checkpoint"] if name not in ("step", "numbers")])
+
+    def rows(self, name: str, count: int, index: int | None = None) -> np.ndarray:
+        """This rank's ``count`` rows of a dataset, or of its ``index``."""
+        counts = self._comm.allgather(count)
+        dtype, shape = self._asked(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
+        own, failure = np.empty((count, *shape), dtype), None
+        if self._comm.rank > 0:
+            for part in pieces(own, count):
+                self._comm.Recv(own[part], source=0)
+        else:
+            failure = self._send(self._file[name], counts, index, own)
+        with together(self._comm):
+            if failure is not None:
+                raise InputError(f"{self._path} cannot be read: {failure}")
+        return own
+
+    def _send(self, dataset: h5py.Dataset, counts: Sequence[int], index: int | None, own: np.ndarray) -> OSError | None:
+        start, failure = 0, None
+        for rank, count in enumerate(counts):
+            for part in pieces(own, count):
+                place, piece = slice(start + part.start, start + part.stop), np.zeros_like(own, shape=(part.stop - part.start, *own.shape[1:]))
+                try:
+                    piece[...] = dataset[place if index is None else (index, place)]
+                except OSError as error:
+                    failure = error  # the others still wait
+                if rank > 0:
+                    self._comm.Send(piece, dest=rank)
+                else:
+                    own[part] = piece
+            start += count
+        return failure
+
+    def _asked(self, question):
+        """What rank 0 finds in the file."""
+        answer = None
+        with together(self._comm):
+            if self._file is not None:
+                try:
+                    answer = question(self._file)
+                except (OSError, KeyError) as error:
+                    raise InputError(f"{self._path} is damaged: {error}") from None
+        return self._comm.bcast(answer)

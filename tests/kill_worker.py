@@ -81,8 +81,9 @@ def chain(scene: str, path: Path, kills: int, chance: random.Random, seen: dict,
     for extra, whole in runs:
         arguments, status = ["run", scene, "--resume", str(path), *extra], None
         while status is None:
+            often = chance.choice([[], ["--checkpoint-every", "1"]])
             enough = seen["kills"] - begun >= kills
-            status = run(arguments, None if enough else chance.uniform(0, seen["seconds"] * 0.6))
+            status = run([*arguments, *often], None if enough else chance.uniform(0, seen["seconds"] * 0.6))
             if status is None:
                 seen["kills"] += 1
                 seen["before the file"] += not path.exists()

@@ -34,12 +34,12 @@ def test_killed_at_any_moment_on_one_rank(tmp_path):
 
 def test_killed_at_any_moment_on_two_ranks(tmp_path):
     """One rank, which ends the other."""
-    scene, path, chance = hanging(tmp_path, 400, output={"surface": False}), tmp_path / "x.h5", random.Random(2)
+    scene, path, chance = hanging(tmp_path, 80, output={"surface": False}), tmp_path / "x.h5", random.Random(2)
     whole = tmp_path / "whole.h5"
     assert run(2, "-m", "msmpetsc.cli.main", "run", scene, "-o", whole).returncode == 0
     kills, known, at = 0, 0, []
     while kills < ON_TWO:
-        killed = kill_soon(["run", str(scene), "--resume", str(path)], chance)
+        killed = kill_soon(["run", str(scene), "--resume", str(path), "--checkpoint-every", "1"], chance)
         kills += killed
         with h5py.File(path, locking=False) as file:
             assert finished(file) >= known
@@ -62,7 +62,7 @@ def kill_soon(arguments: list[str], chance: random.Random) -> bool:
         for line in process.stderr:
             if line.startswith("frame "):
                 break
-        time.sleep(chance.uniform(0, 0.3))
+        time.sleep(chance.uniform(0, 0.2))
         ranks = ranks_of(process)
         if len(ranks) == 2 and process.poll() is None:
             os.kill(chance.choice(ranks), signal.SIGKILL)

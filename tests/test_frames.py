@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -18,7 +19,7 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
-from msmpetsc.output import frames
+from msmpetsc.output import continued, frames
 from msmpetsc.output.frames import SERIES, ResultFile, finished, open_result, read_checkpoint
 from msmpetsc.output.xdmf import write_xdmf
 
@@ -111,6 +112,52 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
                 assert np.array_equal(kept[2], positions(kept[0] - 1, NODES))
 
 
+def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypatch):
+    """As above, from the opening of a file that was left by a kill, until it is closed."""
+    path, disk = tmp_path / "x.h5", Disk()
+    with ResultFile(path, MPI.COMM_SELF, {}) as file:
+        file.start_frames(9, NODES, POINTS)
+        for index in range(3):
+            file.append(frame(index))
+            file.write_checkpoint(saved(index))
+        file.close(trim=False)
+    before = path.read_bytes()
+    io.BytesIO.write(disk, before)
+    monkeypatch.setattr(continued, "open_again", lambda _: h5py.File(disk, "r+", libver="earliest", rdcc_nbytes=0))
+    file = continued.InPlace(path, MPI.COMM_SELF, {})
+    file.start_frames(9, NODES, POINTS)
+    assert file.finished == 3
+    for index in range(3, 6):
+        file.append(frame(index))
+        file.write_checkpoint(saved(index))
+    file.close(trim=False)
+    with h5py.File(io.BytesIO(before)) as laid:
+        numbers = sorted(places(laid))
+    assert {change for change in disk.log if isinstance(change, int)} <= {len(before)}  # not cut, not stretched
+    for offset, data in [change for change in disk.log if not isinstance(change, int)]:
+        changed = [at for at, byte in enumerate(data, offset) if byte != before[at]]
+        inside = [any(start <= at < end for start, end in numbers) for at in changed]
+        assert all(inside)
+    for _, image in disk.images(start=1, begin=before):
+        with h5py.File(io.BytesIO(image), "r") as killed:
+            assert_holds(killed, finished(killed))
+            step, q, _ = read_checkpoint(killed)
+            assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(q, positions(step, NODES))
+
+
+def saved(index: int) -> Saved:
+    return Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+
+
+def places(file: h5py.File) -> Iterator[tuple[int, int]]:
+    """Where the chunks of frames and checkpoints lie, [byte]."""
+    for group in ("frames", "checkpoint"):
+        for dataset in file[group].values():
+            for number in range(dataset.id.get_num_chunks()):
+                chunk = dataset.id.get_chunk_info(number)
+                yield chunk.byte_offset, chunk.byte_offset + chunk.size
+
+
 class Disk(io.BytesIO):
     """A file that remembers every change of itself, in order."""
 
@@ -133,9 +180,9 @@ class Disk(io.BytesIO):
         super().write(bytes(max(0, missing)))
         self.seek(here)
 
-    def images(self, start):
+    def images(self, start, begin=b""):
         """(number of changes made, content) after each change from the start-th on."""
-        image = bytearray()
+        image = bytearray(begin)
         for number, change in enumerate(self.log, 1):
             end = change if isinstance(change, int) else change[0] + len(change[1])
             image.extend(bytes(max(0, end - len(image))))

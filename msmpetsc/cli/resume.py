@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
+from msmpetsc import __version__
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.output.continued import Anew, InPlace
@@ -53,7 +54,7 @@ def read_scene(args: argparse.Namespace, earlier: Earlier | None, changes: list[
 
 def _stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
     text, file = (earlier.attributes.get(name) for name in ("scene", "scene_file"))
-    if text is None or file is None:
+    if not text or not file:
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
     return scene_of(Path(file), text, changes, presets)
 
@@ -74,6 +75,8 @@ class Resumed:
         fixed = [line for line in self.differs if line.startswith(FIXED)]
         if fixed:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
+        if (version := earlier.attributes.get("msmpetsc_version")) != __version__:
+            log.warning("%s was begun by msmpetsc %s, this is %s", earlier.path, version, __version__)
 
     @property
     def is_done(self) -> bool:
@@ -100,7 +103,7 @@ class Resumed:
             return InPlace(earlier.path, comm, attributes)
         before = f"{earlier.attributes.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.attributes.get("earlier"), before]))
-        attributes |= {name: earlier.attributes["scene_file"] for name in ("scene_file",) if name in earlier.attributes}
+        attributes["scene_file"] = attributes["scene_file"] or earlier.attributes["scene_file"]
         return Anew(earlier.path, comm, attributes, earlier.finished)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
@@ -116,13 +119,16 @@ class Resumed:
         saved = read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
         if saved is None:
             return
+        if simulation.stored_until(saved.step) > self.earlier.finished:
+            raise InputError(f"{self.earlier.path} is damaged: it lacks frames of before its checkpoint")
         if isinstance(file, Anew) and self.differs:  # later frames are of how it was
             kept = simulation.stored_until(saved.step)
             file.keep(kept)
             if kept < self.earlier.finished and saved.step % simulation.every:
                 saved.numbers |= read_numbers(comm, self.earlier.path, kept)  # its last frame, which is none now
         simulation.restore(saved)
-        log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, saved.step * simulation.time_step)
+        time = saved.step * simulation.time_step
+        log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, time)
 
 
 def flat(scene: Scene) -> dict[str, Any]:

@@ -5,7 +5,6 @@ import json
 import shlex
 import sys
 from pathlib import Path
-from signal import Signals as Signal
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -17,12 +16,12 @@ from msmpetsc import __version__
 from msmpetsc.cli import resume
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.resume import Resumed
-from msmpetsc.cli.signals import STATUS, Interval, Signals
+from msmpetsc.cli.signals import Interval, Signals
+from msmpetsc.cli.storing import tell_stop, write_frames, write_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.earlier import Earlier
 from msmpetsc.output.frames import ResultFile
-from msmpetsc.output.progress import Progress
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene import Scene
 
@@ -145,16 +144,6 @@ def what_is_measured(args: argparse.Namespace) -> "Measured":
     return Measured(args.true_error, args.trace)
 
 
-def tell_stop(number: int, path: Path, simulation: "Simulation") -> int:
-    """One line, and the exit status of that signal."""
-    log.warning(
-        "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",
-        Signal(number).name, simulation.step, simulation.steps, simulation.step * simulation.time_step,
-        shlex.quote(str(path)),
-    )  # fmt: skip
-    return STATUS[number]
-
-
 def refuse_steps_beyond(steps: int, args: argparse.Namespace, taken: int) -> None:
     """Raises InputError for steps to be measured that the run does not come to, or that it took before."""
     if args.trace is not None and args.trace <= taken:
@@ -202,12 +191,17 @@ def given_options() -> dict[str, str]:
     return PETSc.Options().getAll()
 
 
+def as_given(option: tuple[str, str]) -> str:
+    name, value = option
+    return f"-{name} {shlex.quote(value)}" if value else f"-{name}"
+
+
 def attributes(comm: MPI.Comm, scene: Scene, args: argparse.Namespace) -> dict:
     """What the file says of the run that made it."""
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
-        "petsc_options": " ".join(f"-{name} {shlex.quote(value) if value else ''}".strip() for name, value in given_options().items()),
+        "petsc_options": " ".join(map(as_given, given_options().items())),
         "ranks": comm.size,
         "command": shlex.join(["msmpetsc", *sys.argv[1:]]),
         "scene": scene.text,
@@ -224,62 +218,3 @@ def describe(comm: MPI.Comm, model: "Model") -> None:
         "%d cells of %.4g m, %d nodes, %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, springs, comm.size, "s" * (comm.size > 1),
     )  # fmt: skip
-
-
-def write_model(comm: MPI.Comm, file: ResultFile, model: "Model") -> None:
-    """The parts of the file that do not change with time (collective)."""
-    lattice, owned = model.lattice, model.lattice.owned
-    springs = slice(lattice.springs_owned)
-    numbers = lattice.global_numbers
-    file.write("lattice/nodes", lattice.nodes[:owned])
-    file.write("lattice/cells", lattice.cells)
-    file.write("lattice/cell_kind", lattice.cell_kind)
-    file.write("lattice/springs", numbers[lattice.springs[springs]])
-    file.write("lattice/rest_length", lattice.rest_length[springs])
-    file.write("lattice/stiffness", lattice.stiffness[springs])
-    file.write("lattice/mass", lattice.mass)
-    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
-    surface, embedding = model.surface, model.embedding
-    if embedding is None:
-        return
-    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
-    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
-    offset = comm.exscan(len(embedding.indices)) or 0
-    indptr = embedding.indptr[1:] + offset
-    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
-    file.write("embedding/indices", embedding.indices)
-    file.write("embedding/weights", embedding.weights)
-
-
-def write_frames(
-    comm: MPI.Comm, file: ResultFile, simulation: "Simulation", cost: Cost, signals: Signals, interval: Interval
-) -> int:
-    """Run, and store each frame when it is done; those before a failure stay. Returns the signal that ended it, or 0
-    (collective)."""
-    lattice, embedding = simulation.model.lattice, simulation.model.embedding
-    points = embedding.points if embedding else None
-    file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
-    progress = Progress(simulation.steps, enabled=comm.rank == 0)
-    count = simulation.stored_until(simulation.step) if simulation.step else 0  # frames of the steps taken
-    signal = 0
-    signals.begin()
-    try:
-        for frame in simulation.advance():
-            begun = perf_counter()
-            if frame is not None:
-                if count >= file.finished:  # else it was written before
-                    file.append(frame)
-                count += 1
-                progress.update(frame)
-            due = comm.rank == 0 and interval.due(frame is not None) or simulation.step in (0, simulation.steps)
-            due, signal = signals.agree(due)
-            if due:
-                began = perf_counter()
-                file.write_checkpoint(simulation.saved())
-                interval.done(began)
-            cost.add(frame.wall_time if frame else 0.0, begun)
-            if signal:
-                break
-    finally:
-        progress.close()
-    return signal if simulation.step < simulation.steps else 0

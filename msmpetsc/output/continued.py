@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
-from msmpetsc.output.frames import ResultFile, refuse_small_disk
+from msmpetsc.output.frames import ResultFile, open_again, refuse_small_disk
 from msmpetsc.output.result import finished, open_result
 
 
@@ -24,7 +23,7 @@ class InPlace(ResultFile):
     def _create(self, _: dict) -> None:
         try:
             open_result(self.path).close()
-            self._file = h5py.File(self.path, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+            self._file = open_again(self.path)
         except Exception:
             self._lock.free()
             raise

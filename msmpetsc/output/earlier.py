@@ -51,8 +51,11 @@ def read_saved(comm, path: Path, owned: int) -> Saved | None:
             return None
         slot = int(np.argmax(steps))
         rows = {name: source.rows(f"checkpoint/{name}", owned, slot) for name in source.row_names()}
-        numbers, names = source.value("checkpoint/numbers"), source.names()
-        return Saved(int(steps[slot]), rows, dict(zip(names, numbers[slot].tolist(), strict=True)) if names else {})
+        names, numbers = source.names(), source.value("checkpoint/numbers")
+        numbers = numbers[slot].tolist() if names else []
+        if not {"q", "q_previous"} <= rows.keys() or len(names) != len(numbers):
+            raise InputError(f"{path} is damaged: its checkpoint is not whole")
+        return Saved(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
 
 
 def read_numbers(comm, path: Path, index: int) -> dict[str, float]:
@@ -121,14 +124,18 @@ class Source:
                 raise InputError(f"{self._path} cannot be read: {failure}")
         return own
 
-    def _send(self, dataset: h5py.Dataset, counts: Sequence[int], index: int | None, own: np.ndarray) -> OSError | None:
+    def _send(
+        self, dataset: h5py.Dataset, counts: Sequence[int], index: int | None, own: np.ndarray
+    ) -> Exception | None:
+        """Rank 0's part of ``rows``; what could not be read."""
         start, failure = 0, None
         for rank, count in enumerate(counts):
             for part in pieces(own, count):
-                place, piece = slice(start + part.start, start + part.stop), np.zeros_like(own, shape=(part.stop - part.start, *own.shape[1:]))
+                place = slice(start + part.start, start + part.stop)
+                piece = np.zeros((part.stop - part.start, *own.shape[1:]), own.dtype)
                 try:
                     piece[...] = dataset[place if index is None else (index, place)]
-                except OSError as error:
+                except (OSError, ValueError) as error:
                     failure = error  # the others still wait
                 if rank > 0:
                     self._comm.Send(piece, dest=rank)

@@ -319,6 +319,11 @@ def _open_new(path: Path) -> h5py.File:
     return h5py.File(path, "w", libver="earliest", rdcc_nbytes=0, locking=False)
 
 
+def open_again(path: Path) -> h5py.File:
+    """A file of that kind, to be written further."""
+    return h5py.File(path, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+
+
 def _layout(
     count: int,
     nodes: int,

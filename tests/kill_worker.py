@@ -19,13 +19,13 @@ import petsc4py
 
 petsc4py.init(["msmpetsc"])
 
-from mpi4py import MPI  # noqa: E402
+from mpi4py import MPI  # noqa: E402, F401
 
 from msmpetsc.cli.main import main  # noqa: E402
-from msmpetsc.model.build import build_model  # noqa: E402
+from msmpetsc.model.build import build_model  # noqa: E402, F401
 from msmpetsc.output.frames import ResultFile, finished  # noqa: E402
 from msmpetsc.scene_reading import load_scene  # noqa: E402
-from msmpetsc.solve.simulate import Simulation  # noqa: E402
+from msmpetsc.solve.simulate import Simulation  # noqa: E402, F401
 
 stored = Value("i", 0, lock=False)  # frames that the child's file had when `append` returned
 append = ResultFile.append

@@ -107,15 +107,11 @@ class EnergyBalance:
         """The step is taken."""
         self.known, self.ledger = (result.position, after.elastic), ledger
 
-    def save(self, saved: Saved, state: State) -> None:
-        known = self.known is not None and state.q is self.known[0]
-        saved.numbers |= vars(self.ledger) | {"elastic": self.known[1] if known else np.nan}
+    def save(self, saved: Saved) -> None:
+        saved.numbers |= vars(self.ledger)
 
-    def restore(self, saved: Saved, state: State) -> None:
-        numbers = saved.numbers
-        self.ledger = Ledger(**{name: numbers[name] for name in vars(Ledger()) if name in numbers})
-        elastic = numbers.get("elastic", np.nan)
-        self.known = None if np.isnan(elastic) else (state.q, elastic)
+    def restore(self, saved: Saved) -> None:
+        self.ledger = Ledger(**{name: saved.numbers[name] for name in vars(Ledger()) if name in saved.numbers})
 
     def _start(self, before: State, result: StepResult, time: float, time_step: float) -> tuple[float, float]:
         """Right side of the balance, and the work in it: of loads, and of obstacles that drag [J] (collective)."""
@@ -136,7 +132,8 @@ class EnergyBalance:
                 ]
             )
         )
-        return sums[:3].sum() + (self.known[1] if known else 0.0), sums[3]
+        kinetic, elastic, contact, work = sums
+        return kinetic + (self.known[1] if known else elastic) + contact, work
 
     def _worst(self, vectors: np.ndarray) -> str:
         owned = np.arange(self.lattice.owned)

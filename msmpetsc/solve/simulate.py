@@ -115,9 +115,8 @@ class Simulation:
         """All that the next step depends on; to be stored or copied before that is taken."""
         saved = Saved(self.step)
         self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back)
-        for part in (self.integrator, self.balance):
-            part.save(saved, self.state)
-        for part in (self.rescue, self.watch):
+        self.integrator.save(saved, self.state)
+        for part in (self.balance, self.rescue, self.watch):
             part.save(saved)
         saved.numbers |= vars(self.effort)
         return saved
@@ -127,8 +126,7 @@ class Simulation:
         self.step, time = saved.step, saved.step * self.time_step
         self.state = State.restored(self.comm, self.model.lattice, saved)
         self.integrator.restore(saved, self.state, time)
-        self.balance.restore(saved, self.state)
-        for part in (self.rescue, self.watch):
+        for part in (self.balance, self.rescue, self.watch):
             part.restore(saved)
         fields = {name: type(value) for name, value in vars(Effort()).items() if name in saved.numbers}
         self.effort = Effort(**{name: kind(saved.numbers[name]) for name, kind in fields.items()})

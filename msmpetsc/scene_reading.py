@@ -28,20 +28,29 @@ def load_scene(
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
-    return scene_of(path, _read(path, "scene"), overrides, presets)
+    return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
 
 
 def scene_of(
-    path: Path, file_text: str, overrides: Iterable[str] = (), presets: Collection[str] | None = None
+    path: Path,
+    file_text: str,
+    overrides: Iterable[str] = (),
+    presets: Collection[str] | None = None,
+    by_user: bool = True,
+    to_read: bool = True,
 ) -> Scene:
-    """The same of a text that stood in the file."""
+    """The same of a text that stood in the file.
+
+    to_read: whether the files that it names are to be read
+    """
     overrides, data = list(overrides), _parse(path, file_text)
     keys = {_override(data, override): override for override in overrides}
     try:
         checked = SceneFile.model_validate(data, context={"presets": presets})
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
-    _refuse_outside(path, checked, keys if by_user else ())
+    if to_read:
+        _refuse_outside(path, checked, keys if by_user else ())
     return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
 
 

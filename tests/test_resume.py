@@ -238,9 +238,9 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
     block_scene(tmp_path, sides=np.array([0.5, 0.5, 0.375]), name="other")
     with h5py.File(stopped, "r+") as file:
         scene = tomllib.loads(file.attrs["scene"])
-        scene["mesh"]["source"] = str(tmp_path / "other.ply")
+        other = scene["mesh"]["source"] = str(tmp_path / "other.ply")
         file.attrs["scene"] = tomli_w.dumps(scene)
-    assert main(["run", "--resume", str(stopped)]) == 2
+    assert main(["run", "--resume", str(stopped), "--set", f"mesh.source={other}"]) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(told) == 1 and "the mesh has changed: lattice/nodes" in told[0]
     with h5py.File(stopped) as file:

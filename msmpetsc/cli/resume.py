@@ -86,7 +86,7 @@ class Resumed:
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier
         if "scene" in earlier.attributes:
-            was = flat(scene_of(Path(earlier.attributes.get("scene_file", "scene")), earlier.attributes["scene"]))
+            was = flat(scene_of(earlier.path, earlier.attributes["scene"], to_read=False))
             now = flat(scene)
             for key in sorted(was.keys() | now.keys()):
                 if was.get(key) != now.get(key):

@@ -17,7 +17,7 @@ from test_signals import assert_same, hanging, ranks_of
 from msmpetsc.output.frames import finished
 
 ALONE, ON_TWO = 40, 10  # kills
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(170)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
 
 def test_killed_at_any_moment_on_one_rank(tmp_path):
@@ -34,7 +34,7 @@ def test_killed_at_any_moment_on_one_rank(tmp_path):
 
 def test_killed_at_any_moment_on_two_ranks(tmp_path):
     """One rank, which ends the other."""
-    scene, path, chance = hanging(tmp_path, 80, output={"surface": False}), tmp_path / "x.h5", random.Random(2)
+    scene, path, chance = hanging(tmp_path, 40, output={"surface": False}), tmp_path / "x.h5", random.Random(2)
     whole = tmp_path / "whole.h5"
     assert run(2, "-m", "msmpetsc.cli.main", "run", scene, "-o", whole).returncode == 0
     kills, known, at = 0, 0, []

@@ -247,6 +247,20 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
+@pytest.mark.parametrize("option", ["-pc_type python -pc_python_type os.system", "-options_file x", "-log_view :x.py"])
+def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, capsys, tmp_path, monkeypatch, option: str):
+    """Options without effect on results are forgotten, all others that choose no solver are refused."""
+    monkeypatch.chdir(tmp_path)
+    with h5py.File(stopped, "r+") as file:
+        file.attrs["petsc_options"] = option
+    status = main(["run", "--resume", str(stopped)])
+    told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    if option.startswith("-log_view"):
+        assert status == 0 and not list(tmp_path.glob("x*"))
+    else:
+        assert status == 2 and len(told) == 1 and "is not taken from a file" in told[0]
+
+
 def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
     from msmpetsc.output.frames import Lock
 

@@ -3,7 +3,7 @@
 import argparse
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,10 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.continued import Anew, InPlace
 from msmpetsc.output.earlier import Earlier, read_numbers, read_saved, refuse_other_lattice
 from msmpetsc.output.frames import ResultFile
+from msmpetsc.output.result import refuse_deadly
 from msmpetsc.scene import Scene
 from msmpetsc.scene_reading import load_scene, scene_of
+from msmpetsc.study.schema import beside_solving
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
@@ -39,8 +41,8 @@ def look(comm: MPI.Comm, args: argparse.Namespace) -> Earlier | None:
     there = comm.bcast(on_root(comm, args.resume.exists))
     if not there and args.scene:
         return None  # the first start of a job that may be started again
-    earlier = comm.bcast(on_root(comm, lambda: Earlier.look(args.resume)))
-    args.petsc_options = [*shlex.split(earlier.attributes.get("petsc_options", "")), *args.petsc_options]
+    earlier = comm.bcast(on_root(comm, lambda: look_closely(args.resume)))
+    args.petsc_options = [*_stored_options(earlier, _as_options(args.petsc_options)), *args.petsc_options]
     args.true_error = args.true_error or int(earlier.attributes.get("true_error", 0)) or None
     return earlier
 
@@ -50,6 +52,25 @@ def read_scene(args: argparse.Namespace, earlier: Earlier | None, changes: list[
     if args.scene is not None:
         return load_scene(args.scene, changes, presets)
     return _stored_scene(earlier, changes, presets)
+
+
+def look_closely(path: Path) -> Earlier:
+    """For one rank."""
+    refuse_deadly(path)
+    return Earlier.look(path)
+
+
+def _stored_options(earlier: Earlier, given: Collection[str]) -> Iterator[str]:
+    """PETSc's, of the earlier run, less those without effect on results. Raises InputError for one that could do more
+    than choose a solver, and is not ``given`` again: the file may be from anywhere."""
+    stored = _as_options(shlex.split(earlier.attributes.get("petsc_options", "")))
+    for name, value in stored.items():
+        words = [f"-{name}", value] if value else [f"-{name}"]
+        if name in given or OF_NO_EFFECT.search(name):
+            continue
+        if beside_solving(words):
+            raise InputError(f"{earlier.path} was run with {' '.join(words)}, which is not taken from a file: give it again")
+        yield from words
 
 
 def _stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:

@@ -23,16 +23,23 @@ def _not_empty(values: tuple) -> tuple:
     return values
 
 
-def _words(options: str) -> str:
-    """A study file may choose solvers; it may not make PETSc, or us, run code, read files or write them."""
-    try:
-        words = shlex.split(options)
-    except ValueError as error:
-        raise rule(f"cannot be taken apart: {str(error).lower()}") from None
+def beside_solving(words: list[str]) -> str | None:
+    """The first of PETSc's options and their values that a file may not hold, if any: it may choose solvers; it may not
+    make PETSc, or us, run code, read files or write them."""
     for word in words:
         known = SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)
         if not known or word == "python" or BESIDE_SOLVING.search(word):
-            raise rule(f"has {word!r}: only options of solvers, and plain values, may stand in a file")
+            return word
+    return None
+
+
+def _words(options: str) -> str:
+    try:
+        refused = beside_solving(shlex.split(options))
+    except ValueError as error:
+        raise rule(f"cannot be taken apart: {str(error).lower()}") from None
+    if refused is not None:
+        raise rule(f"has {refused!r}: only options of solvers, and plain values, may stand in a file")
     return options
 
 

@@ -1,5 +1,6 @@
 """Writes result files for test_frames.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
 
+import os
 import sys
 
 import numpy as np
@@ -37,10 +38,11 @@ def share(rows: int) -> slice:
     return slice(cuts[rank], cuts[rank + 1]) if rank < len(cuts) - 1 else slice(rows, rows)
 
 
-def write_all(path: str) -> None:
-    frames.PIECE_BYTES = 100  # several pieces a rank
+def write_all(path: str, gathers: bool = False) -> None:
+    frames.PIECE_BYTES, frames.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
     nodes, points = share(NODES), share(POINTS)
     with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}) as file:
+        file.gathers = gathers
         file.write("lattice/nodes", positions(0, NODES)[nodes])
         file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
         file.write("lattice/pinned", np.zeros(0, int))
@@ -69,11 +71,19 @@ def refuse(path: str) -> None:
         sys.stdout.write(f"refused: {error}\n")
 
 
-def fill_disk(path: str) -> None:
-    """The disk is full at the third frame, when the other ranks are already sending."""
+def fill_disk(path: str, gathers: bool = True) -> None:
+    """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
+    in the midst of its rows."""
     frames.PIECE_BYTES = 100
     nodes = share(NODES)
     store = frames.h5py.Dataset.__setitem__
+
+    def half(file: int, data: memoryview, place: int) -> int:
+        if MPI.COMM_WORLD.rank != 1:
+            return write(file, data, place)
+        if len(data) < 100:
+            raise OSError(28, "No space left on device")
+        return write(file, data[:100], place)
 
     def full(dataset, key, value):
         if dataset.name == "/frames/position":
@@ -82,14 +92,24 @@ def fill_disk(path: str) -> None:
 
     try:
         with ResultFile(path, MPI.COMM_WORLD, {}) as file:
+            file.gathers = gathers
             file.start_frames(STEPS + 1, nodes.stop - nodes.start)
             for index in range(STEPS + 1):
-                if index == 2:
+                if index == 2 and gathers:
                     frames.h5py.Dataset.__setitem__ = full
+                elif index == 2:
+                    write, os.pwrite = os.pwrite, half
                 file.append(frame(index, nodes, None))
     except InputError as error:
         sys.stdout.write(f"refused: {error}\n")
 
 
 if __name__ == "__main__":
-    {"all": write_all, "forever": write_forever, "refuse": refuse, "full": fill_disk}[sys.argv[1]](sys.argv[2])
+    {
+        "all": write_all,
+        "gathered": lambda path: write_all(path, gathers=True),
+        "forever": write_forever,
+        "refuse": refuse,
+        "full": fill_disk,
+        "full for one": lambda path: fill_disk(path, gathers=False),
+    }[sys.argv[1]](sys.argv[2])

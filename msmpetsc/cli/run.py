@@ -56,6 +56,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--checkpoint-every", metavar="N", help="frames, or 30s, 5min, 2h; default: as takes 1%% of the time at most"
     )
     parser.add_argument(
+        "--gather", action="store_true", help="let rank 0 write for all: where nodes of a cluster do not see one file alike"
+    )
+    parser.add_argument("--compress", action="store_true", help="pack the finished OUT.h5: smaller, slower to read")
+    parser.add_argument(
         "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
@@ -104,6 +108,7 @@ def run(args: argparse.Namespace) -> int:
             Signals(comm) as signals,
             resumed.file(comm, about) if resumed else ResultFile(path, comm, about, args.overwrite) as file,
         ):
+            file.gathers = args.gather
             model = build_model(comm, scene)
             describe(comm, model)
             if resumed:

@@ -1,4 +1,7 @@
-"""The result file (HDF5, format_version 1): written by all ranks through rank 0, safe against a kill.
+"""The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
+
+Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank writes its own
+where it can reach the file (output.direct). The file is the same.
 
 All metadata is on disk before the first frame and does not change while frames are written: every dataset of
 ``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks allocated, nothing buffered.
@@ -30,6 +33,7 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.saved import Saved
+from msmpetsc.output.direct import chunk_places, reach, write_rows
 from msmpetsc.output.result import FORMAT, FORMAT_VERSION, finished, open_result, read_checkpoint  # noqa: F401
 
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
@@ -71,7 +75,10 @@ class ResultFile:
     file system has locks, keeps a second run from writing it at the same time.
 
     finished : number of frames that it holds
+    gathers  : rank 0 writes frames for all ranks, even where each can reach the file; to be said before they start
     """
+
+    gathers = False
 
     def __init__(self, path: str | Path, comm, attributes: dict, overwrite: bool = False):
         """comm: an mpi4py communicator. attributes: see design.md; format and format_version are added here."""
@@ -80,6 +87,7 @@ class ResultFile:
         self._comm = comm
         self._overwrite = overwrite
         self._file: h5py.File | None = None  # open on rank 0 only
+        self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
         self._lock: Lock | None = None  # the same
         self._planned = self.finished = 0
         self._failed = False  # to write
@@ -134,6 +142,8 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._publish()
+        if self._comm.size > 1 and not self.gathers:
+            self._direct = reach(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
@@ -164,6 +174,7 @@ class ResultFile:
                 slot = int(np.argmin(self._file["checkpoint/step"]))
                 self._file["checkpoint/step"][slot] = -1
                 self._file.flush()
+        slot = self._comm.bcast(slot)
         for name, rows in saved.rows.items():
             self._collect(rows, "f8", self._nodes, f"checkpoint/{name}", slot)
         with self._together():
@@ -225,6 +236,9 @@ class ResultFile:
         os.replace(self._part, self.path)
 
     def _finish(self, trim: bool) -> None:
+        if self._direct is not None:
+            os.close(self._direct)
+            self._direct = None
         file, self._file = self._file, None
         if file is None:
             return
@@ -271,6 +285,9 @@ class ResultFile:
     def _collect(self, rows: np.ndarray, dtype, counts: Sequence[int], name: str, index: int | None = None) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)
+        if self._direct is not None and index is not None:
+            self._write_directly(rows, counts, name, index)
+            return
 
         def store(start: int, piece: np.ndarray) -> None:
             part = slice(start, start + len(piece))
@@ -282,6 +299,17 @@ class ResultFile:
                     self._comm.Send(rows[part], dest=0)
             else:
                 _receive(self._comm, rows, counts, store)
+
+
+    def _write_directly(self, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
+        chunk, places = 0, []
+        with self._together():
+            if self._file is not None:
+                dataset = self._file[name]
+                chunk, places = dataset.chunks[1], chunk_places(dataset, index)
+        chunk, places = self._comm.bcast((chunk, places))
+        with self._together():
+            write_rows(self._direct, rows, sum(counts[: self._comm.rank]), chunk, places)
 
 
 def _receive(comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int, np.ndarray], None]) -> None:
@@ -367,6 +395,7 @@ def _plan_dataset(file: h5py.File, name: str, shape: tuple, chunks: tuple, dtype
     dcpl.set_chunk(chunks)
     dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    dcpl.set_obj_track_times(False)  # the same run makes the same bytes
     if name == "frames/time":
         dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
     space, kind = h5py.h5s.create_simple(shape, shape), h5py.h5t.py_create(np.dtype(dtype))

@@ -43,7 +43,7 @@ def look(comm: MPI.Comm, args: argparse.Namespace) -> Earlier | None:
         return None  # the first start of a job that may be started again
     earlier = comm.bcast(on_root(comm, lambda: look_closely(args.resume)))
     args.petsc_options = [*_stored_options(earlier, _as_options(args.petsc_options)), *args.petsc_options]
-    args.true_error = args.true_error or int(earlier.attributes.get("true_error", 0)) or None
+    args.true_error = args.true_error or earlier.true_error or None
     return earlier
 
 
@@ -63,8 +63,7 @@ def look_closely(path: Path) -> Earlier:
 def _stored_options(earlier: Earlier, given: Collection[str]) -> Iterator[str]:
     """PETSc's, of the earlier run, less those without effect on results. Raises InputError for one that could do more
     than choose a solver, and is not ``given`` again: the file may be from anywhere."""
-    stored = _as_options(shlex.split(earlier.attributes.get("petsc_options", "")))
-    for name, value in stored.items():
+    for name, value in _stored(earlier).items():
         words = [f"-{name}", value] if value else [f"-{name}"]
         if name in given or OF_NO_EFFECT.search(name):
             continue
@@ -73,8 +72,15 @@ def _stored_options(earlier: Earlier, given: Collection[str]) -> Iterator[str]:
         yield from words
 
 
+def _stored(earlier: Earlier) -> dict[str, str]:
+    try:
+        return _as_options(shlex.split(earlier.texts.get("petsc_options", "")))
+    except ValueError:
+        raise InputError(f"{earlier.path} is damaged: its PETSc options cannot be taken apart") from None
+
+
 def _stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
-    text, file = (earlier.attributes.get(name) for name in ("scene", "scene_file"))
+    text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file:
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
     return scene_of(Path(file), text, changes, presets)
@@ -96,7 +102,7 @@ class Resumed:
         fixed = [line for line in self.differs if line.startswith(FIXED)]
         if fixed:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
-        if (version := earlier.attributes.get("msmpetsc_version")) != __version__:
+        if (version := earlier.texts.get("msmpetsc_version")) != __version__:
             log.warning("%s was begun by msmpetsc %s, this is %s", earlier.path, version, __version__)
 
     @property
@@ -106,13 +112,13 @@ class Resumed:
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier
-        if "scene" in earlier.attributes:
-            was = flat(scene_of(earlier.path, earlier.attributes["scene"], to_read=False))
+        if "scene" in earlier.texts:
+            was = flat(scene_of(earlier.path, earlier.texts["scene"], to_read=False))
             now = flat(scene)
             for key in sorted(was.keys() | now.keys()):
                 if was.get(key) != now.get(key):
                     yield f"{key}: {_told(was.get(key))} in {earlier.path}, {_told(now.get(key))} now"
-        was = _as_options(shlex.split(earlier.attributes.get("petsc_options", "")))
+        was = _stored(earlier)
         for name in sorted(was.keys() | options.keys()):
             if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
                 yield f"-{name}: {_told(was.get(name))} in {earlier.path}, {_told(options.get(name))} now"
@@ -122,9 +128,9 @@ class Resumed:
         earlier = self.earlier
         if not self.differs and earlier.planned == self.stored and earlier.exact:
             return InPlace(earlier.path, comm, attributes)
-        before = f"{earlier.attributes.get('command', '')} (to step {earlier.step})"
-        attributes["earlier"] = "\n".join(filter(None, [earlier.attributes.get("earlier"), before]))
-        attributes["scene_file"] = attributes["scene_file"] or earlier.attributes["scene_file"]
+        before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
+        attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
+        attributes["scene_file"] = attributes["scene_file"] or earlier.texts["scene_file"]
         return Anew(earlier.path, comm, attributes, earlier.finished)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:

@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     about = attributes(comm, scene, args)
     resumed = earlier and Resumed(earlier, scene, given_options(), args.force)
     if resumed and resumed.is_done:
-        on_root(comm, lambda: finish(path, args.picture))
+        on_root(comm, lambda: finish(path, args))
         log.info("%s has all its %d frames: nothing left to do", path, earlier.finished)
         return 0
     try:
@@ -122,15 +122,16 @@ def run(args: argparse.Namespace) -> int:
                 stopped = write_frames(comm, file, simulation, cost, signals, interval)
                 file.close(trim=not stopped)
     except StepFailed as failure:
-        on_root(comm, lambda: write_xdmf(path))  # the frames before the failure are worth a look
+        on_root(comm, lambda: write_beside(path))  # the frames before the failure are worth a look
         if args.measure:
             cost.write(args.measure, failure)
         raise
     if args.measure:
         cost.write(args.measure)
-    on_root(comm, lambda: finish(path, args.picture and not stopped))
     if stopped:
+        on_root(comm, lambda: write_beside(path))
         return tell_stop(stopped, path, simulation)
+    on_root(comm, lambda: finish(path, args))
     simulation.refuse_unused_options(at_end=True)
     return 0
 
@@ -158,13 +159,23 @@ def refuse_steps_beyond(steps: int, args: argparse.Namespace, taken: int) -> Non
             raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
 
 
-def finish(path: Path, picture: bool) -> None:
-    """What stands beside the result file. Raises InputError where that cannot be written."""
+def write_beside(path: Path) -> None:
+    """The XDMF file. Raises InputError where it cannot be written."""
     try:
         write_xdmf(path)
     except OSError as error:
         raise InputError(f"{path.with_suffix('.xdmf')} cannot be written: {error.strerror}") from None
-    if picture:
+
+
+def finish(path: Path, args: argparse.Namespace) -> None:
+    """The result file packed if that was asked for, and what stands beside it. Raises InputError where that cannot be
+    written."""
+    if args.compress:
+        from msmpetsc.output.packed import pack
+
+        pack(path)
+    write_beside(path)
+    if args.picture:
         from msmpetsc.output.render import contact_sheet  # loads VTK: a second that other runs need not wait
 
         contact_sheet(path, path.with_suffix(".png"))

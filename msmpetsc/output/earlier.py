@@ -11,18 +11,20 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
 from msmpetsc.output.frames import SERIES, pieces
-from msmpetsc.output.result import Result, finished, open_result
+from msmpetsc.output.result import Result, checked_checkpoint, finished, open_result
 
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """step: of its last checkpoint, 0 if it has none; finished, planned: frames that are there, and have their place;
-    exact: whether a checkpoint has all that a run goes on from."""
+    """texts: its attributes that are text; true_error: every so many steps it was measured, 0 for never; step: of its
+    last checkpoint, 0 if it has none; finished, planned: frames that are there, and have their place; exact: whether a
+    checkpoint has all that a run goes on from."""
 
     path: Path
-    attributes: dict
+    texts: dict[str, str]
+    true_error: int
     step: int
     finished: int
     planned: int
@@ -32,12 +34,14 @@ class Earlier:
     def look(cls, path: Path) -> "Earlier":
         """For one rank. Raises InputError for what is no result, or a damaged one."""
         with Result(path) as result:  # which checks it
-            attributes = result.attributes
+            texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
+            true_error = result.attributes.get("true_error")
         with open_result(path) as file:
-            step = max(0, int(np.max(file["checkpoint/step"]))) if "checkpoint/step" in file else 0
+            names = checked_checkpoint(file)
             count, planned = finished(file), len(file["frames/time"])
-            exact = "names" in file["checkpoint/numbers"].attrs if "checkpoint/numbers" in file else False
-        return cls(path, attributes, step if count else 0, count, planned, exact)
+            step = max(0, int(np.max(file["checkpoint/step"]))) if names is not None and count else 0
+        true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
+        return cls(path, texts, true_error, step, count, planned, bool(names))
 
 
 def read_saved(comm, path: Path, owned: int) -> Saved | None:
@@ -53,8 +57,6 @@ def read_saved(comm, path: Path, owned: int) -> Saved | None:
         rows = {name: source.rows(f"checkpoint/{name}", owned, slot) for name in source.row_names()}
         names, numbers = source.names(), source.value("checkpoint/numbers")
         numbers = numbers[slot].tolist() if names else []
-        if not {"q", "q_previous"} <= rows.keys() or len(names) != len(numbers):
-            raise InputError(f"{path} is damaged: its checkpoint is not whole")
         return Saved(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
 
 

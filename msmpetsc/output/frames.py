@@ -102,7 +102,7 @@ class ResultFile:
         if kind is None:
             self.close()
         else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
-            with suppress(InputError), _plain_errors(self.path):
+            with suppress(InputError), plain_errors(self.path):
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
     def write(self, name: str, rows: np.ndarray) -> None:
@@ -201,7 +201,7 @@ class ResultFile:
 
     def _create(self, attributes: dict) -> None:
         try:
-            self._file = _open_new(self._part)
+            self._file = open_new(self._part)
             self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
         except Exception:
             self._part.unlink(missing_ok=True)
@@ -257,7 +257,7 @@ class ResultFile:
     def _together(self) -> Iterator[None]:
         """What one rank cannot do in the block, all raise after it."""
         try:
-            with together(self._comm), _plain_errors(self.path):
+            with together(self._comm), plain_errors(self.path):
                 yield
         except InputError:
             self._failed = True
@@ -338,7 +338,7 @@ def pieces(rows: np.ndarray, count: int) -> Iterator[slice]:
     return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
 
-def _open_new(path: Path) -> h5py.File:
+def open_new(path: Path) -> h5py.File:
     """An empty file, of a kind that a kill cannot spoil.
 
     libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
@@ -434,7 +434,7 @@ def refuse_small_disk(path: Path, planned: int) -> None:
 
 
 @contextmanager
-def _plain_errors(path: Path) -> Iterator[None]:
+def plain_errors(path: Path) -> Iterator[None]:
     """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""
     try:
         yield

@@ -220,12 +220,37 @@ def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np
     with damage_told(path):
         if _held(path, file, "checkpoint") is None:
             return None
-        steps, q, q_previous = (_check(path, file, f"checkpoint/{name}") for name in ("step", "q", "q_previous"))
+        steps, q, q_previous = (checked_dataset(path, file, f"checkpoint/{name}") for name in ("step", "q", "q_previous"))
         if steps.shape != (2,) or not q.shape == q_previous.shape == (2, q.shape[1], 3):
             raise InputError(f"{path} is damaged: its checkpoint has shapes {steps.shape}, {q.shape}, {q_previous.shape}")
         slot = int(np.argmax(steps))
         step = int(steps[slot])
         return None if step < 0 else (step, q[slot, rows], q_previous[slot, rows])
+
+
+def checked_checkpoint(file: h5py.File) -> list[str] | None:
+    """The names of its numbers, [] if it has none; None if the file has no checkpoint.
+
+    Raises InputError for one that no run wrote so.
+    """
+    path = Path(file.filename)
+    with damage_told(path):
+        group = _held(path, file, "checkpoint")
+        if group is None:
+            return None
+        nodes, names = len(file["lattice/nodes"]), []
+        for name in group:
+            dataset = checked_dataset(path, file, f"checkpoint/{name}")
+            if name == "numbers":
+                names, shape = str(_plain(dataset.attrs.get("names", ""))).split(), (2, dataset.shape[-1])
+            else:
+                shape = (2,) if name == "step" else (2, nodes, *dataset.shape[2:])
+            kind = "i8" if name == "step" else "f8"
+            if dataset.shape != shape or dataset.dtype != kind or name == "numbers" and len(names) != shape[1]:
+                raise InputError(f"{path} is damaged: checkpoint/{printable(name, 40)} has shape {dataset.shape}")
+        if not {"step", "q", "q_previous"} <= set(group):
+            raise InputError(f"{path} is damaged: its checkpoint is not whole")
+        return names
 
 
 def _check_is_result(path: Path, file: h5py.File) -> None:
@@ -237,7 +262,7 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
         raise InputError(f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here")
     if not isinstance(_held(path, file, "frames"), h5py.Group):
         raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
-    _check(path, file, "frames/time")
+    checked_dataset(path, file, "frames/time")
 
 
 @contextmanager
@@ -266,7 +291,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
             raise InputError(f"{path} is damaged: it has no {name}")
     names = [name for name in SHAPES if _held(path, file, name) is not None]
     names += [f"frames/{name}" for name in file["frames"] if f"frames/{name}" not in SHAPES and _numbers(file, name)]
-    datasets = {name: _check(path, file, name) for name in names}
+    datasets = {name: checked_dataset(path, file, name) for name in names}
     count, sizes = finished(file), {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, _expected(name, dataset)[1], strict=True)):
@@ -312,7 +337,7 @@ def _elsewhere(dataset: h5py.Dataset) -> bool:
     return dataset.is_virtual or bool(dataset.external)
 
 
-def _check(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """The dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
     dataset = _held(path, file, name)
     if not isinstance(dataset, h5py.Dataset):

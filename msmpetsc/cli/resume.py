@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.comm import log, on_root
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 from msmpetsc.output.continued import Anew, InPlace
 from msmpetsc.output.earlier import Earlier, read_numbers, read_saved, refuse_other_lattice
 from msmpetsc.output.frames import ResultFile
@@ -81,7 +81,7 @@ def _stored(earlier: Earlier) -> dict[str, str]:
 
 def _stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
-    if not text or not file:
+    if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
     return scene_of(Path(file), text, changes, presets)
 
@@ -103,7 +103,7 @@ class Resumed:
         if fixed:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
         if (version := earlier.texts.get("msmpetsc_version")) != __version__:
-            log.warning("%s was begun by msmpetsc %s, this is %s", earlier.path, version, __version__)
+            log.warning("%s was begun by msmpetsc %s, this is %s", earlier.path, printable(str(version), 20), __version__)
 
     @property
     def is_done(self) -> bool:

@@ -13,7 +13,8 @@ ROOT = Path(__file__).parent.parent
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
 SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}  # more ranks than cores: who waits makes room
 # As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
-ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **SHARED_CORES}
+PATHS = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))  # petsc4py may be found by it
+ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": PATHS, "OMP_NUM_THREADS": "1", **SHARED_CORES}
 
 Run = Callable[..., subprocess.CompletedProcess]
 

@@ -17,7 +17,10 @@ def refusal(what: str) -> Iterator[None]:
     try:
         yield
     except (PETSc.Error, ImportError) as error:
-        raise InputError(f"{what}: {last_words(error)}") from None
+        told = error.__cause__ or error  # newer petsc4py: what Python code within PETSc raised is the cause of its own
+        if not isinstance(told, (PETSc.Error, ImportError)):
+            raise told
+        raise InputError(f"{what}: {last_words(told)}") from None
 
 
 def last_words(error: Exception) -> str:

@@ -34,7 +34,8 @@ SHARE = 0.5  # of the error that would do, left to the linear solve
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
-    PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN: "not finite",
+    -4: "not finite",  # DIVERGED_FNORM_NAN; from PETSc 3.25 on DIVERGED_FUNCTION_NANORINF
+    -14: "not finite",  # there too: DIVERGED_OBJECTIVE_NANORINF
 }
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}

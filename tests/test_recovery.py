@@ -277,8 +277,8 @@ DIVERGES = [
     ("anderson", "through", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
     # A knows nothing of cells that resist or of stiffening springs, and no line search holds the steps back
-    ("anderson", "flat, stiffening", NOT_FINITE),
-    ("anderson", "mirrored, stiffening", NOT_FINITE),
+    ("anderson", "flat, stiffening", "DIVERGED_"),  # numbers that are not finite, or in PETSc 3.26 too many iterations
+    ("anderson", "mirrored, stiffening", "DIVERGED_"),
     ("fast-msm", "flat, stiffening", NOT_FINITE),
     ("fast-msm", "pressed, stiffening", NOT_FINITE),
 ]

@@ -12,6 +12,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.solve.presets import PRESETS, find_preset
+from msmpetsc.solve.refusal import refusal
 from msmpetsc.solve.step import Stepper
 
 T = 1 / 60
@@ -225,6 +226,20 @@ def test_options_that_cannot_be_are_one_line(petsc_options, options: dict[str, s
     with pytest.raises(InputError, match=said) as refused:
         swing("newton", 1)
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_fault_of_ours_within_petsc_is_no_bad_option():
+    """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own error."""
+    from petsc4py import PETSc
+
+    def fault(*_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), refusal("PETSc refuses"):
+        snes = PETSc.SNES().create(COMM)
+        x = PETSc.Vec().createMPI(2, comm=COMM)
+        snes.setFunction(fault, x.duplicate())
+        snes.solve(None, x)
 
 
 def test_a_preset_leaves_no_options_behind():

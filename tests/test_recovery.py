@@ -306,7 +306,7 @@ def test_what_anderson_cannot_do_is_rescued(how: str):
     played = play(name, *anderson, f"safety.on_failure={how}")
     assert not played.words and played.shape_error() < 1e-6 and played.inverted(played.last) == 0
     rescued = [getattr(frame, f"{how}s") for frame in played.frames]
-    assert rescued[1] > 0 and rescued[-1] == 0
+    assert rescued[1] > rescued[-1]  # less and less
 
 
 def test_the_robust_method_is_as_good():

@@ -10,7 +10,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -74,8 +74,9 @@ def _known_names() -> set[str]:
             for name in types:
                 solver = kind().create(PETSc.COMM_SELF)
                 solver.setOptionsPrefix(f"{ASKED}{name}_")
-                solver.setType(name)
-                solver.setFromOptions()
+                with suppress(PETSc.Error):  # a PETSc without hypre
+                    solver.setType(name)
+                    solver.setFromOptions()
                 solver.destroy()
         matrix = PETSc.Mat().create(PETSc.COMM_SELF)
         matrix.setOptionsPrefix(f"{ASKED}mat_")

@@ -70,6 +70,15 @@ def test_mumps_is_asked_for(bare: Path, tmp_path: Path) -> None:
     assert done.returncode == 2 and "PETSC_MUMPS_DIR" in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_who_may_not_install_is_told_what_to_ask_for(bare: Path, tmp_path: Path) -> None:
+    program(bare, "apt-get", "exit 1")
+    program(bare, "dpkg-query", '[ "${@: -1}" = g++ ] && echo installed')
+    program(bare, "id", "echo 1000")
+    done = build(bare, tmp_path / "petsc", "--arch", "90")
+    assert done.returncode == 2 and "libmumps-dev" in done.stderr and "g++" not in done.stderr, done
+    assert done.stderr.count("\n") == 1 and not (tmp_path / "petsc").exists()
+
+
 def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("keep")
     done = build(bare, tmp_path, "--arch", "90")

@@ -17,10 +17,11 @@ def refusal(what: str) -> Iterator[None]:
     try:
         yield
     except (PETSc.Error, ImportError) as error:
-        told = error.__cause__ or error  # newer petsc4py: what Python code within PETSc raised is the cause of its own
-        if not isinstance(told, (PETSc.Error, ImportError)):
-            raise told
-        raise InputError(f"{what}: {last_words(told)}") from None
+        # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, to the end.
+        # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
+        if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError)):
+            raise error.__cause__
+        raise InputError(f"{what}: {last_words(error.__cause__ or error)}") from None
 
 
 def last_words(error: Exception) -> str:

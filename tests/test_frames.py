@@ -245,7 +245,7 @@ class Disk(io.BytesIO):
 
 def test_killed_at_any_moment(tmp_path):
     chance = random.Random(1)
-    for batch in range(5):
+    for batch in range(2):  # tests/test_kills.py has more
         writers = [start_writer(tmp_path / f"{batch}-{number}.h5") for number in range(4)]
         for process in writers:
             process.stdout.readline()  # frame 0 is stored

@@ -463,6 +463,16 @@ class SceneFile(Table):
 
     _of_one_kind = field_validator("part")(_as_the_material)
 
+    @property
+    def stored(self) -> int:
+        """Number of frames, frame 0 included."""
+        return self.stored_until(self.time.steps)
+
+    def stored_until(self, step: int) -> int:
+        """Number of frames of the first steps: one for every ``every``-th and for the last."""
+        every = self.output.every
+        return 1 + (-(-step // every) if step == self.time.steps else step // every)
+
     def named_files(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
         """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
         yield ("mesh", "source"), self.mesh.source

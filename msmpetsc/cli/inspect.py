@@ -12,6 +12,7 @@ import petsc4py
 from mpi4py import MPI
 from scipy.optimize import brentq
 
+from msmpetsc.cli.arguments import refuse_below_one
 from msmpetsc.cli.cost import peak_memory
 from msmpetsc.cli.study import refuse_ranks, stop
 from msmpetsc.comm import log
@@ -76,9 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def refuse_bad_numbers(args: argparse.Namespace) -> None:
-    for name in ("ranks", "frames"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    refuse_below_one(args, "ranks", "frames")
     if not (args.latency >= 0 and np.isfinite(args.latency)):
         raise InputError(f"--latency must be no less than 0, not {args.latency:g}")
     if not args.bandwidth > 0:
@@ -101,8 +100,8 @@ def tell_counts(args: argparse.Namespace, scene: Scene, shares: "Shares", counte
     for name, values in rows.items():
         total = shares.all_springs if name == SPRINGS else values.sum()
         print(f"{name:{WIDTH}}{total:15.0f}{values.mean():15.1f}{values.max():15.0f}")
-    frames = 1 + -(-scene.time.steps // scene.output.every)
-    print(f"{f'positions of {frames} frames, file [GB]':{WIDTH}}{24 * frames * shares.nodes.sum() / GB:15.3g}")
+    positions = f"positions of {scene.stored} frames, file [GB]"
+    print(f"{positions:{WIDTH}}{24 * scene.stored * shares.nodes.sum() / GB:15.3g}")
 
 
 def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Shares", mesh: float) -> None:

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from msmpetsc.cli.arguments import refuse_below_one
 from msmpetsc.cli.study import refuse_ranks, stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -38,9 +39,7 @@ def run(args: argparse.Namespace) -> int:
     target = args.error if args.step_error is None else args.step_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    for name in ("frames", "ranks"):
-        if getattr(args, name) < 1:
-            raise InputError(f"--{name} must be at least 1, not {getattr(args, name)}")
+    refuse_below_one(args, "frames", "ranks")
     from msmpetsc.study.plan import cheapest
 
     try:

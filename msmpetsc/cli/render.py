@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from msmpetsc.cli.arguments import refuse_below_one
 from msmpetsc.errors import InputError
 
 
@@ -26,8 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from msmpetsc.output.render import contact_sheet  # here: the other commands need no graphics
     from msmpetsc.output.result import refuse_deadly
 
-    if args.count is not None and args.count < 1:
-        raise InputError(f"--count must be at least 1, not {args.count}")
+    refuse_below_one(args, "count")
     picture = args.output or args.result.with_suffix(".png")
     frames = _numbers("--frames", args.frames, int, "0,10,20")
     eye = _numbers("--eye", args.eye, float, "1,-2,0.6")

@@ -95,7 +95,7 @@ class Resumed:
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
         """options: PETSc's, now. Raises InputError for what may not differ."""
         self.earlier, self.force = earlier, force
-        self.stored = 1 + -(-scene.time.steps // scene.output.every)
+        self.stored = scene.stored
         self.differs = list(self._differences(scene, options))
         if self.differs and not force:
             raise InputError("\n".join([*self.differs, "--force goes on all the same"]))

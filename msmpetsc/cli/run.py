@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import resume
+from msmpetsc.cli.arguments import refuse_below_one
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
@@ -28,7 +29,6 @@ from msmpetsc.scene import Scene
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
     from msmpetsc.solve.measured import Measured
-    from msmpetsc.solve.simulate import Simulation
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -140,9 +140,7 @@ def what_is_measured(args: argparse.Namespace) -> "Measured":
     """Raises InputError for numbers of steps that are none."""
     from msmpetsc.solve.measured import Measured, begin_timing
 
-    for option, number in {"--true-error": args.true_error, "--trace": args.trace}.items():
-        if number is not None and number < 1:
-            raise InputError(f"{option} must be at least 1, not {number}")
+    refuse_below_one(args, "true_error", "trace")
     if args.trace is not None and args.measure is None:
         raise InputError("--trace needs --measure, the file that it is written to")
     if args.measure:
@@ -193,8 +191,7 @@ def read_scene(args: argparse.Namespace, earlier: Earlier | None) -> Scene:
     changes += args.set
     scene = resume.read_scene(args, earlier, changes, PRESETS)
     if args.frames is not None:
-        if args.frames < 1:
-            raise InputError(f"--frames must be at least 1, not {args.frames}")
+        refuse_below_one(args, "frames")
         changes.append(f"time.duration={args.frames * scene.time.step!r}")
         scene = resume.read_scene(args, earlier, changes, PRESETS)
     return scene

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from msmpetsc.cli.arguments import refuse_below_one
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 
@@ -31,8 +32,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; returns the exit status."""
     refuse_ranks("study")
-    if args.jobs is not None and args.jobs < 1:
-        raise InputError(f"--jobs must be at least 1, not {args.jobs}")
+    refuse_below_one(args, "jobs")
     part = part_of(args.part)
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.study import run_study

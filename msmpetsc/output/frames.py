@@ -12,7 +12,7 @@ finite (`finished`). So a process killed at any moment leaves a file that opens 
 ``numbers (2,k)`` with their names as an attribute and rows of nodes (2,n,...). The older slot is written, with its
 step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
 
-A run that goes on (`Continued`) writes into the file as it lies there, if all that it needs is laid out in it: so no
+A run that goes on (output.continued) writes into the file as it lies there, if all that it needs is laid out in it: so no
 metadata change then either. Else it writes a new one, takes the frames over, and renames it when it holds them.
 """
 
@@ -88,7 +88,7 @@ class ResultFile:
         self._overwrite = overwrite
         self._file: h5py.File | None = None  # open on rank 0 only
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
-        self._lock: Lock | None = None  # the same
+        self._lock: Lock | None = None  # held on rank 0 only
         self._planned = self.finished = 0
         self._failed = False  # to write
         with self._together():

@@ -1,6 +1,6 @@
 """Arrays of a file, read where they are indexed."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 import h5py
 import numpy as np

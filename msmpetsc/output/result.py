@@ -240,6 +240,8 @@ def checked_checkpoint(file: h5py.File) -> list[str] | None:
             return None
         nodes, names = len(file["lattice/nodes"]), []
         for name in group:
+            if not name.isprintable():  # lines that tell of it would not be lines
+                raise InputError(f"{path} is damaged: its checkpoint has {printable(name, 40)!r}")
             dataset = checked_dataset(path, file, f"checkpoint/{name}")
             if name == "numbers":
                 names, shape = str(_plain(dataset.attrs.get("names", ""))).split(), (2, dataset.shape[-1])
@@ -247,7 +249,7 @@ def checked_checkpoint(file: h5py.File) -> list[str] | None:
                 shape = (2,) if name == "step" else (2, nodes, *dataset.shape[2:])
             kind = "i8" if name == "step" else "f8"
             if dataset.shape != shape or dataset.dtype != kind or name == "numbers" and len(names) != shape[1]:
-                raise InputError(f"{path} is damaged: checkpoint/{printable(name, 40)} has shape {dataset.shape}")
+                raise InputError(f"{path} is damaged: checkpoint/{name} has shape {dataset.shape}")
         if not {"step", "q", "q_previous"} <= set(group):
             raise InputError(f"{path} is damaged: its checkpoint is not whole")
         return names

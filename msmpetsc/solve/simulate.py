@@ -73,15 +73,7 @@ class Simulation:
         q, velocity = model.start
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity), Effort()
         self.step = 0  # steps taken
-
-    @property
-    def stored(self) -> int:
-        """Number of frames, frame 0 included."""
-        return self.stored_until(self.steps)
-
-    def stored_until(self, step: int) -> int:
-        """Number of frames of the first steps."""
-        return 1 + (-(-step // self.every) if step == self.steps else step // self.every)
+        self.stored, self.stored_until = scene.stored, scene.stored_until  # numbers of frames
 
     def frames(self) -> Iterator[Frame]:
         """Frame 0, then one frame for every ``every``-th step and for the last (collective). ``state`` always goes

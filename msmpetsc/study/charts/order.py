@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from msmpetsc.study import wording
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
-from msmpetsc.study.charts.look import COUNT, ERROR, FAINT, SECONDS, Look, around, log_axes, log_ticks
+from msmpetsc.study.charts.look import ERROR, FAINT, SECONDS, Look, around, log_axes, log_ticks
 from msmpetsc.study.rows import Row, grouped, measured, succeeded
 
 KIND = "Convergence in time"

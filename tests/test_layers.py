@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
 LAYERS = [
-    {"errors"}, {"scene", "scene_errors", "scene_reading", "comm"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
+    {"errors"}, {"scene", "scene_errors", "scene_reading", "comm", "place"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
     {"study"}, {"cli", "__main__"},
 ]  # fmt: skip
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}

@@ -1,8 +1,13 @@
 """The elastic energy of a lattice, whatever its law: what the solver sees of a material."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.model.cells_around import CellsAround
 from msmpetsc.model.energy import (
     add_elastic_gradient,
     add_elastic_product,
@@ -18,9 +23,13 @@ from msmpetsc.model.inversion import (
     resistance_energy,
 )
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.neighbours import Neighbours
+from msmpetsc.place.arrays import is_here
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
 RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
+
+Product = Callable[[np.ndarray, np.ndarray], None]  # adds (a Hessian) v [N] to the second argument
 
 
 class Elasticity:
@@ -28,62 +37,105 @@ class Elasticity:
     the law stiffens, stiffening ones and cells that resist being turned inside out (model.inversion).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
-    owned nodes.
+    owned nodes. ``cells`` is None where they do not resist.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.all = lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening
-        self.own = *(array[: lattice.springs_owned] for array in self.all[:3]), lattice.stiffening
-        self.cells = self.own_cells = None
+        self.springs, self.cells = (Springs if is_here(lattice.nodes) else Neighbours).of(lattice), None
         if lattice.stiffening > 0:
-            volume, h = ONSET * lattice.cell_size**3, lattice.cell_size
-            self.cells = lattice.local_cells, RESISTANCE * lattice.cell_stiffness * h**2, volume
-            self.own_cells = *(array[: lattice.cells_owned] for array in self.cells[:2]), volume
+            volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
+            kind = Cells if is_here(lattice.nodes) else CellsAround
+            self.cells = kind.of(lattice, RESISTANCE * resistance, ONSET * volume)
+        self.parts = [part for part in (self.springs, self.cells) if part]
 
     def energy(self, q: np.ndarray) -> float:
         """[J]"""
-        return elastic_energy(q, *self.own) + (resistance_energy(q, *self.own_cells) if self.cells else 0.0)
+        return sum(part.energy(q) for part in self.parts)
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
         """E(q) - E(base) [J]."""
-        change = elastic_change(q, base, *self.own)
-        if self.cells:
-            change += resistance_change(q, base, *self.own_cells)
-        return change
+        return sum(part.change(q, base) for part in self.parts)
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
-        add_elastic_gradient(q, *self.all, gradient)
-        if self.cells:
-            add_resistance_gradient(q, *self.cells, gradient)
-
-    def resisting(self, q: np.ndarray) -> np.ndarray:
-        """The cells (r,) of all that resist at q: few, so that products with the Hessian need not look at the others."""
-        if not self.cells:
-            return np.empty(0, np.int64)
-        cells, _, volume = self.cells
-        return np.flatnonzero(least_volumes(q, cells) < volume)
+        for part in self.parts:
+            part.add_gradient(q, gradient)
 
     def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
         """The Hessian of E at q.
 
         projected : without its negative parts, as of compressed springs
         """
-        return Hessian(self, q, self.resisting(q), projected)
+        return Hessian([part.hessian_at(q, projected) for part in self.parts])
 
 
+@dataclass(frozen=True)
 class Hessian:
-    """The Hessian of E at one q, ready for many products; ``resisting``: which cells do there."""
+    """The Hessian of E at one q, ready for many products."""
 
-    def __init__(self, elasticity: Elasticity, q: np.ndarray, resisting: np.ndarray, projected: bool):
-        self.springs, self.blocks = elasticity.all[0], elastic_hessian(q, *elasticity.all, projected)
-        self.resisting, self.projected = len(resisting) > 0, projected
-        if self.resisting:
-            cells, resistance, volume = elasticity.cells
-            self.q, self.cells = q.copy(), (cells[resisting], resistance[resisting], volume)
+    parts: list[Product]
 
     def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
         """Add Hessian v [N] to ``product`` (l, 3)."""
-        add_elastic_product(self.springs, self.blocks, v, product)
-        if self.resisting:
-            add_resistance_hessian(self.q, *self.cells, self.projected, v, product)
+        for add in self.parts:
+            add(v, product)
+
+
+class Springs:
+    """As a CPU takes them: one after another, those that this rank owns first."""
+
+    def __init__(self, *all_of_them: np.ndarray | float, owned: int):
+        self.all = all_of_them
+        self.own = *(array[:owned] for array in self.all[:3]), self.all[3]
+
+    @classmethod
+    def of(cls, lattice: Lattice) -> "Springs":
+        return cls(
+            lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening, owned=lattice.springs_owned
+        )
+
+    def energy(self, q: np.ndarray) -> float:
+        return elastic_energy(q, *self.own)
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        return elastic_change(q, base, *self.own)
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        add_elastic_gradient(q, *self.all, gradient)
+
+    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+        return partial(add_elastic_product, self.all[0], elastic_hessian(q, *self.all, projected))
+
+
+class Cells:
+    """As a CPU takes them: one after another, those that this rank owns first.
+
+    all : (c, 8) local corner nodes, K (c,) [J], J_0 h^3 [m^3]
+    """
+
+    def __init__(self, cells: np.ndarray, resistance: np.ndarray, volume: float, owned: int):
+        self.all = cells, resistance, volume
+        self.own = cells[:owned], resistance[:owned], volume
+
+    @classmethod
+    def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "Cells":
+        return cls(lattice.local_cells, resistance, volume, lattice.cells_owned)
+
+    def energy(self, q: np.ndarray) -> float:
+        return resistance_energy(q, *self.own)
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        return resistance_change(q, base, *self.own)
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        add_resistance_gradient(q, *self.all, gradient)
+
+    def resisting(self, q: np.ndarray) -> np.ndarray:
+        """Which cells (r,) resist at q: few, so that products with the Hessian need not look at the others."""
+        cells, _, volume = self.all
+        return np.flatnonzero(least_volumes(q, cells) < volume)
+
+    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+        cells, resistance, volume = self.all
+        few = self.resisting(q)
+        return partial(add_resistance_hessian, q.copy(), cells[few], resistance[few], volume, projected)

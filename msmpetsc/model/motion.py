@@ -28,6 +28,11 @@ class Path:
         stops = [(0.0, (0.0, 0.0, 0.0)), *((k.time, k.by) for k in keyframes)]
         return cls(np.array([time for time, _ in stops]), np.array([by for _, by in stops], float))
 
+    @property
+    def leads_away(self) -> bool:
+        """From where it starts."""
+        return len(self.times) > 1
+
     def at(self, time: float) -> np.ndarray:
         """Displacement (3,) [m]; after the last time that of the last."""
         return np.array([np.interp(time, self.times, along) for along in self.displacements.T])

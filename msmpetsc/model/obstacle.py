@@ -7,6 +7,8 @@ import numpy as np
 
 from msmpetsc import scene
 from msmpetsc.model.motion import Path, within
+from msmpetsc.place.arrays import beside
+from msmpetsc.place.each import each
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Obstacle:
 
     def points_at(self, time: float) -> np.ndarray:
         """A point of each face (f, 3) [m] at a time."""
-        return self.points + self.path.at(time)
+        return self.points + beside(self.points, self.path.at(time)) if self.path.leads_away else self.points
 
 
 @numba.njit(cache=True)
@@ -55,10 +57,14 @@ def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[float
     return least, face
 
 
-@numba.njit(cache=True)
+@each
+def _depth_of(first, count, step, q, points, normals, least, face):
+    for i in range(first, count, step):
+        least[i], face[i] = depth(q[i], points, normals)
+
+
 def depths(q: np.ndarray, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``depth`` of positions (n, 3): (n,) [m], and the nearest faces (n,)."""
-    least, face = np.empty(len(q)), np.empty(len(q), np.int64)
-    for i in range(len(q)):
-        least[i], face[i] = depth(q[i], points, normals)
+    least, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
+    _depth_of(len(q), q, points, normals, least, face)
     return least, face

@@ -7,12 +7,14 @@ potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e an
 Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from msmpetsc.model.obstacle import Obstacle, depth, depths
+from msmpetsc.place.each import each
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Rub:
         """
         u, length = self.slip(q)
         slope = self.slope(length)
-        blocks = slope[:, None, None] * (np.eye(3) - _squares(self.normal))
+        blocks = slope[:, None, None] * (np.eye(3, like=q) - _squares(self.normal))
         if true:
             direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
             curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
@@ -116,49 +118,49 @@ class Contact:
 
     def energy(self, q: np.ndarray) -> float:
         """Of the push alone, [J]: friction stores none."""
-        return sum(_energy(q[: self.owned], p.points, p.normals, p.stiffness) for p in self.presses)
+        energy = 0.0
+        for press in self.presses:
+            inside = np.maximum(depths(q[: self.owned], press.points, press.normals)[0], 0)
+            energy += 0.5 * press.stiffness * float(inside @ inside)
+        return energy
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
         """Energy at q less energy at base, friction included [J]."""
         total = 0.0
         for press in self.presses:
-            total += _change(q[: self.owned], base[: self.owned], press.points, press.normals, press.stiffness)
+            parts = np.empty(self.owned, like=q)
+            _change_of(self.owned, q, base, press.points, press.normals, press.stiffness, parts)
+            total += float(parts.sum())
             if press.rub:
-                total += press.rub.change(q, base)
+                total += float(press.rub.change(q, base))
         return total
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for press in self.presses:
-            _add_gradient(q[: self.owned], press.points, press.normals, press.stiffness, gradient)
+            _add_gradient_of(self.owned, q, press.points, press.normals, press.stiffness, gradient)
             if press.rub:
                 press.rub.add_gradient(q, gradient)
 
-    def hessian(self, q: np.ndarray, true: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes in contact (a,), ascending, and their blocks (a, 3, 3) [N/m], positive semidefinite.
+    def hessian(self, q: np.ndarray, true: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Nodes in contact (a,), each once, and their blocks (a, 3, 3) [N/m], positive semidefinite: of each push and
+        each friction, the sum of which it is.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
             Hessian, nothing along a slip, would let nodes run to and fro
         """
-        nodes, blocks = [np.empty(0, np.int64)], [np.empty((0, 3, 3))]
         for press in self.presses:
             inside, face = depths(q[: self.owned], press.points, press.normals)
             pressed = np.flatnonzero(inside > 0)
-            nodes.append(pressed)
-            blocks.append(press.stiffness * _squares(press.normals[face[pressed]]))
+            yield pressed, press.stiffness * _squares(press.normals[face[pressed]])
             if press.rub:
-                nodes.append(press.rub.nodes)
-                blocks.append(press.rub.blocks(q, true))
-        found, place = np.unique(np.concatenate(nodes), return_inverse=True)
-        total = np.zeros((len(found), 3, 3))
-        np.add.at(total, place, np.concatenate(blocks))
-        return found, total
+                yield press.rub.nodes, press.rub.blocks(q, true)
 
     def bound(self, q: np.ndarray) -> np.ndarray:
         """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
-        bound = np.zeros(self.owned)
+        bound = np.zeros(self.owned, like=q)
         for press in self.presses:
-            bound[depths(q[: self.owned], press.points, press.normals)[0] > 0] += press.stiffness
+            bound += press.stiffness * (depths(q[: self.owned], press.points, press.normals)[0] > 0)
             if press.rub:
                 bound[press.rub.nodes] += 2 * press.rub.limit / press.rub.stick
         return bound
@@ -169,43 +171,49 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
-@numba.njit(cache=True)
-def _energy(q, points, normals, stiffness):
-    energy = 0.0
-    for i in range(len(q)):
-        d, _ = depth(q[i], points, normals)
-        if d > 0.0:
-            energy += 0.5 * stiffness * d * d
-    return energy
-
-
-@numba.njit(cache=True)
-def _change(q, base, points, normals, stiffness):
-    change = 0.0
-    for i in range(len(q)):
+@each
+def _change_of(first, count, step, q, base, points, normals, stiffness, parts):
+    for i in range(first, count, step):
         d, face = depth(q[i], points, normals)
         d_base, face_base = depth(base[i], points, normals)
+        parts[i] = 0.0
         if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
             deeper = 0.0
             for c in range(3):
                 deeper -= normals[face, c] * (q[i, c] - base[i, c])
-            change += 0.5 * stiffness * deeper * (d + d_base)
+            parts[i] = 0.5 * stiffness * deeper * (d + d_base)
         elif d > 0.0 or d_base > 0.0:
             d, d_base = max(d, 0.0), max(d_base, 0.0)
-            change += 0.5 * stiffness * (d - d_base) * (d + d_base)
-    return change
+            parts[i] = 0.5 * stiffness * (d - d_base) * (d + d_base)
 
 
-@numba.njit(cache=True)
-def _add_gradient(q, points, normals, stiffness, gradient):
-    for i in range(len(q)):
+@each
+def _add_gradient_of(first, count, step, q, points, normals, stiffness, gradient):
+    for i in range(first, count, step):
         d, face = depth(q[i], points, normals)
         if d > 0.0:
             for c in range(3):
                 gradient[i, c] -= stiffness * d * normals[face, c]
 
 
-@numba.njit(cache=True)
+@each
+def _rub_of(first, count, step, rows, q, points, normals, carried, impulse, per_mass, v):
+    for row in range(first, count, step):
+        i = rows[row]
+        d, face = depth(q[i], points, normals)
+        if d > 0.0:
+            along, speed = 0.0, 0.0
+            for c in range(3):
+                along += (v[i, c] - carried[c]) * normals[face, c]
+            for c in range(3):
+                speed += (v[i, c] - carried[c] - along * normals[face, c]) ** 2
+            speed = math.sqrt(speed)
+            if speed > 0.0:
+                lost = min(1.0, impulse * d * per_mass[i] / speed)
+                for c in range(3):
+                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])
+
+
 def rub(
     rows: np.ndarray,
     q: np.ndarray,
@@ -222,16 +230,4 @@ def rub(
 
     impulse : mu k dt [kg/s], times the depth the impulse
     """
-    for i in rows:
-        d, face = depth(q[i], points, normals)
-        if d > 0.0:
-            along, speed = 0.0, 0.0
-            for c in range(3):
-                along += (v[i, c] - carried[c]) * normals[face, c]
-            for c in range(3):
-                speed += (v[i, c] - carried[c] - along * normals[face, c]) ** 2
-            speed = np.sqrt(speed)
-            if speed > 0.0:
-                lost = min(1.0, impulse * d * per_mass[i] / speed)
-                for c in range(3):
-                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])
+    _rub_of(len(rows), rows, q, points, normals, carried, impulse, per_mass, v)

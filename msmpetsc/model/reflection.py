@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.model.obstacle import Obstacle, depths
+from msmpetsc.place.arrays import beside
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,9 @@ class Reflection:
         if len(at) == 0:
             return q, q_previous
         normal, path = self.obstacle.normals[face[at]], self.obstacle.path
-        v = q[at] - q_previous[at] - (path.at(time) - path.at(time - time_step))
+        v = q[at] - q_previous[at]
+        if path.leads_away:
+            v -= beside(q, path.at(time) - path.at(time - time_step))
         back = np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal
         q, q_previous = q.copy(), q_previous.copy()
         q[at] -= back

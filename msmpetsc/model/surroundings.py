@@ -9,6 +9,7 @@ from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
 from msmpetsc.model.obstacle import depths
 from msmpetsc.model.penalty import Contact, Penalty, rub
+from msmpetsc.place.arrays import beside
 
 
 class Surroundings:
@@ -27,7 +28,7 @@ class Surroundings:
         """External force f_ext (owned, 3) [N], not to be written to."""
         acting = [load.acts_at(time) for load in self.loads]
         if acting != self._acting:
-            self._acting, self._load = acting, np.zeros((self.lattice.owned, 3))
+            self._acting, self._load = acting, np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
             for load in compress(self.loads, acting):
                 self._load += load.force
         return self._load
@@ -45,9 +46,9 @@ class Surroundings:
         held = self.held_at(time)
         if not held:
             return None
-        q = q.copy()
         for anchor in held:
-            q[anchor.where] = self.lattice.nodes[anchor.where] + anchor.path.at(time)
+            place = self.lattice.nodes + beside(q, anchor.path.at(time))
+            q = np.where(anchor.where[:, None], place, q)
         return q
 
     def contact(self, q: np.ndarray, time: float, time_step: float) -> Contact | None:
@@ -81,7 +82,7 @@ class Surroundings:
         for p in self._pressing(time):
             if p.friction > 0:
                 path, points = p.obstacle.path, p.obstacle.points_at(time)
-                carried = (path.at(end) - path.at(begin)) / (end - begin)
+                carried = beside(q, (path.at(end) - path.at(begin)) / (end - begin))
                 impulse = p.friction * p.stiffness * duration
                 rub(rows, q, points, p.obstacle.normals, carried, impulse, per_mass, v)
 
@@ -91,13 +92,13 @@ class Surroundings:
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
             makes good is counted as inside already
         """
-        stiffness = np.zeros(len(q))
+        stiffness = np.zeros(len(q), like=q)
         for p in self.penalties:
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
                 way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
                 reach = 2 * (speed * (time - start) + np.linalg.norm(way))
                 inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals)
-                stiffness[inside > -reach] += p.stiffness
+                stiffness += p.stiffness * (inside > -reach)
         return stiffness
 
     def dragged(self, before: np.ndarray, after: np.ndarray, time: float, time_step: float) -> float:
@@ -109,7 +110,7 @@ class Surroundings:
             if p.friction > 0 and way > 0:
                 for q, when in ((before, time - time_step), (after, time)):
                     inside, _ = depths(q, p.obstacle.points_at(when), p.obstacle.normals)
-                    work += p.friction * p.stiffness * np.maximum(inside, 0).sum() * way
+                    work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 
     def _pressing(self, time: float) -> list[Penalty]:

@@ -66,17 +66,13 @@ class EnergyBalance:
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
         at, contact, square = q[owned], around.push(time), np.einsum("ij,ij->i", v[owned], v[owned])
-        sums = self.comm.allreduce(
-            np.array(
-                [
-                    0.5 * lattice.mass @ square,
-                    0.5 * lattice.mass @ (square * ~around.pinned_at(time)[owned]),
-                    self.elasticity.energy(q),
-                    contact.energy(at) if contact else 0.0,
-                    -np.vdot(around.load(time), at),
-                    *(lattice.mass @ v[owned]),
-                ]
-            )
+        sums = self._sums(
+            0.5 * lattice.mass @ square,
+            0.5 * lattice.mass @ (square * ~around.pinned_at(time)[owned]),
+            self.elasticity.energy(q),
+            contact.energy(at) if contact else 0.0,
+            -np.vdot(around.load(time), at),
+            *(lattice.mass @ v[owned]),
         )
         return Energies(*sums[:5], sums[5:])
 
@@ -121,19 +117,19 @@ class EnergyBalance:
         q, v = before.q if led is None else led, before.velocity(time_step)[owned]
         contact, free = around.push(time), ~around.pinned_at(time)[owned]
         known = self.known is not None and q is self.known[0]
-        sums = self.comm.allreduce(
-            np.array(
-                [
-                    0.5 * lattice.mass @ (np.einsum("ij,ij->i", v, v) * free),
-                    0.0 if known else self.elasticity.energy(q),
-                    contact.energy(q[owned]) if contact else 0.0,
-                    np.vdot(around.load(time), result.position[owned] - q[owned])
-                    + around.dragged(q[owned], result.position[owned], time, time_step),
-                ]
-            )
+        sums = self._sums(
+            0.5 * lattice.mass @ (np.einsum("ij,ij->i", v, v) * free),
+            0.0 if known else self.elasticity.energy(q),
+            contact.energy(q[owned]) if contact else 0.0,
+            np.vdot(around.load(time), result.position[owned] - q[owned])
+            + around.dragged(q[owned], result.position[owned], time, time_step),
         )
         kinetic, elastic, contact, work = sums
         return kinetic + (self.known[1] if known else elastic) + contact, work
+
+    def _sums(self, *values: float) -> np.ndarray:
+        """Over all ranks; the values may be on a GPU."""
+        return self.comm.allreduce(np.array([float(value) for value in values]))
 
     def _worst(self, vectors: np.ndarray) -> str:
         owned = np.arange(self.lattice.owned)

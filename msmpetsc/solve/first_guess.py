@@ -3,6 +3,7 @@
 import numpy as np
 
 from msmpetsc.model.saved import Saved
+from msmpetsc.place.arrays import beside, fetch
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.ghosted import with_ghosts
 
@@ -48,7 +49,7 @@ class FirstGuess:
         if not self.extrapolate:
             return
         lattice = self.functional.lattice
-        missing = [np.zeros((lattice.owned, 3))] * (2 - len(self.corrections))
+        missing = [np.zeros((lattice.owned, 3), like=lattice.nodes)] * (2 - len(self.corrections))
         saved.numbers["corrections"] = len(self.corrections)
         for name, rows in zip(SAVED, [*self.corrections, *missing], strict=True):
             saved.rows[name] = rows[: lattice.owned]
@@ -69,6 +70,6 @@ class FirstGuess:
         if self.holds:
             return 0.0
         mass = self.functional.lattice.mass
-        sums = np.append(mass @ moved[: len(mass)], mass.sum())
+        sums = np.append(fetch(mass @ moved[: len(mass)]), float(mass.sum()))
         sums = self.functional.comm.allreduce(sums)
-        return sums[:3] / sums[3]
+        return beside(moved, sums[:3] / sums[3])

@@ -5,6 +5,7 @@ from mpi4py import MPI
 
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.place.arrays import beside
 from msmpetsc.solve.ghosted import Ghosted
 
 SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
@@ -23,7 +24,7 @@ class HighestMode:
         """Know the nodes ``held`` (owned,) bool, and begin with something of every mode, whatever the number of ranks."""
         self.held = held
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
-        self.mode.values[:] = np.sin(1e4 * np.sin(numbers))
+        self.mode.values[:] = beside(self.mode.values, np.sin(1e4 * np.sin(numbers)))
         self.mode.values[: self.lattice.owned][held] = 0
         self._normalise()
         self.squared = 0.0
@@ -49,7 +50,7 @@ class HighestMode:
     def _normalise(self) -> float:
         """Make |x|_M = 1; returns what it was (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = np.sqrt(self.comm.allreduce(self.lattice.mass @ np.einsum("ij,ij->i", x, x)))
+        size = np.sqrt(self.comm.allreduce(float(self.lattice.mass @ np.einsum("ij,ij->i", x, x))))
         if size > 0:
             x /= size
         self.mode.update()

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.penalty import Contact
-from msmpetsc.solve.operators import scaled_sum
+from msmpetsc.place.arrays import greatest
 from msmpetsc.solve.unknowns import Unknowns
 
 
@@ -23,7 +23,7 @@ class StepFunctional:
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
         self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
-        self.lattice = unknowns.lattice
+        self.lattice, self.memory = unknowns.lattice, unknowns.memory
         self.q, self.gradient = np.empty_like(self.lattice.nodes), np.empty_like(self.lattice.nodes)
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
         self.per_mass = 1 / self.mass
@@ -34,7 +34,7 @@ class StepFunctional:
         """A new step, as Stepper.step takes it."""
         self.y, self.load, self.contact = y, load, contact
         self.q[:] = q if led is None else led  # held nodes stay there
-        self.reach = self.comm.allreduce(np.abs(q).max(initial=0), MPI.MAX)  # [m]
+        self.reach = self.comm.allreduce(greatest(np.abs(q)), MPI.MAX)  # [m]
 
     def gradient_at(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """f = F(x) [kg m]."""
@@ -46,16 +46,16 @@ class StepFunctional:
         if self.contact:
             self.contact.add_gradient(self.q, self.gradient)
         moved = self.q[:owned] - self.y[:owned]
-        scaled_sum(self.unknowns.free, self.lattice.mass, moved, self.t2, self.gradient, f.array.reshape(3, -1))
+        self.unknowns.scaled_sum(moved, self.t2, self.gradient, f)
 
     def value(self, q: np.ndarray) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart."""
         owned = slice(self.lattice.owned)
         moved = q[owned] - self.y[owned]
-        acting = self.elasticity.energy(q) - np.vdot(moved, self.load)
+        acting = self.elasticity.energy(q) - float(np.vdot(moved, self.load))
         if self.contact:
             acting += self.contact.change(q, self.y)
-        inertia = 0.5 * self.lattice.mass @ np.einsum("ij,ij->i", moved, moved)
+        inertia = 0.5 * float(self.lattice.mass @ np.einsum("ij,ij->i", moved, moved))
         return self.comm.allreduce(inertia + self.t2 * acting)
 
     def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
@@ -64,23 +64,23 @@ class StepFunctional:
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - base[owned]
         twice = self.q[owned] + base[owned] - 2 * self.y[owned]
-        inertia = 0.5 * self.lattice.mass @ np.einsum("ij,ij->i", moved, twice)
-        elastic = self.elasticity.change(self.q, base) - np.vdot(moved, self.load)
+        inertia = 0.5 * float(self.lattice.mass @ np.einsum("ij,ij->i", moved, twice))
+        elastic = self.elasticity.change(self.q, base) - float(np.vdot(moved, self.load))
         if self.contact:
             elastic += self.contact.change(self.q, base)
-        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, np.vdot(moved, moved)])))
+        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])))
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""
-        return np.sqrt(self.comm.allreduce(displacement.array_r**2 @ self.mass))
+        return np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass)))
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
-        return np.sqrt(self.comm.allreduce(f.array_r**2 @ self.per_mass))
+        return np.sqrt(self.comm.allreduce(float(self.memory.read(f) ** 2 @ self.per_mass)))
 
     def pull(self, f: PETSc.Vec) -> tuple[np.ndarray, np.ndarray]:
         """The free nodes, local numbers, and |F| / m of each [m]: how far each is pulled from where it is."""
-        columns = (f.array_r * self.per_mass).reshape(3, -1)
+        columns = (self.memory.read(f) * self.per_mass).reshape(3, -1)
         return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
     def away(self, correction: PETSc.Vec | None = None) -> float:
@@ -88,5 +88,5 @@ class StepFunctional:
         free = self.unknowns.free
         columns = (self.q[free] - self.y[free]).T.ravel()
         if correction is not None:
-            columns -= correction.array_r
-        return np.sqrt(self.comm.allreduce(columns**2 @ self.mass))
+            columns -= self.memory.read(correction)
+        return np.sqrt(self.comm.allreduce(float(columns**2 @ self.mass)))

@@ -16,3 +16,12 @@ def total_iterations(ksp: PETSc.KSP) -> int:
     count = Integer()
     petsc_library().KSPGetTotalIterations(ctypes.c_void_p(ksp.handle), ctypes.byref(count))
     return count.value
+
+
+def dense_pointer(matrix: PETSc.Mat) -> int:
+    """Where this rank's numbers of a dense matrix are, on the GPU if it has them there (MatDenseGetArrayAndMemType)."""
+    library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
+    library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
+    found = array.value or 0
+    library.MatDenseRestoreArrayAndMemType(handle, ctypes.byref(array))
+    return found

@@ -4,24 +4,25 @@ Each is a Python context over the scalar matrix A, which acts on the m x 3 block
 unknowns is: one product or one solve for three right-hand sides.
 """
 
-import numba
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.penalty import Contact
+from msmpetsc.place.arrays import beside, fetch
+from msmpetsc.solve.memory import HOST, Memory
 from msmpetsc.solve.unknowns import Unknowns
+
+DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 
 
 class Block:
-    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of."""
+    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of; values: x, then y, then z."""
 
-    def __init__(self, matrix: PETSc.Mat):
+    def __init__(self, matrix: PETSc.Mat, memory: Memory):
         rows, _ = matrix.getSizes()
-        self.mat = PETSc.Mat().createDense((rows, (None, 3)), comm=matrix.comm)
-        self.mat.setUp()
-        self.mat.assemble()
-        self.values = self.mat.getDenseArray().T.reshape(-1)  # a view of PETSc's memory: x, then y, then z
+        self.mat = memory.dense(rows, 3, matrix.comm)
+        self.values = memory.values(self.mat)
         self.destroy = self.mat.destroy
 
 
@@ -29,37 +30,40 @@ class ContactBlocks:
     """t^2 (Hessian of contact): a 3 x 3 block for each node in contact, added to either operator below."""
 
     def __init__(self, unknowns: Unknowns, time_step: float):
-        self.t2 = time_step**2
-        self.row = np.full(unknowns.lattice.owned, -1)
-        self.row[unknowns.free] = np.arange(unknowns.size)
-        self.rows, self.blocks = np.empty(0, np.int64), np.empty((0, 3, 3))
+        self.t2, self.unknowns, self.parts = time_step**2, unknowns, []
+        row = np.full(unknowns.lattice.owned, -1)
+        row[fetch(unknowns.free)] = np.arange(unknowns.size)
+        self.row = beside(unknowns.free, row)
 
     def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
         """Take the blocks at positions q, ``true`` ones or such as go with A."""
-        nodes, blocks = contact.hessian(q, true) if contact else (np.empty(0, np.int64), np.empty((0, 3, 3)))
-        free = self.row[nodes] >= 0
-        self.rows, self.blocks = self.row[nodes[free]], self.t2 * blocks[free]
+        self.parts = []
+        for nodes, blocks in contact.hessian(q, true) if contact else ():
+            free = np.flatnonzero(self.row[nodes] >= 0)
+            if len(free):
+                self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
 
     def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y += blocks x."""
-        if len(self.rows):
-            x, y = x.array_r.reshape(3, -1), y.array.reshape(3, -1)
-            y[:, self.rows] += np.einsum("aij,ja->ia", self.blocks, x[:, self.rows])
+        if self.parts:
+            x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
+        for rows, blocks in self.parts:
+            y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
 
 
 class ThreeColumns:
     """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
 
-    def __init__(self, matrix: PETSc.Mat, contact: ContactBlocks | None = None):
-        self.matrix, self.contact = matrix, contact
-        self.input = Block(matrix)
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, contact: ContactBlocks | None = None):
+        self.matrix, self.memory, self.contact = matrix, memory, contact
+        self.input = Block(matrix, memory)
         self.product = matrix.matMult(self.input.mat)
-        self.values = self.product.getDenseArray().T.reshape(-1)
+        self.values = memory.values(self.product)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.input.values[:] = x.array_r
+        self.input.values[:] = self.memory.read(x)
         self.matrix.matMult(self.input.mat, result=self.product)
-        y.array[:] = self.values
+        self.memory.write(y)[:] = self.values
         if self.contact:
             self.contact.add(x, y)
 
@@ -89,18 +93,9 @@ class TrueHessian:
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
         self.elastic.add_product(self.v, self.product)
-        lattice, free = self.unknowns.lattice, self.unknowns.free
-        scaled_sum(free, lattice.mass, self.v, self.t2, self.product, y.array.reshape(3, -1))
+        self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
         if self.contact:
             self.contact.add(x, y)
-
-
-@numba.njit(cache=True)
-def scaled_sum(rows, mass, a, t2, b, columns):
-    """M a + t^2 b at the given rows of (l, 3) arrays, written as (3, m) columns."""
-    for i in range(len(rows)):
-        for c in range(3):
-            columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]
 
 
 class Preconditioner:
@@ -112,11 +107,11 @@ class Preconditioner:
     matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
     """
 
-    def __init__(self, matrix: PETSc.Mat, columns: int, prefix: str):
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str):
+        self.matrix, self.memory, self.columns, self.blocks = matrix, memory, columns, []
         self.pc = PETSc.PC().create(matrix.comm)
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
-        self.blocks = [Block(matrix), Block(matrix)] if columns > 1 else []
 
     def setFromOptions(self, _: PETSc.PC) -> None:  # noqa: N802 (PETSc's name)
         self.pc.setFromOptions()
@@ -125,13 +120,19 @@ class Preconditioner:
         self.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if not self.blocks:
+        if self.columns == 1:
             self.pc.apply(x, y)
             return
-        given, found = self.blocks
-        given.values[:] = x.array_r
+        given, found = self.blocks = self.blocks or self._create_blocks()
+        given.values[:] = beside(given.values, self.memory.read(x))
         self.pc.matApply(given.mat, found.mat)
-        y.array[:] = found.values
+        y = self.memory.write(y)
+        y[:] = beside(y, found.values)
+
+    def _create_blocks(self) -> list[Block]:
+        """Where the inner one works: a direct solver does on the CPU."""
+        memory = HOST if self.pc.getType() in DIRECT else self.memory
+        return [Block(self.matrix, memory), Block(self.matrix, memory)]
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.pc.view(viewer)
@@ -145,6 +146,7 @@ def python_matrix(unknowns: Unknowns, context: ThreeColumns | TrueHessian, comm:
     """A MATPYTHON on vectors of unknowns."""
     size = (3 * unknowns.size, 3 * unknowns.total)
     matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
+    matrix.setVecType(unknowns.memory.vec_type)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     matrix.setUp()
     return matrix

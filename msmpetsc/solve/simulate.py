@@ -11,10 +11,13 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.frame import Frame
+from msmpetsc.model.placed import placed
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.place.arrays import fetch
 from msmpetsc.scene import Scene
 from msmpetsc.solve.balance import EnergyBalance
+from msmpetsc.solve.device import sender
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.rescue import Done, Rescue
@@ -61,6 +64,7 @@ class Simulation:
     """Steps a model from its start. Use as a context manager: its PETSc objects are destroyed on leaving."""
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, measured: Measured = Measured()):
+        model = placed(model, sender(comm))
         self.comm, self.model, self.time_step = comm, model, scene.time.step
         self.steps, self.every, self.measured, self.trace = scene.time.steps, scene.output.every, measured, None
         self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
@@ -111,6 +115,7 @@ class Simulation:
         for part in (self.balance, self.rescue, self.watch):
             part.save(saved)
         saved.numbers |= vars(self.effort)
+        saved.rows = {name: fetch(rows) for name, rows in saved.rows.items()}
         return saved
 
     def restore(self, saved: Saved) -> None:
@@ -157,7 +162,7 @@ class Simulation:
         effort, self.effort = self.effort, Effort()
         effort.energy_gained = max(effort.energy_gained, 0.0)
         self.watch.error(index, time, effort.step_error)
-        position = q[: self.model.lattice.owned]
+        position = fetch(q[: self.model.lattice.owned])
         return Frame(
             index=index,
             time=time,

@@ -13,6 +13,7 @@ from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.worst import inside_out, place_of_greatest
+from msmpetsc.place.arrays import beside
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
@@ -88,6 +89,7 @@ class Stepper:
         self.budget = max_iterations or published
         self.error = error if error is not None or self.budget else DEFAULT_ERROR
         self.unknowns = Unknowns(comm, lattice)
+        self.memory = self.unknowns.memory
         self.functional = StepFunctional(comm, self.unknowns, self.elasticity, time_step)
         self.base = np.empty_like(lattice.nodes)
         self.first_guess = FirstGuess(self.functional, preset.extrapolate)
@@ -110,7 +112,7 @@ class Stepper:
         self.projected = False  # whether newton's is, at the moment
         self.linear = self.hessian
         if not self.preset.true_hessian:
-            self.linear = ThreeColumns(self.matrix, self._contact_blocks(time_step))
+            self.linear = ThreeColumns(self.matrix, self.memory, self._contact_blocks(time_step))
         self.operator = self._keep(python_matrix(self.unknowns, self.linear, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
@@ -151,9 +153,9 @@ class Stepper:
             self.preconditioned = self._keep(self.matrix.copy())
         self.scalar = self._keep(self.preconditioned.createVecLeft())
         self.preconditioned.getDiagonal(self.scalar)
-        self.diagonal = self.scalar.array_r.copy()
+        self.diagonal = self.memory.read(self.scalar).copy()
         self.added = np.zeros_like(self.diagonal)  # to the preconditioner's diagonal
-        return Preconditioner(self.preconditioned, 3 // columns, self.prefix)
+        return Preconditioner(self.preconditioned, self.memory, 3 // columns, self.prefix)
 
     def _keep(self, owned: PETSc.Object) -> PETSc.Object:
         self.owned_objects.append(owned)
@@ -204,7 +206,7 @@ class Stepper:
         self.first_guess.save(saved)
         saved.numbers["ratio"] = self.ratio
         if self.touches:
-            bound = saved.rows["contact_bound"] = np.zeros(self.lattice.owned)
+            bound = saved.rows["contact_bound"] = np.zeros(self.lattice.owned, like=self.added)
             bound[self.unknowns.free] = self.added[: self.unknowns.size]
 
     def restore(self, saved: Saved) -> None:
@@ -212,7 +214,8 @@ class Stepper:
         self.first_guess.restore(saved)
         self.ratio = saved.numbers.get("ratio", FIRST_RATIO)
         if self.touches:
-            bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))[self.unknowns.free]
+            bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))
+            bound = beside(self.added, bound)[self.unknowns.free]
             self._add_to_preconditioner(np.tile(bound, len(self.diagonal) // max(len(bound), 1)))
 
     def all_its(self) -> int:
@@ -306,16 +309,17 @@ class Stepper:
         A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
         """
         contact = self.functional.contact
-        bound = contact.bound(self.base)[self.unknowns.free] if contact else np.zeros(self.unknowns.size)
+        bound = contact.bound(self.base) if contact else np.zeros(self.lattice.owned, like=self.base)
+        bound = bound[self.unknowns.free]
         bound = np.tile(bound, len(self.diagonal) // max(len(bound), 1))
-        changed = self.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR)
+        changed = self.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
         if changed:
             self._add_to_preconditioner(bound)
         return changed
 
     def _add_to_preconditioner(self, bound: np.ndarray) -> None:
         self.added = bound
-        self.scalar.array[:] = self.diagonal + self.t2 * bound
+        self.memory.write(self.scalar)[:] = self.diagonal + self.t2 * bound
         self.preconditioned.setDiagonal(self.scalar)
 
     def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
@@ -357,7 +361,8 @@ class Stepper:
 
     def _rounding_of_residual(self) -> float:
         """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: some eps of each row's diagonal."""
-        self.work.array[:] = np.tile(ROUNDINGS * np.finfo(float).eps * self.diagonal[: self.unknowns.size], 3)
+        rounding = ROUNDINGS * np.finfo(float).eps * self.diagonal[: self.unknowns.size]
+        self.memory.write(self.work)[:] = np.tile(rounding, 3)
         return self.functional.dual_norm(self.work)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:

@@ -8,6 +8,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
+from msmpetsc.errors import InputError
+from msmpetsc.place.arrays import fetch
 from msmpetsc.solve.limits import refuse_nonzeros
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -19,19 +21,19 @@ def assemble(
 
     columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A
 
-    Raises InputError for more nonzeros than PETSc can count.
+    Raises InputError for more nonzeros than PETSc can count, and for a type whose vectors are not where the arrays are.
     """
     lattice = unknowns.lattice
-    row = np.full(len(lattice.nodes), -1)
-    row[unknowns.free] = np.arange(unknowns.size)
+    row, free = np.full(len(lattice.nodes), -1), fetch(unknowns.free)
+    row[free] = np.arange(unknowns.size)
     weight = time_step**2 * lattice.stiffness
     ends = np.concatenate([lattice.springs, lattice.springs[:, ::-1]])
-    diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[unknowns.free]
-    diagonal += lattice.mass[unknowns.free]
+    diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[free]
+    diagonal += fetch(lattice.mass)[free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
     refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
-    nodes = np.concatenate([unknowns.free, ends[kept, 1]])
+    nodes = np.concatenate([free, ends[kept, 1]])
     values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])
     places = unknowns.numbers[:, None] if columns == 1 else unknowns.places
     sizes = (columns * unknowns.size, columns * unknowns.total)
@@ -41,8 +43,18 @@ def assemble(
     matrix = PETSc.Mat().create(comm=comm)
     matrix.setOptionsPrefix(prefix)
     matrix.setSizes((sizes, sizes))
-    matrix.setType(PETSc.Mat.Type.AIJ)
+    matrix.setType(unknowns.memory.mat_type)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     matrix.setFromOptions()
+    _check_memory(matrix, unknowns)
     matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
     return matrix
+
+
+def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
+    vector = unknowns.create_vector(matrix.comm)
+    wanted, given = vector.getType(), matrix.getType()
+    vector.destroy()
+    if ("cuda" in wanted) != ("cusparse" in given):
+        prefix = matrix.getOptionsPrefix() or ""
+        raise InputError(f"-{prefix}mat_type {given}: the run computes on the {'GPU' if 'cuda' in wanted else 'CPU'}")

@@ -8,7 +8,6 @@ The two half kicks at one time are one, but for a step's first and last: so v is
 frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
 """
 
-import numba
 import numpy as np
 from mpi4py import MPI
 
@@ -19,6 +18,8 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
+from msmpetsc.place.arrays import beside, greatest
+from msmpetsc.place.each import each
 from msmpetsc.solve.frequency import HighestMode
 from msmpetsc.solve.ghosted import Ghosted
 from msmpetsc.solve.measured import Measured
@@ -54,7 +55,8 @@ class Verlet:
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
         self.highest = HighestMode(comm, self.lattice, self.elasticity)
         owned = self.lattice.owned
-        self.q, self.v, self.before = self.position.values[:owned], self.velocity.values[:owned], np.empty((owned, 3))
+        self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
+        self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.known = None  # the positions that ``gradient`` and the highest frequency are of
         self.anchors = None  # how many hold
@@ -88,7 +90,7 @@ class Verlet:
         if saved.numbers.get("squared", -1.0) < 0:
             return
         self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = saved.rows["mode"]
+        self.highest.mode.values[: self.lattice.owned] = beside(self.v, saved.rows["mode"])
         self.highest.mode.update()
         self.highest.squared, self.substep = saved.numbers["squared"], saved.numbers["substep"]
         if saved.numbers["known"]:
@@ -162,13 +164,14 @@ class Verlet:
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
-        kick(self.free, self.per_mass, self.around.load(time), self.gradient, duration, self.v)
+        load = self.around.load(time)
+        kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
         self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end)
 
     def _drift(self, begin: float, end: float) -> None:
         """q to the end of a substep: led nodes along their path, nodes that strike something back."""
         self._hold(end)
-        drift(self.free, self.v, end - begin, self.q)
+        drift(len(self.free), self.free, self.v, end - begin, self.q)
         if self.anchors:
             self._lead(begin, end)
         if self.around.reflections:
@@ -203,10 +206,10 @@ class Verlet:
     def _pushed(self, start: float, time: float) -> float:
         """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
         fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
-        speed = np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1).max(initial=0)
+        speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         pushed = self.around.stiffest_push(self.q, speed, start, time)[self.free] * self.per_mass[self.free]
-        return self.comm.allreduce(pushed.max(initial=0), MPI.MAX)
+        return self.comm.allreduce(greatest(pushed), MPI.MAX)
 
     def _count(self, squared: float) -> int:
         """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
@@ -235,17 +238,19 @@ class Verlet:
             field.destroy()
 
 
-@numba.njit(cache=True)
-def kick(rows, per_mass, load, gradient, duration, v):
+@each
+def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
     """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
-    for i in rows:
+    for row in range(first, count, step):
+        i = rows[row]
         for c in range(3):
             v[i, c] += duration * per_mass[i] * (load[i, c] - gradient[i, c])
 
 
-@numba.njit(cache=True)
-def drift(rows, v, duration, q):
+@each
+def drift(first, count, step, rows, v, duration, q):
     """q += duration v at the rows of (l, 3) arrays."""
-    for i in rows:
+    for row in range(first, count, step):
+        i = rows[row]
         for c in range(3):
             q[i, c] += duration * v[i, c]

@@ -1,0 +1,53 @@
+"""Threads on a CUDA GPU, by numba: imported by those alone who have one."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import cupy
+import numpy as np
+from numba import cuda
+
+THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
+KEPT = 4096  # arrays that numba has seen
+
+
+@lru_cache(maxsize=None)
+def launcher(body: Callable[..., None]) -> Callable[..., None]:
+    """What place.each calls: one thread for each index below a count, in CuPy's current stream."""
+    kernel = kernel_of(body)
+
+    def launch(count, *arguments):
+        if count:
+            kernel[-(-count // THREADS), THREADS, _stream()](count, tuple(map(as_argument, arguments)))
+
+    return launch
+
+
+def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
+    """Takes a count and the tuple of what the body takes beside its range."""
+    compiled = cuda.jit(device=True)(body)
+
+    @cuda.jit
+    def threads(count, arguments):
+        compiled(cuda.grid(1), count, cuda.gridsize(1), *arguments)
+
+    return threads
+
+
+def as_argument(value: np.ndarray | float) -> np.ndarray | float:
+    """An array as numba wants it, anything else as it is."""
+    if np.isscalar(value):
+        return value
+    return _seen_by_numba(value.data.ptr, value.shape, value.strides, value.dtype.str)
+
+
+@lru_cache(maxsize=KEPT)
+def _seen_by_numba(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str) -> np.ndarray:
+    """It owns nothing; made once, for that takes longer than a launch."""
+    told = {"data": (pointer, False), "shape": shape, "strides": strides, "typestr": kind, "version": 3}
+    return cuda.from_cuda_array_interface(told, sync=False)
+
+
+def _stream() -> int:
+    pointer = cupy.cuda.get_current_stream().ptr
+    return cuda.external_stream(pointer) if pointer else 0

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from msmpetsc import __version__
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.place.arrays import is_here
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation
@@ -41,7 +42,8 @@ class Cost:
         from msmpetsc.solve.measured import times
 
         comm, simulation = self.comm, self.simulation
-        told = {"machine": machine(), "versions": versions(), "ranks": comm.size}
+        device = "cpu" if is_here(simulation.model.lattice.nodes) else "cuda"
+        told = {"machine": machine(), "device": device, "versions": versions(), "ranks": comm.size}
         told |= {"command": shlex.join(["msmpetsc", *sys.argv[1:]]), **self.counts}
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         told["time"] = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)

@@ -24,7 +24,9 @@ if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
     from msmpetsc.solve.simulate import Simulation
 
-OF_NO_EFFECT = re.compile(r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc")  # on results
+OF_NO_EFFECT = re.compile(  # on results
+    r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
+)
 FIXED = ("time.step", "time.integrator", "output.every", "output.surface")  # a file has one of each
 UNHEARD = {"text", "folder", "title", "picture"}  # what may differ in silence
 

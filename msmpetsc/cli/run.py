@@ -41,6 +41,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="OUT.h5", help="default: out/SCENE.h5")
     parser.add_argument("--preset", metavar="NAME", help="solver preset (see --list-presets)")
     parser.add_argument("--error", metavar="E", help="relative error at which a step is done")
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), help="where to compute: cuda is -mat_type aijcusparse, a CUDA GPU"
+    )
     parser.add_argument("--frames", type=int, metavar="N", help="stop after N steps")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
@@ -89,8 +92,10 @@ def run(args: argparse.Namespace) -> int:
     petsc4py.init(["msmpetsc", *args.petsc_options])
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
     from msmpetsc.model.build import build_model
+    from msmpetsc.solve.device import choose
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
 
+    choose(comm, args.device)
     began = perf_counter()
     measured, interval = what_is_measured(args), Interval(args.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(args, earlier)))

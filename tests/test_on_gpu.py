@@ -3,9 +3,11 @@ no array of one place among those of the other, and nothing carried but what fra
 
 import importlib
 import json
+import operator
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -208,7 +210,8 @@ def bodies() -> list[Callable]:
 
 def test_kernels_compile_for_a_gpu(tmp_path: Path):
     """To PTX, for the arguments that runs give them; it needs no GPU."""
-    pytest.importorskip("numba_cuda", reason="no numba-cuda here: pip install 'msmpetsc[cuda]'")
+    for package in ("numba_cuda", "cupy"):
+        pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
     from numba import cuda
 
     given = {}
@@ -224,14 +227,22 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
         for name, case in SIMULATED.items():
             play(block_scene(tmp_path, name=name, **{**case, **SMALLEST}))
     assert set(given) == set(bodies())
-    with pretend_gpu.module("cupy"):
-        from msmpetsc.place import threads
+    from msmpetsc.place import threads
+
     h200 = SimpleNamespace(compute_capability=(9, 0))
     with patch("numba.cuda.dispatcher.get_current_device", lambda: h200):
         for body, arguments in given.items():
             types = numba.types.Tuple([numba.typeof(pretend_gpu.bare(one)) for one in arguments])
             ptx, _ = cuda.compile_ptx(threads.kernel_of(body).py_func, (numba.int64, types), cc=(9, 0))
             assert ".target sm_90" in ptx and "threads" in ptx
+            with warnings.catch_warnings(action="error"):  # a grid of one block is no one's concern
+                threads.kernel_of(body)[1, threads.THREADS]
+
+
+def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():
+    cupy = pytest.importorskip("cupy", reason="no CuPy here: pip install 'msmpetsc[cuda]'")
+    for name in pretend_gpu.KNOWN:
+        assert operator.attrgetter(name)(cupy)
 
 
 def test_ranks_agree_on_gpus_too(tmp_path: Path, on_ranks):

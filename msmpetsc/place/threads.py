@@ -4,8 +4,11 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import cupy
+import numba
 import numpy as np
 from numba import cuda
+
+numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small body needs few threads, and so do the nodes in contact
 
 THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
 KEPT = 4096  # arrays that numba has seen

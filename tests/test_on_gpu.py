@@ -5,6 +5,7 @@ import importlib
 import json
 import operator
 import re
+import shutil
 import subprocess
 import sys
 import warnings
@@ -209,7 +210,8 @@ def bodies() -> list[Callable]:
 
 
 def test_kernels_compile_for_a_gpu(tmp_path: Path):
-    """To PTX, for the arguments that runs give them; it needs no GPU."""
+    """To PTX, for the arguments that runs give them, and where there is ptxas to machine code that keeps what it works with
+    in registers; it needs no GPU."""
     for package in ("numba_cuda", "cupy"):
         pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
     from numba import cuda
@@ -237,6 +239,12 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
             assert ".target sm_90" in ptx and "threads" in ptx
             with warnings.catch_warnings(action="error"):  # a grid of one block is no one's concern
                 threads.kernel_of(body)[1, threads.THREADS]
+            if shutil.which("ptxas"):
+                (tmp_path / "kernel.ptx").write_text(ptx)
+                command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]
+                said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+                print(body.__name__, said)
+                assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
 
 
 def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():

@@ -1,5 +1,6 @@
 """Threads on a CUDA GPU, by numba: imported by those alone who have one."""
 
+import os
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -8,7 +9,9 @@ import numba
 import numpy as np
 from numba import cuda
 
-numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small body needs few threads, and so do the nodes in contact
+# A small body needs few threads, and so do the nodes in contact. numba reads its environment again now and then.
+os.environ.setdefault("NUMBA_CUDA_LOW_OCCUPANCY_WARNINGS", "0")
+numba.config.reload_config()
 
 THREADS = 128  # of a block: registers, not their number, bound the kernels that look at all neighbours of a node
 KEPT = 4096  # arrays that numba has seen

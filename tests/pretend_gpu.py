@@ -19,8 +19,8 @@ from msmpetsc.solve import device, memory
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
 KNOWN = (
-    "abs arange argmin array array_equal asarray clip concatenate copyto einsum empty empty_like eye flatnonzero "
-    "full linalg.norm max nan_to_num stack sum tile vdot where zeros zeros_like"
+    "array_equal asarray copyto einsum empty empty_like flatnonzero "
+    "linalg.norm tile vdot where zeros zeros_like"
 ).split()  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
 counted = Counter()
@@ -52,6 +52,7 @@ class Array(NDArrayOperatorsMixin):
         assert name in KNOWN, f"has CuPy numpy.{name}?"
         if name in ("asarray", "array"):
             return arguments[0] if isinstance(arguments[0], Array) else send(arguments[0])
+        assert not keywords.keys() & {"device", "copy", "initial", "where"}, f"CuPy's {name} may not take all of {keywords}"
         keywords = {key: bare(value) for key, value in keywords.items() if key != "like"}
         return dressed(function(*map(bare, arguments), **keywords))
 

@@ -22,7 +22,7 @@ def launcher(body):
     return threads.launcher(body)
 
 
-replaced = {"as_argument": bare, "_stream": lambda: 0, "THREADS": 8}
+replaced = {"as_argument": lambda value: (None, bare(value)), "_stream": lambda: 0, "THREADS": 8}
 with patch.multiple(threads, **replaced), pretended(launcher):
     last = [play(scene)[1][-1].position for scene in sys.argv[1:]]
 print(*sorted(ran))

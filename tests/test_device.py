@@ -91,10 +91,11 @@ def test_messages_are_staged_on_the_cpu_where_mpi_knows_no_gpus(options, knows: 
         aware.value = before
 
 
+@pytest.mark.cuda
 def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path, options):
     """A prefix has a matrix type of its own, for the spare solver of a rescue or of the true error."""
-    if not PETSc.Sys.hasExternalPackage("cuda"):
-        pytest.skip("this PETSc was built without CUDA")
+    if device.what_is_missing():
+        pytest.skip(device.what_is_missing())
     options["mat_type"] = "seqaijcusparse"
     with patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array):
         with pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"):

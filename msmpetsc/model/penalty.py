@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.model.obstacle import Obstacle, depth, depths
+from msmpetsc.place.arrays import beside
 from msmpetsc.place.each import each
 
 
@@ -89,7 +90,7 @@ class Rub:
         """
         u, length = self.slip(q)
         slope = self.slope(length)
-        blocks = slope[:, None, None] * (np.eye(3, like=q) - _squares(self.normal))
+        blocks = slope[:, None, None] * (beside(q, np.eye(3)) - _squares(self.normal))
         if true:
             direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
             curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)

@@ -1,7 +1,7 @@
 """Threads on a CUDA GPU, by numba: imported by those alone who have one."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import lru_cache
 
 import cupy
@@ -20,11 +20,15 @@ KEPT = 4096  # arrays that numba has seen
 @lru_cache(maxsize=None)
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
     """What place.each calls: one thread for each index below a count, in CuPy's current stream."""
-    kernel = kernel_of(body)
+    kernel, known = kernel_of(body), {}
 
     def launch(count, *arguments):
-        if count:
-            kernel[-(-count // THREADS), THREADS, _stream()](count, tuple(map(as_argument, arguments)))
+        if not count:
+            return
+        kinds, arguments = zip(*map(as_argument, arguments), strict=True)
+        if kinds not in known:  # left to itself numba looks for the types at each launch, which takes longer than that
+            known[kinds] = kernel.specialize(count, arguments)
+        known[kinds][-(-count // THREADS), THREADS, _stream()](count, arguments)
 
     return launch
 
@@ -40,18 +44,19 @@ def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
     return threads
 
 
-def as_argument(value: np.ndarray | float) -> np.ndarray | float:
-    """An array as numba wants it, anything else as it is."""
-    if np.isscalar(value):
-        return value
-    return _seen_by_numba(value.data.ptr, value.shape, value.strides, value.dtype.str)
+def as_argument(value: np.ndarray | float) -> tuple[Hashable, np.ndarray | float]:
+    """What tells for which type it is compiled, and the value: an array as numba wants it, anything else as it is."""
+    if isinstance(value, cupy.ndarray):
+        return _seen_by_numba(value.data.ptr, value.shape, value.strides, value.dtype.str)
+    return type(value), value
 
 
 @lru_cache(maxsize=KEPT)
-def _seen_by_numba(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str) -> np.ndarray:
+def _seen_by_numba(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str) -> tuple[Hashable, object]:
     """It owns nothing; made once, for that takes longer than a launch."""
     told = {"data": (pointer, False), "shape": shape, "strides": strides, "typestr": kind, "version": 3}
-    return cuda.from_cuda_array_interface(told, sync=False)
+    array = cuda.from_cuda_array_interface(told, sync=False)
+    return (kind, len(shape), array.is_c_contiguous(), array.is_f_contiguous()), array
 
 
 def _stream() -> int:

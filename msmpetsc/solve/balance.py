@@ -65,14 +65,15 @@ class EnergyBalance:
         """Of positions (l, 3) [m] and velocities (l, 3) [m/s] as things stand at ``time`` (collective)."""
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
-        at, contact, square = q[owned], around.push(time), np.einsum("ij,ij->i", v[owned], v[owned])
+        at, contact, v = q[owned], around.push(time), v[owned]
+        momenta, free = lattice.mass[:, None] * v, ~around.pinned_at(time)[owned]
         sums = self._sums(
-            0.5 * lattice.mass @ square,
-            0.5 * lattice.mass @ (square * ~around.pinned_at(time)[owned]),
+            0.5 * np.vdot(momenta, v),
+            0.5 * np.vdot(momenta * free[:, None], v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
             -np.vdot(around.load(time), at),
-            *(lattice.mass @ v[owned]),
+            *momenta.sum(axis=0),
         )
         return Energies(*sums[:5], sums[5:])
 
@@ -118,7 +119,7 @@ class EnergyBalance:
         contact, free = around.push(time), ~around.pinned_at(time)[owned]
         known = self.known is not None and q is self.known[0]
         sums = self._sums(
-            0.5 * lattice.mass @ (np.einsum("ij,ij->i", v, v) * free),
+            0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(around.load(time), result.position[owned] - q[owned])

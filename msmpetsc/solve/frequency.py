@@ -50,7 +50,7 @@ class HighestMode:
     def _normalise(self) -> float:
         """Make |x|_M = 1; returns what it was (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = np.sqrt(self.comm.allreduce(float(self.lattice.mass @ np.einsum("ij,ij->i", x, x))))
+        size = np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
         if size > 0:
             x /= size
         self.mode.update()

@@ -55,7 +55,7 @@ class StepFunctional:
         acting = self.elasticity.energy(q) - float(np.vdot(moved, self.load))
         if self.contact:
             acting += self.contact.change(q, self.y)
-        inertia = 0.5 * float(self.lattice.mass @ np.einsum("ij,ij->i", moved, moved))
+        inertia = 0.5 * self._inner(moved, moved)
         return self.comm.allreduce(inertia + self.t2 * acting)
 
     def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
@@ -64,11 +64,15 @@ class StepFunctional:
         owned = slice(self.lattice.owned)
         moved = self.q[owned] - base[owned]
         twice = self.q[owned] + base[owned] - 2 * self.y[owned]
-        inertia = 0.5 * float(self.lattice.mass @ np.einsum("ij,ij->i", moved, twice))
+        inertia = 0.5 * self._inner(moved, twice)
         elastic = self.elasticity.change(self.q, base) - float(np.vdot(moved, self.load))
         if self.contact:
             elastic += self.contact.change(self.q, base)
         return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])))
+
+    def _inner(self, a: np.ndarray, b: np.ndarray) -> float:
+        """a^T M b of this rank's (owned, 3)."""
+        return float(np.vdot(self.lattice.mass[:, None] * a, b))
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""

@@ -33,7 +33,7 @@ class Memory(Protocol):
         """A dense matrix; rows: of this rank, of all."""
 
     def values(self, dense: PETSc.Mat) -> np.ndarray:
-        """This rank's part of a dense matrix, column after column (columns * rows,)."""
+        """This rank's part of a dense matrix, column after column (columns * rows,), to be read or written at once."""
 
 
 class Host:

@@ -17,13 +17,17 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 
 
 class Block:
-    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of; values: x, then y, then z."""
+    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of."""
 
     def __init__(self, matrix: PETSc.Mat, memory: Memory):
         rows, _ = matrix.getSizes()
-        self.mat = memory.dense(rows, 3, matrix.comm)
-        self.values = memory.values(self.mat)
+        self.mat, self.memory = memory.dense(rows, 3, matrix.comm), memory
         self.destroy = self.mat.destroy
+
+    @property
+    def values(self) -> np.ndarray:
+        """x, then y, then z; to be read or written at once."""
+        return self.memory.values(self.mat)
 
 
 class ContactBlocks:
@@ -58,12 +62,11 @@ class ThreeColumns:
         self.matrix, self.memory, self.contact = matrix, memory, contact
         self.input = Block(matrix, memory)
         self.product = matrix.matMult(self.input.mat)
-        self.values = memory.values(self.product)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.input.values[:] = self.memory.read(x)
         self.matrix.matMult(self.input.mat, result=self.product)
-        self.memory.write(y)[:] = self.values
+        self.memory.write(y)[:] = self.memory.values(self.product)
         if self.contact:
             self.contact.add(x, y)
 
@@ -124,7 +127,8 @@ class Preconditioner:
             self.pc.apply(x, y)
             return
         given, found = self.blocks = self.blocks or self._create_blocks()
-        given.values[:] = beside(given.values, self.memory.read(x))
+        values = given.values
+        values[:] = beside(values, self.memory.read(x))
         self.pc.matApply(given.mat, found.mat)
         y = self.memory.write(y)
         y[:] = beside(y, found.values)

@@ -118,6 +118,20 @@ def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
 
 
 @on_a_gpu
+def test_multigrid_may_share_its_matrix_with_our_products(tmp_path: Path, on_gpu):
+    """cuSPARSE keeps what it prepared for a product with the matrix, which here has two."""
+    path = block_scene(tmp_path, **CASES["anderson"])
+    PETSc.Options()["pc_type"] = "gamg"
+    try:
+        here = play(path)
+        with on_gpu():
+            there = play(path)
+    finally:
+        del PETSc.Options()["pc_type"]
+    np.testing.assert_allclose(positions(there), positions(here), rtol=0, atol=1e-8)
+
+
+@on_a_gpu
 def test_true_errors_are_measured_there(tmp_path: Path, on_gpu):
     path = block_scene(tmp_path, **{**FALL, **HELD, "solver": {"preset": "newton", "error": 1e-2}})
     here = play(path, Measured(true_error=4))

@@ -19,5 +19,5 @@ def beside(array: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def greatest(array: np.ndarray) -> float:
-    """The greatest of no negative numbers, 0 of none."""
+    """The greatest of numbers that are not negative, 0 if there are none."""
     return float(array.max()) if array.size else 0.0

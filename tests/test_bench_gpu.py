@@ -1,5 +1,6 @@
 """scripts/bench_gpu, which has no GPU here, on a pretended one: that it runs to its end, and counts what it says."""
 
+import os
 import sys
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -8,7 +9,7 @@ from unittest.mock import patch
 
 import pytest
 from block_scene import block_scene
-from conftest import ROOT
+from conftest import ENVIRONMENT, ROOT
 from mpi4py import MPI
 from pretend_gpu import pretended
 
@@ -56,7 +57,7 @@ def test_runs_are_compared(bench, tmp_path: Path, capsys: pytest.CaptureFixture)
     (tmp_path / "scenes").mkdir()
     for file in tmp_path.glob("scene.*"):
         file.rename(tmp_path / "scenes" / file.name)
-    with patch.object(bench, "ROOT", tmp_path):
+    with patch.object(bench, "ROOT", tmp_path), patch.dict(os.environ, ENVIRONMENT):
         (row,) = bench.compared(args, tmp_path)
     assert row["cells"] == 32 and row["frames/s, GPU"] is None and row["error"] < 1e-3
     assert min(row["frames/s, one core"], row["frames/s, all cores"]) > 0 and path.name == "scene.toml"

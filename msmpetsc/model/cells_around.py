@@ -50,16 +50,15 @@ class CellsAround:
     @classmethod
     def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellsAround":
         """Beside the lattice's nodes."""
-        cells, owned = fetch(lattice.local_cells), lattice.owned
-        nodes = cells.ravel()
+        nodes, owned = fetch(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")
         by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
         node = nodes[by_node]
         slot = np.arange(len(node)) - np.searchsorted(node, node)
         around, corner = np.full((8, owned), -1, np.int32), np.zeros((8, owned), np.uint8)
         around[slot, node], corner[slot, node] = by_node // 8, by_node % 8
-        cells, resistance, around, corner = (beside(lattice.nodes, a) for a in (cells, resistance, around, corner))
-        return cls(cells, lattice.cells_owned, resistance, volume, around, corner)
+        resistance, around, corner = (beside(lattice.nodes, a) for a in (resistance, around, corner))
+        return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
 
     def energy(self, q: np.ndarray) -> float:
         """[J] of the own cells."""

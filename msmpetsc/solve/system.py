@@ -52,9 +52,7 @@ def assemble(
 
 
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
-    vector = unknowns.create_vector(matrix.comm)
-    wanted, given = vector.getType(), matrix.getType()
-    vector.destroy()
-    if ("cuda" in wanted) != ("cusparse" in given):
+    given, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
+    if ("cusparse" in given) != on_gpu:
         prefix = matrix.getOptionsPrefix() or ""
-        raise InputError(f"-{prefix}mat_type {given}: the run computes on the {'GPU' if 'cuda' in wanted else 'CPU'}")
+        raise InputError(f"-{prefix}mat_type {given}: the run computes on the {'GPU' if on_gpu else 'CPU'}")

@@ -11,6 +11,7 @@ from msmpetsc.model.cells_around import CellsAround
 from msmpetsc.model.energy import (
     add_elastic_gradient,
     add_elastic_product,
+    add_spring_concavity,
     elastic_change,
     elastic_energy,
     elastic_hessian,
@@ -41,6 +42,7 @@ class Elasticity:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.owned = lattice.owned
         self.springs, self.cells = (Springs if is_here(lattice.nodes) else Neighbours).of(lattice), None
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
@@ -60,6 +62,18 @@ class Elasticity:
         """Add grad E [N] to ``gradient`` (l, 3)."""
         for part in self.parts:
             part.add_gradient(q, gradient)
+
+    def concavity(self, q: np.ndarray) -> np.ndarray:
+        """(owned,) [N/m]: the springs' Hessian is no less than minus the diagonal matrix of it, 0 where none is compressed."""
+        concavity = np.zeros(len(q), like=q)
+        self.springs.add_concavity(q, concavity)
+        return concavity[: self.owned]
+
+    def resists(self, q: np.ndarray) -> bool:
+        """Whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
+        if self.cells is None or not len(self.cells.cells):
+            return False
+        return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
 
     def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
         """The Hessian of E at q.
@@ -103,6 +117,9 @@ class Springs:
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         add_elastic_gradient(q, *self.all, gradient)
 
+    def add_concavity(self, q: np.ndarray, concavity: np.ndarray) -> None:
+        add_spring_concavity(q, *self.all, concavity)
+
     def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
         return partial(add_elastic_product, self.all[0], elastic_hessian(q, *self.all, projected))
 
@@ -114,6 +131,7 @@ class Cells:
     """
 
     def __init__(self, cells: np.ndarray, resistance: np.ndarray, volume: float, owned: int):
+        self.cells, self.volume = cells, volume
         self.all = cells, resistance, volume
         self.own = cells[:owned], resistance[:owned], volume
 

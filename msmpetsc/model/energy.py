@@ -143,6 +143,28 @@ def add_elastic_gradient(
 
 
 @numba.njit(cache=True)
+def add_spring_concavity(
+    q: np.ndarray,
+    springs: np.ndarray,
+    rest_length: np.ndarray,
+    stiffness: np.ndarray,
+    stiffening: float,
+    concavity: np.ndarray,
+) -> None:
+    """Add to ``concavity`` (l,) [N/m], at both ends of each compressed spring, twice what it pushes across itself.
+
+    With d = v_a - v_b a spring's Hessian c I + e e^T makes  c |d|^2 + (e . d)^2 >= -2 |c| (|v_a|^2 + |v_b|^2)  for c < 0.
+    """
+    for s in range(len(springs)):
+        a, b = springs[s, 0], springs[s, 1]
+        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+        across = spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening)
+        if across < 0.0:
+            concavity[a] -= 2.0 * across
+            concavity[b] -= 2.0 * across
+
+
+@numba.njit(cache=True)
 def elastic_hessian(
     q: np.ndarray,
     springs: np.ndarray,

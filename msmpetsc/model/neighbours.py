@@ -70,6 +70,10 @@ class Neighbours:
         """Add grad E [N] to the owned rows of ``gradient``."""
         gradient_around(self.other.shape[1], q, *self.all, gradient)
 
+    def add_concavity(self, q: np.ndarray, concavity: np.ndarray) -> None:
+        """As model.energy's, to the owned rows of ``concavity`` (l,) [N/m]."""
+        concavity_around(self.other.shape[1], q, *self.all, concavity)
+
     def hessian_at(self, q: np.ndarray, projected: bool) -> Callable[[np.ndarray, np.ndarray], None]:
         """What adds (Hessian of E at q) v [N] to the owned rows of its second argument."""
         return partial(product_around, self.other.shape[1], q.copy(), *self.all, projected)
@@ -119,6 +123,19 @@ def gradient_around(first, count, step, q, other, kind, stiffness, lengths, stif
         gradient[i, 0] += gx
         gradient[i, 1] += gy
         gradient[i, 2] += gz
+
+
+@each
+def concavity_around(first, count, step, q, other, kind, stiffness, lengths, stiffening, concavity):
+    for i in range(first, count, step):
+        total = 0.0
+        for s in range(other.shape[0]):
+            j = other[s, i]
+            if j < 0:
+                break
+            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
+            total -= 2.0 * min(spring_pull(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening), 0.0)
+        concavity[i] += total
 
 
 @each

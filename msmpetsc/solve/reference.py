@@ -53,7 +53,9 @@ class Reference:
             exact = self.stepper.step(**vars(problem), start=positions[-1]).position
             away = self._distances(problem.y, exact)
             found = np.array([self._distances(x, exact) for x in positions])
-            return np.divide(found, away, out=np.zeros_like(found), where=away > 0)
+            errors = np.divide(found, away, out=np.zeros_like(found), where=away > 0)
+            errors[:, 0] = [self.stepper.rounding.added_to(error, away[0]) for error in errors[:, 0]]
+            return errors
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
             return np.full((len(positions), 2), np.nan)

@@ -14,30 +14,34 @@ from msmpetsc.model.penalty import Contact
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.worst import inside_out, place_of_greatest
 from msmpetsc.place.arrays import beside
+from msmpetsc.solve.curvature import LowestCurvature
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
+from msmpetsc.solve.minimum import Minimum
 from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
+from msmpetsc.solve.rounding import Rounding
 from msmpetsc.solve.system import assemble
 from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell
-ROUNDINGS = 3  # of a row of F: in free fall one was passed now and then
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
 EARLY = 2.0  # a step is first looked at closely when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
+DOUBTS = 20  # about where a step has come to: saddles, and errors larger than they had seemed
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
     -4: "not finite",  # DIVERGED_FNORM_NAN; from PETSc 3.25 on DIVERGED_FUNCTION_NANORINF
     -14: "not finite",  # there too: DIVERGED_OBJECTIVE_NANORINF
 }
+INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
@@ -99,7 +103,6 @@ class Stepper:
         self.defaults = set_defaults(preset, prefix, self.budget or 0)
         try:
             self._create_solver(time_step, touches)
-            self.rounding = self._rounding_of_residual()
         except InputError:
             self.destroy()
             raise
@@ -129,6 +132,8 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
         self.estimate = self._keep(ErrorEstimate(self.functional, self.hessian, preconditioner, self.prefix))
+        self.curvature = self._keep(LowestCurvature(self.functional, self.hessian, preconditioner))
+        self.minimum = self._keep(Minimum(self.functional, self.estimate, self.curvature))
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.operator, self.operator)
         self.snes.setObjective(self._objective)
@@ -154,6 +159,7 @@ class Stepper:
         self.scalar = self._keep(self.preconditioned.createVecLeft())
         self.preconditioned.getDiagonal(self.scalar)
         self.diagonal = self.memory.read(self.scalar).copy()
+        self.rounding = Rounding(self.functional, self.diagonal[: self.unknowns.size])
         self.added = np.zeros_like(self.diagonal)  # to the preconditioner's diagonal
         return Preconditioner(self.preconditioned, self.memory, 3 // columns, self.prefix)
 
@@ -193,17 +199,22 @@ class Stepper:
         self.functional.begin(q, y, load, contact, led)
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
-        self.early, self.corrected = EARLY, False
+        self.early, self.corrected, self.alarmed, self.at_rounding = EARLY, False, False, False
+        self.doubts = 0
         self.unknowns.from_nodes(self.first_guess.best(q) if start is None else start, self.x)
-        iterations = 0 if self._is_solved() else self._solve()
+        iterations = self._come_to_rest()
+        while not self._is_minimum():
+            iterations += self._come_to_rest()
         functional = self.functional
         self.unknowns.to_nodes(self.x, functional.q)
         self.first_guess.learn(functional.q)
-        return StepResult(functional.q.copy(), q, self.last_error, iterations, self.all_its() - its_before)
+        error = self.rounding.added_to(self.last_error, functional.away())
+        return StepResult(functional.q.copy(), q, error, iterations, self.all_its() - its_before)
 
     def save(self, saved: Saved) -> None:
         """What the next step depends on beside what it is given."""
         self.first_guess.save(saved)
+        self.curvature.save(saved)
         saved.numbers["ratio"] = self.ratio
         if self.touches:
             bound = saved.rows["contact_bound"] = np.zeros(self.lattice.owned, like=self.added)
@@ -212,6 +223,7 @@ class Stepper:
     def restore(self, saved: Saved) -> None:
         """Go on from there; from nothing saved as if no step had been taken (collective)."""
         self.first_guess.restore(saved)
+        self.curvature.restore(saved)
         self.ratio = saved.numbers.get("ratio", FIRST_RATIO)
         if self.touches:
             bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))
@@ -222,13 +234,39 @@ class Stepper:
         """KSP iterations of all steps so far, and of their estimates."""
         return total_iterations(self.ksp) + total_iterations(self.estimate.ksp)
 
+    def _come_to_rest(self) -> int:
+        """Iterations that took x to where F is as small as it must be."""
+        return 0 if self._is_solved() else self._solve()
+
+    def _is_minimum(self) -> bool:
+        """Whether x is one and its error what was said; x is moved on if not (collective). Raises StepFailed."""
+        functional, enough = self.functional, self.error or 0.0
+        self.unknowns.to_nodes(self.x, functional.q)
+        compression = self.curvature.compression(functional.q)
+        if compression.is_harmless:
+            return True
+        away = functional.away()
+        finding = self.minimum.examine(
+            self.x, self.corrected, compression, self.alarmed, enough * away if enough else np.inf
+        )
+        doubtful = finding.direction is not None or not np.isfinite(finding.error)
+        if self.budget or self.at_rounding or (finding.error <= enough and not doubtful):
+            self.last_error = np.inf if doubtful else finding.error
+            return True
+        self.doubts += 1
+        if self.doubts > DOUBTS:
+            raise self._no_minimum(doubtful)
+        self.minimum.go_on(self.x, finding.direction)
+        self.bound, self.corrected = np.inf, False
+        return False
+
     def _is_solved(self) -> bool:
         """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
         if self.inner is self.snes:
             return False
         self._residual(self.snes, self.x, self.work)
         self.last_error = self._error_of(self.work)
-        solved = self.last_error <= (self.error or 0.0)
+        solved = self._will_do()
         if self.adapts and not solved:
             self._loosen()
         if solved and self.observer:
@@ -281,7 +319,8 @@ class Stepper:
         self.local.begin()
         change, distance = self.functional.change(x, self.base)
         self.local.end()
-        return -1.0 if self.bound < FULL_STEP_ERROR and distance > 0 else change
+        flat = self.bound < FULL_STEP_ERROR and distance > 0 and (self.corrected or not self.doubts)
+        return -1.0 if flat else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: A is constant, only the true Hessian and contact depend on x."""
@@ -341,29 +380,28 @@ class Stepper:
         functional, enough = self.functional, self.error or 0.0
         self.corrected = False
         self.residual, away = functional.dual_norm(f), functional.away()
-        if self.residual <= self.rounding * functional.reach:  # F is nothing but rounding
-            self.bound = 0.0
-            return 0.0
+        self.at_rounding = self.rounding.is_all_of(f)
         if not away > 0 or not np.isfinite(self.residual):  # the start x = y tells nothing yet
-            return np.inf
+            return 0.0 if self.at_rounding else np.inf
         self.bound = self.residual / away
-        if self.bound <= enough or self.bound > self.ratio * self.early * enough:
+        if self.bound > self.ratio * self.early * enough and not self.at_rounding:
+            return self.bound
+        if self.bound <= enough and self.curvature.compression(functional.q).is_harmless:
             return self.bound
         return self._estimated(f, away, enough)
+
+    def _will_do(self) -> bool:
+        """Whether the error that was said last is below what was asked for, or nothing but rounding is left."""
+        return self.at_rounding or self.last_error <= (self.error or 0.0)
 
     def _estimated(self, f: PETSc.Vec, away: float, enough: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         length = self.estimate(f, self.residual, EARLY * enough * away if enough else np.inf)
         if not np.isfinite(length):
+            self.alarmed = True
             return self.bound
         self.ratio, self.early, self.corrected = max(self.bound * away / length, 1.0), 1.0, True
         return length / self.functional.away(self.estimate.correction)
-
-    def _rounding_of_residual(self) -> float:
-        """|F|_(M^-1) that rounding alone leaves, for each metre of a coordinate: some eps of each row's diagonal."""
-        rounding = ROUNDINGS * np.finfo(float).eps * self.diagonal[: self.unknowns.size]
-        self.memory.write(self.work)[:] = np.tile(rounding, 3)
-        return self.functional.dual_norm(self.work)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         reasons = PETSc.SNES.ConvergedReason
@@ -373,12 +411,13 @@ class Stepper:
         else:
             f = self._function(snes)
             self.last_error = self._error_of(f)
+        self.alarmed = self.alarmed or self.ksp.reason == INDEFINITE
         if self.observer:
             self.observer(self)
         if not np.isfinite(self.residual):
             return reasons.DIVERGED_FNORM_NAN
-        if self.last_error <= (self.error or 0.0):
-            return reasons.CONVERGED_FNORM_RELATIVE
+        if self._will_do():
+            return reasons.CONVERGED_FNORM_ABS if self.at_rounding else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
             if not self.corrected:
                 self.last_error = self._estimated(f, self.functional.away(), 0.0)
@@ -411,13 +450,26 @@ class Stepper:
             reason += f" (KSP {ksp} after {self.ksp.its} its)"
             advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
         self._residual(self.snes, self.snes.getSolution(), self.work)
-        worst = place_of_greatest(self.comm, self.lattice, *self.functional.pull(self.work))
-        cells = inside_out(self.comm, self.lattice, self.functional.q)
         return StepFailed(
             f"did not converge: {reason} after {iterations} iterations, residual |F| = {self.residual:.2e}, "
-            f"relative error {self.last_error:.2e}, worst at {worst}{cells}; try {advice}",
+            f"relative error {self.last_error:.2e}{self._where_worst()}; try {advice}",
             kind,
         )
+
+    def _no_minimum(self, doubtful: bool) -> StepFailed:
+        """(collective)"""
+        self._residual(self.snes, self.x, self.work)
+        seen = "a saddle or a fold" if doubtful else "a point farther from its solution than it seemed"
+        return StepFailed(
+            f"did not come to a minimum: it came to {seen} {self.doubts} times, residual |F| = {self.residual:.2e}"
+            f"{self._where_worst()}; try a smaller time.step, or another preset (newton)",
+            "no minimum",
+        )
+
+    def _where_worst(self) -> str:
+        """Where x, whose F is ``work``, is pulled farthest, and what is inside out (collective)."""
+        worst = place_of_greatest(self.comm, self.lattice, *self.functional.pull(self.work))
+        return f", worst at {worst}{inside_out(self.comm, self.lattice, self.functional.q)}"
 
     def destroy(self) -> None:
         """Collective, and in the same order on all ranks; the garbage collector's would differ."""

@@ -1,0 +1,191 @@
+"""Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
+
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
+positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
+for by locally optimal conjugate gradients, preconditioned as the step is (Knyazev 2001, Toward the optimal preconditioned
+eigensolver, Algorithm 4.1): at some length when the body is compressed anew or more than it was, or something showed a
+negative curvature; at all other steps the mode found last is followed in a few iterations.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.linalg import eigh
+
+from msmpetsc.model.saved import Saved
+from msmpetsc.model.start import uniform
+from msmpetsc.place.arrays import beside, fetch, greatest
+from msmpetsc.solve.functional import StepFunctional
+from msmpetsc.solve.operators import Preconditioner, TrueHessian
+
+MOST = 300  # iterations of a long search
+FOLLOWED = 6  # of a short one
+LEAST = 24  # of a long one that finds nothing
+SETTLED = 0.9  # of the curvature when half as many iterations were done: there is no lower one to come
+SHARPENED = 1.1  # times a negative curvature four iterations ago: further ones lead down no steeper
+MORE = 1.25  # times the compression of the last long search: time for another
+TINY = np.finfo(float).tiny
+DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of three unit directions: one of them is none
+
+
+@dataclass(frozen=True)
+class Compression:
+    """Of all ranks: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+
+    greatest: float
+    total: float
+    resists: bool
+
+    @property
+    def is_harmless(self) -> bool:
+        """H is positive definite for certain: M outweighs all that is negative in it."""
+        return self.greatest < 1 and not self.resists
+
+    def exceeds(self, other: "Compression") -> bool:
+        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
+
+
+NONE = Compression(0.0, 0.0, False)
+
+
+class LowestCurvature:
+    """Looks for directions of negative curvature of a step's Hessian. All methods but properties are collective.
+
+    preconditioner : of the step's linear solves
+    """
+
+    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner):
+        self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
+        self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
+        self.searched = NONE  # the compression that the last long search was at
+        self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.basis: np.ndarray | None = None
+
+    def compression(self, q: np.ndarray) -> Compression:
+        """At positions q (l, 3) [m]."""
+        functional, free = self.functional, self.unknowns.free
+        elasticity = functional.elasticity
+        shares = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
+        found = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
+        most, sums, resist = zip(*found, strict=True)
+        return Compression(max(most), sum(sums), any(resist))
+
+    def way_down(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray] | None:
+        """A negative eigenvalue of M^(-1) H and its direction (n,), about where H was linearised last; None if none
+        was found.
+
+        alarmed : something showed a negative curvature
+        hint    : a direction that may have part in it
+        """
+        at_length = alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched)
+        self._begin(hint if alarmed else None, at_length)
+        value = self._search(at_length)
+        if at_length:
+            self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
+        self.mode = self.basis[0].copy()
+        return (value, self.mode) if value < 0 else None
+
+    def _begin(self, hint: PETSc.Vec | None, at_length: bool) -> None:
+        """The first two directions: a long search starts from something of each mode, the same for any number of ranks,
+        for near a mode that is known a lower one comes up late; a short one starts from that mode."""
+        self._create_arrays()
+        lattice, free = self.functional.lattice, fetch(self.unknowns.free)
+        random = uniform(lattice.global_numbers[: lattice.owned])[free].T.ravel() - 0.5
+        self.basis[0] = beside(self.basis, random)
+        self._precondition(0)  # which leaves little of the stiff modes
+        if hint is not None:
+            self.basis[0] /= max(self._length(self.basis[0]), TINY)
+            self.basis[0] += self.memory.read(hint) / max(self._length(self.memory.read(hint)), TINY)
+        if self.mode is not None:
+            self.basis[2] = self.mode
+            if not at_length:
+                self.basis[[0, 2]] = self.basis[[2, 0]]
+        for row in (0, 2) if self.mode is not None else (0,):
+            self.basis[row] /= max(self._length(self.basis[row]), TINY)
+            self.hessian.mult(None, self.vectors[row], self.images[row])
+        self.directions = 1 if self.mode is None else 2
+
+    def _search(self, at_length: bool) -> float:
+        """The lowest eigenvalue that the iterations come to; basis[0] is its direction."""
+        values = [self._sum(self.basis[0] @ self.products[0])]
+        for its in range(1, (MOST if at_length else FOLLOWED) + 1):
+            values.append(self._improve(values[-1]))
+            if values[-1] < 0:
+                if its >= 4 and values[-1] > SHARPENED * values[-5]:
+                    break
+            elif at_length and its >= LEAST and values[-1] > SETTLED * values[its // 2]:
+                break
+        return values[-1]
+
+    def _improve(self, value: float) -> float:
+        """One iteration: the lowest curvature in the span of the mode, its preconditioned residual and the last move."""
+        mass, basis, products = self.functional.mass, self.basis, self.products
+        basis[1] = products[0] - value * mass * basis[0]
+        self._precondition(1)
+        length = self._length(basis[1])
+        if not length > 0:
+            return value
+        basis[1] /= length
+        self.hessian.mult(None, self.vectors[1], self.images[1])
+        self.directions = min(self.directions + 1, 3)
+        grams = self._sum(np.stack([fetch(basis @ products.T), fetch((basis * mass) @ basis.T)]))
+        size = self.directions
+        while np.linalg.eigvalsh(grams[1, :size, :size])[0] < DEPENDENT:
+            size -= 1
+        if size == 1:
+            return value
+        (value, *_), parts = eigh(*(0.5 * (gram + gram.T)[:size, :size] for gram in grams))
+        first, rest = parts[0, 0], beside(basis, parts[1:, 0])
+        moved, moved_product = rest @ basis[1:size], rest @ products[1:size]
+        basis[0], products[0] = first * basis[0] + moved, first * products[0] + moved_product
+        length = self._length(moved)
+        if length > 0:
+            basis[2], products[2] = moved / length, moved_product / length
+        else:
+            self.directions = 1
+        return float(value)
+
+    def _precondition(self, row: int) -> None:
+        """basis[row] becomes P^(-1) times itself."""
+        self.preconditioner.apply(None, self.vectors[row], self.images[row])
+        self.basis[row] = self.products[row]
+
+    def _create_arrays(self) -> None:
+        """Mode, residual and last move (3, n), and what H makes of each; vectors of PETSc's over the rows."""
+        if self.basis is not None:
+            return
+        like = self.functional.mass
+        self.basis, self.products = np.zeros((3, len(like)), like=like), np.zeros((3, len(like)), like=like)
+        self.vectors = [self.memory.over(row, self.comm) for row in self.basis]
+        self.images = [self.memory.over(row, self.comm) for row in self.products]
+
+    def _length(self, direction: np.ndarray) -> float:
+        """In the norm of M."""
+        return float(np.sqrt(self._sum(float(direction**2 @ self.functional.mass))))
+
+    def _sum(self, values: np.ndarray | float) -> np.ndarray:
+        return self.comm.allreduce(np.asarray(fetch(values) if isinstance(values, np.ndarray) else float(values)))
+
+    def save(self, saved: Saved) -> None:
+        """What the next step's search depends on."""
+        lattice = self.functional.lattice
+        rows = saved.rows["lowest_mode"] = np.zeros((lattice.owned, 3), like=lattice.nodes)
+        if self.mode is not None:
+            rows[self.unknowns.free] = self.mode.reshape(3, -1).T
+        saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
+        saved.numbers["knows_mode"] = self.mode is not None
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from there; from nothing saved as if no step had been taken."""
+        numbers = saved.numbers
+        self.searched = Compression(numbers.get("searched_greatest", 0.0), numbers.get("searched_total", 0.0), False)
+        self.mode = None
+        if numbers.get("knows_mode"):
+            rows = beside(self.functional.mass, saved.rows["lowest_mode"])
+            self.mode = rows[self.unknowns.free].T.ravel()
+
+    def destroy(self) -> None:
+        if self.basis is not None:
+            for vector in (*self.vectors, *self.images):
+                vector.destroy()

@@ -1,0 +1,99 @@
+"""Where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and no more.
+
+The estimate of a step's error is the Newton correction e at x. Where a body is compressed g may have a fold or a saddle
+between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.place.arrays import greatest
+from msmpetsc.solve.curvature import Compression, LowestCurvature
+from msmpetsc.solve.estimate import ErrorEstimate
+from msmpetsc.solve.functional import StepFunctional
+
+SMALL = 0.3  # of the first correction: a second one that is less tells nothing new
+FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
+
+
+@dataclass(frozen=True)
+class Finding:
+    """error: relative, of x, infinite where no estimate can be had; direction (n,): of negative curvature, None if none
+    was found."""
+
+    error: float
+    direction: np.ndarray | None
+
+
+class Minimum:
+    """Examines the points that a stepper comes to. All methods are collective."""
+
+    def __init__(self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature):
+        self.functional, self.estimate, self.curvature = functional, estimate, curvature
+        self.unknowns, self.memory = functional.unknowns, functional.memory
+        self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
+        self.base = np.empty_like(functional.lattice.nodes)
+
+    def examine(self, x: PETSc.Vec, corrected: bool, compression: Compression, alarmed: bool, enough: float) -> Finding:
+        """What there is at x, or rather at x less its estimated error.
+
+        corrected : whether estimate.correction is of x
+        alarmed   : whether something has shown a negative curvature
+        enough    : the length of an error that will do, |e|_M
+        """
+        functional, estimate = self.functional, self.estimate
+        x.copy(self.nearer)
+        self.first.set(0.0)
+        if corrected:
+            estimate.correction.copy(self.first)
+            self.nearer.axpy(-1.0, self.first)
+        functional.gradient_at(self.nearer, self.f)  # functional.q is there from now on
+        second = functional.dual_norm(self.f)
+        if corrected and second <= SMALL * functional.norm(self.first):
+            estimate.linearise()
+            error = functional.norm(self.first) / functional.away()
+        else:
+            error = self._second_estimate(second, enough)
+        alarmed = alarmed or not np.isfinite(error)
+        found = self.curvature.way_down(compression, alarmed, estimate.correction if alarmed else None)
+        return Finding(error, None if found is None else found[1])
+
+    def _second_estimate(self, bound: float, enough: float) -> float:
+        """The error of x by both corrections; infinite where the second cannot be had."""
+        functional, correction = self.functional, self.estimate.correction
+        length = self.estimate(self.f, bound, enough)
+        if not np.isfinite(length):
+            return np.inf
+        self.first.axpy(length / max(functional.norm(correction), np.finfo(float).tiny), correction)
+        return functional.norm(self.first) / functional.away(correction)
+
+    def go_on(self, x: PETSc.Vec, direction: np.ndarray | None) -> None:
+        """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
+        way that g falls, as far as doubling the move lets it fall."""
+        functional = self.functional
+        self.unknowns.to_nodes(x, self.base)
+        if functional.change(self.nearer, self.base)[0] < 0:
+            self.nearer.copy(x)
+            self.unknowns.to_nodes(x, self.base)
+        if direction is None:
+            return
+        functional.gradient_at(x, self.f)
+        slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
+        longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
+        move = -math.copysign(FIRST_MOVE * functional.lattice.cell_size / longest, slope)
+        best = lowest = 0.0
+        for _ in range(MOVES):
+            self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
+            change, _ = functional.change(self.f, self.base)
+            if not change < lowest:
+                break
+            best, lowest, move = move, change, 2 * move
+        self.memory.write(x)[:] += best * direction
+
+    def destroy(self) -> None:
+        for owned in (self.nearer, self.f, self.first):
+            owned.destroy()

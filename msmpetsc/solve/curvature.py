@@ -22,7 +22,7 @@ from msmpetsc.solve.operators import Preconditioner, TrueHessian
 MOST = 300  # iterations of a long search
 FOLLOWED = 6  # of a short one
 LEAST = 24  # of a long one that finds nothing
-SETTLED = 0.9  # of the curvature when half as many iterations were done: there is no lower one to come
+SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature four iterations ago: further ones lead down no steeper
 MORE = 1.25  # times the compression of the last long search: time for another
 TINY = np.finfo(float).tiny
@@ -40,7 +40,12 @@ class Compression:
     @property
     def is_harmless(self) -> bool:
         """H is positive definite for certain: M outweighs all that is negative in it."""
-        return self.greatest < 1 and not self.resists
+        return self.least_curvature > 0
+
+    @property
+    def least_curvature(self) -> float:
+        """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
+        return max(1 - self.greatest, 0.0) if not self.resists else 0.0
 
     def exceeds(self, other: "Compression") -> bool:
         return self.greatest > MORE * other.greatest or self.total > MORE * other.total
@@ -58,9 +63,11 @@ class LowestCurvature:
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
+        self.its = 0  # of all searches so far, one product with H each
         self.searched = NONE  # the compression that the last long search was at
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
         self.basis: np.ndarray | None = None
+        self.rigid: np.ndarray | None = None  # motions (6, n) of a free body, orthonormal in M
 
     def compression(self, q: np.ndarray) -> Compression:
         """At positions q (l, 3) [m]."""
@@ -71,20 +78,21 @@ class LowestCurvature:
         most, sums, resist = zip(*found, strict=True)
         return Compression(max(most), sum(sums), any(resist))
 
-    def way_down(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray] | None:
-        """A negative eigenvalue of M^(-1) H and its direction (n,), about where H was linearised last; None if none
-        was found.
+    def lowest(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray]:
+        """The lowest eigenvalue of M^(-1) H that was found, and its direction (n,), about where H was linearised last.
 
         alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
         at_length = alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched)
-        self._begin(hint if alarmed else None, at_length)
+        self._begin(hint, at_length)
         value = self._search(at_length)
+        if self.rigid is not None:
+            value = self._with_rigid(value)
         if at_length:
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
         self.mode = self.basis[0].copy()
-        return (value, self.mode) if value < 0 else None
+        return value, self.mode
 
     def _begin(self, hint: PETSc.Vec | None, at_length: bool) -> None:
         """The first two directions: a long search starts from something of each mode, the same for any number of ranks,
@@ -92,6 +100,7 @@ class LowestCurvature:
         self._create_arrays()
         lattice, free = self.functional.lattice, fetch(self.unknowns.free)
         random = uniform(lattice.global_numbers[: lattice.owned])[free].T.ravel() - 0.5
+        self.rigid = self._rigid_motions() if at_length else None
         self.basis[0] = beside(self.basis, random)
         self._precondition(0)  # which leaves little of the stiff modes
         if hint is not None:
@@ -102,6 +111,7 @@ class LowestCurvature:
             if not at_length:
                 self.basis[[0, 2]] = self.basis[[2, 0]]
         for row in (0, 2) if self.mode is not None else (0,):
+            self._leave_out_rigid(row)
             self.basis[row] /= max(self._length(self.basis[row]), TINY)
             self.hessian.mult(None, self.vectors[row], self.images[row])
         self.directions = 1 if self.mode is None else 2
@@ -123,6 +133,8 @@ class LowestCurvature:
         mass, basis, products = self.functional.mass, self.basis, self.products
         basis[1] = products[0] - value * mass * basis[0]
         self._precondition(1)
+        self.its += 1
+        self._leave_out_rigid(1)
         length = self._length(basis[1])
         if not length > 0:
             return value
@@ -150,6 +162,42 @@ class LowestCurvature:
         """basis[row] becomes P^(-1) times itself."""
         self.preconditioner.apply(None, self.vectors[row], self.images[row])
         self.basis[row] = self.products[row]
+
+    def _rigid_motions(self) -> np.ndarray | None:
+        """Translations and rotations of a free body at functional.q, whose curvature mostly is about 1: among them it
+        would show late that there is a lower one. They are left out of a long search, and looked at by themselves."""
+        if self.unknowns.total < self.functional.lattice.table.total:
+            return None
+        columns = self.functional.q[self.unknowns.free].T
+        motions = np.zeros((6, *columns.shape), like=columns)
+        for c in range(3):
+            motions[c, c] = 1.0
+            motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
+        motions = motions.reshape(6, -1)
+        for _ in range(2):  # once more, for what the first left of rounding
+            sizes, parts = np.linalg.eigh(self._sum(fetch((motions * self.functional.mass) @ motions.T)))
+            kept = sizes > DEPENDENT * sizes[-1]
+            motions = beside(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
+        return motions
+
+    def _leave_out_rigid(self, row: int) -> None:
+        if self.rigid is not None:
+            parts = self._sum(fetch(self.rigid @ (self.functional.mass * self.basis[row])))
+            self.basis[row] -= beside(self.basis, parts) @ self.rigid
+
+    def _with_rigid(self, value: float) -> float:
+        """The lowest curvature in the span of the mode, of curvature ``value``, and the rigid motions."""
+        span = np.concatenate([self.basis[:1], self.rigid])
+        products = np.empty_like(span)
+        products[0] = self.products[0]
+        for row in range(1, len(span)):
+            self.basis[1] = span[row]
+            self.hessian.mult(None, self.vectors[1], self.images[1])
+            products[row] = self.products[1]
+        gram = self._sum(fetch(span @ products.T))
+        values, parts = np.linalg.eigh(0.5 * (gram + gram.T))
+        self.basis[0] = beside(self.basis, parts[:, 0]) @ span
+        return min(value, float(values[0]))
 
     def _create_arrays(self) -> None:
         """Mode, residual and last move (3, n), and what H makes of each; vectors of PETSc's over the rows."""

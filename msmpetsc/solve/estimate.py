@@ -17,6 +17,7 @@ from msmpetsc.solve.operators import Preconditioner, TrueHessian, python_matrix
 LOOK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
+YOUNG, FALLING = 16, 0.2  # iterations in which the least Ritz value must not fall so much while k doubles: it may soon be less
 MOST = 512
 
 
@@ -40,14 +41,17 @@ class ErrorEstimate:
         self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._told_enough)
 
-    def __call__(self, f: PETSc.Vec, bound: float, enough: float) -> float:
+    def __call__(self, f: PETSc.Vec, bound: float, enough: float, lowest: float = 1.0) -> float:
         """|x - x*|_M at functional.q, where F is f (collective); what comes out over ``enough`` may be too low.
 
-        bound : |F|_(M^-1)
+        bound  : on it, |F|_(M^-1) where H is no less than M
+        lowest : eigenvalue of M^(-1) H, as far as is known
 
         Infinite where the Hessian is not positive definite: there no linear correction tells the way.
         """
-        self.enough, self.f, self.bound, self.lengths = enough, f, bound, {}
+        self.enough, self.f, self.bound = enough, f, bound
+        self.lengths, self.leasts = {}, {}  # |e_k|_M and the least Ritz value, by iteration
+        self.close = CLOSE * np.sqrt(min(lowest, 1.0))
         self.linearise()
         self.ksp.solve(f, self.correction)
         if self.ksp.reason <= 0:
@@ -70,6 +74,8 @@ class ErrorEstimate:
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if residual == 0 or its >= MOST or length > self.enough:
             return reasons.CONVERGED_ITS
+        if its <= YOUNG:
+            self.leasts[its] = ksp.computeExtremeSingularValues()[1]
         if its % LOOK_EVERY or 4 * its**2 * length < self.bound or length > GROWTH * self.lengths[its // 2]:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
@@ -77,8 +83,10 @@ class ErrorEstimate:
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """In the norm of H, as far as CG can tell."""
         least = ksp.computeExtremeSingularValues()[1]
+        if least < FALLING * self.leasts.get(ksp.its // 2, 0.0):
+            return False
         found = ksp.getSolution().dot(self.f)
-        return min(least, found) > 0 and residual < CLOSE * np.sqrt(least * found)
+        return min(least, found) > 0 and residual < self.close * np.sqrt(least * found)
 
     def destroy(self) -> None:
         for owned in (self.ksp, self.correction, self.operator):

@@ -16,7 +16,7 @@ from msmpetsc.solve.curvature import Compression, LowestCurvature
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.functional import StepFunctional
 
-SMALL = 0.3  # of the first correction: a second one that is less tells nothing new
+SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
@@ -36,7 +36,6 @@ class Minimum:
         self.functional, self.estimate, self.curvature = functional, estimate, curvature
         self.unknowns, self.memory = functional.unknowns, functional.memory
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
-        self.base = np.empty_like(functional.lattice.nodes)
 
     def examine(self, x: PETSc.Vec, corrected: bool, compression: Compression, alarmed: bool, enough: float) -> Finding:
         """What there is at x, or rather at x less its estimated error.
@@ -52,47 +51,50 @@ class Minimum:
             estimate.correction.copy(self.first)
             self.nearer.axpy(-1.0, self.first)
         functional.gradient_at(self.nearer, self.f)  # functional.q is there from now on
-        second = functional.dual_norm(self.f)
-        if corrected and second <= SMALL * functional.norm(self.first):
-            estimate.linearise()
-            error = functional.norm(self.first) / functional.away()
-        else:
-            error = self._second_estimate(second, enough)
-        alarmed = alarmed or not np.isfinite(error)
-        found = self.curvature.way_down(compression, alarmed, estimate.correction if alarmed else None)
-        return Finding(error, None if found is None else found[1])
+        estimate.linearise()
+        value, direction = self.curvature.lowest(compression, alarmed, estimate.correction if alarmed else None)
+        if value < 0:
+            return Finding(np.inf, direction)
+        bound, first = functional.dual_norm(self.f) / min(value, 1.0), functional.norm(self.first)
+        if corrected and bound <= SMALL * first:
+            return Finding(first / functional.away(), None)
+        return Finding(self._second_estimate(bound, enough, value), None)
 
-    def _second_estimate(self, bound: float, enough: float) -> float:
-        """The error of x by both corrections; infinite where the second cannot be had."""
+    def _second_estimate(self, bound: float, enough: float, lowest: float) -> float:
+        """The error of x by both corrections; infinite where the second cannot be had, or is no smaller."""
         functional, correction = self.functional, self.estimate.correction
-        length = self.estimate(self.f, bound, enough)
-        if not np.isfinite(length):
+        first = functional.norm(self.first)
+        second = self.estimate(self.f, bound, enough, lowest)
+        if not (second < SMALL * first or first == 0 and np.isfinite(second)):
             return np.inf
-        self.first.axpy(length / max(functional.norm(correction), np.finfo(float).tiny), correction)
+        self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
         return functional.norm(self.first) / functional.away(correction)
 
-    def go_on(self, x: PETSc.Vec, direction: np.ndarray | None) -> None:
+    def go_on(self, x: PETSc.Vec, direction: np.ndarray | None) -> bool:
         """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
-        way that g falls, as far as doubling the move lets it fall."""
+        way that g falls, as far as doubling the move lets it fall; whether it has moved."""
         functional = self.functional
-        self.unknowns.to_nodes(x, self.base)
-        if functional.change(self.nearer, self.base)[0] < 0:
+        self.unknowns.to_nodes(x, functional.q)
+        base = functional.q.copy()
+        falls = functional.change(self.nearer, base)[0] < 0
+        if falls:
             self.nearer.copy(x)
-            self.unknowns.to_nodes(x, self.base)
         if direction is None:
-            return
+            return falls
         functional.gradient_at(x, self.f)
+        base[:] = functional.q
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
         longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
         move = -math.copysign(FIRST_MOVE * functional.lattice.cell_size / longest, slope)
         best = lowest = 0.0
         for _ in range(MOVES):
             self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
-            change, _ = functional.change(self.f, self.base)
+            change, _ = functional.change(self.f, base)
             if not change < lowest:
                 break
             best, lowest, move = move, change, 2 * move
         self.memory.write(x)[:] += best * direction
+        return falls or best != 0.0
 
     def destroy(self) -> None:
         for owned in (self.nearer, self.f, self.first):

@@ -35,6 +35,7 @@ EARLY = 2.0  # a step is first looked at closely when its error is thought to be
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 DOUBTS = 20  # about where a step has come to: saddles, and errors larger than they had seemed
+CLOSER = 0.1  # of the error that was enough to doubt
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
@@ -51,7 +52,7 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 class StepResult:
     """position (l, 3) [m], ghosts included; previous (l, 3) [m]: so that the velocity is
     (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
-    the KSP iterations of all of them, and of the estimates."""
+    the KSP iterations of all of them, and of what examines the result."""
 
     position: np.ndarray
     previous: np.ndarray
@@ -200,7 +201,7 @@ class Stepper:
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
         self.early, self.corrected, self.alarmed, self.at_rounding = EARLY, False, False, False
-        self.doubts = 0
+        self.doubts, self.goal = 0, self.error or 0.0
         self.unknowns.from_nodes(self.first_guess.best(q) if start is None else start, self.x)
         iterations = self._come_to_rest()
         while not self._is_minimum():
@@ -231,8 +232,8 @@ class Stepper:
             self._add_to_preconditioner(np.tile(bound, len(self.diagonal) // max(len(bound), 1)))
 
     def all_its(self) -> int:
-        """KSP iterations of all steps so far, and of their estimates."""
-        return total_iterations(self.ksp) + total_iterations(self.estimate.ksp)
+        """KSP iterations of all steps so far, and of their estimates and searches for negative curvature."""
+        return total_iterations(self.ksp) + total_iterations(self.estimate.ksp) + self.curvature.its
 
     def _come_to_rest(self) -> int:
         """Iterations that took x to where F is as small as it must be."""
@@ -249,14 +250,16 @@ class Stepper:
         finding = self.minimum.examine(
             self.x, self.corrected, compression, self.alarmed, enough * away if enough else np.inf
         )
-        doubtful = finding.direction is not None or not np.isfinite(finding.error)
-        if self.budget or self.at_rounding or (finding.error <= enough and not doubtful):
-            self.last_error = np.inf if doubtful else finding.error
+        self.last_error = finding.error
+        if self.budget or self.at_rounding or finding.error <= enough:
             return True
         self.doubts += 1
+        if not self.minimum.go_on(self.x, finding.direction):
+            if np.isfinite(finding.error):
+                return True  # g has no digits left to tell the two points apart
+            self.goal *= CLOSER
         if self.doubts > DOUBTS:
-            raise self._no_minimum(doubtful)
-        self.minimum.go_on(self.x, finding.direction)
+            raise self._no_minimum(finding.error)
         self.bound, self.corrected = np.inf, False
         return False
 
@@ -377,7 +380,7 @@ class Stepper:
 
     def _error_of(self, f: PETSc.Vec) -> float:
         """Relative error at the positions functional.q, where F is f; the bound on it while that is far too much."""
-        functional, enough = self.functional, self.error or 0.0
+        functional, enough = self.functional, self.goal
         self.corrected = False
         self.residual, away = functional.dual_norm(f), functional.away()
         self.at_rounding = self.rounding.is_all_of(f)
@@ -386,13 +389,15 @@ class Stepper:
         self.bound = self.residual / away
         if self.bound > self.ratio * self.early * enough and not self.at_rounding:
             return self.bound
-        if self.bound <= enough and self.curvature.compression(functional.q).is_harmless:
-            return self.bound
+        if self.bound <= enough:
+            lowest = self.curvature.compression(functional.q).least_curvature
+            if self.bound <= enough * lowest:
+                return self.bound / lowest
         return self._estimated(f, away, enough)
 
     def _will_do(self) -> bool:
         """Whether the error that was said last is below what was asked for, or nothing but rounding is left."""
-        return self.at_rounding or self.last_error <= (self.error or 0.0)
+        return self.at_rounding or self.last_error <= self.goal
 
     def _estimated(self, f: PETSc.Vec, away: float, enough: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
@@ -437,7 +442,7 @@ class Stepper:
     def _loosen(self) -> None:
         """Let the next linear solve leave what the step can do with: it need not gain more digits than are missing."""
         missing = self.bound / self.ratio
-        rtol = SHARE * (self.error or 0.0) / missing
+        rtol = SHARE * self.goal / missing
         self.ksp.setTolerances(rtol=min(max(rtol, self.tightest), LOOSEST))
 
     def _failure(self, iterations: int) -> StepFailed:
@@ -456,10 +461,10 @@ class Stepper:
             kind,
         )
 
-    def _no_minimum(self, doubtful: bool) -> StepFailed:
+    def _no_minimum(self, error: float) -> StepFailed:
         """(collective)"""
         self._residual(self.snes, self.x, self.work)
-        seen = "a saddle or a fold" if doubtful else "a point farther from its solution than it seemed"
+        seen = "a saddle or a fold" if np.isinf(error) else "a point farther from its solution than it seemed"
         return StepFailed(
             f"did not come to a minimum: it came to {seen} {self.doubts} times, residual |F| = {self.residual:.2e}"
             f"{self._where_worst()}; try a smaller time.step, or another preset (newton)",

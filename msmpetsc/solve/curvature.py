@@ -67,7 +67,7 @@ class LowestCurvature:
         self.searched = NONE  # the compression that the last long search was at
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
         self.basis: np.ndarray | None = None
-        self.rigid: np.ndarray | None = None  # motions (6, n) of a free body, orthonormal in M
+        self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
     def compression(self, q: np.ndarray) -> Compression:
         """At positions q (l, 3) [m]."""
@@ -85,46 +85,57 @@ class LowestCurvature:
         hint    : a direction that may have part in it
         """
         at_length = alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched)
-        self._begin(hint, at_length)
-        value = self._search(at_length)
-        if self.rigid is not None:
-            value = self._with_rigid(value)
+        self._create_arrays()
         if at_length:
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
+            value = self._search_at_length(hint)
+        else:
+            self.basis[0], self.basis[2] = self.mode, self._random()
+            self._begin(0, 2)
+            value = self._iterate(FOLLOWED, FOLLOWED)
         self.mode = self.basis[0].copy()
         return value, self.mode
 
-    def _begin(self, hint: PETSc.Vec | None, at_length: bool) -> None:
-        """The first two directions: a long search starts from something of each mode, the same for any number of ranks,
-        for near a mode that is known a lower one comes up late; a short one starts from that mode."""
-        self._create_arrays()
+    def _search_at_length(self, hint: PETSc.Vec | None) -> float:
+        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
+        for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
+        rigid = self.rigid = self._rigid_motions()
+        self.basis[0] = self._random()
+        if hint is not None:
+            self.basis[0] += self.memory.read(hint) / max(self._length(self.memory.read(hint)), TINY)
+        self._begin(0)
+        self._iterate(MOST, LEAST)
+        self.rigid = None
+        known = [self.mode[None]] if self.mode is not None else []
+        self._combine(np.concatenate([self.basis[:1], *known, *([] if rigid is None else [rigid])]))
+        self._begin(0)
+        return self._iterate(MOST, LEAST // 2)
+
+    def _random(self) -> np.ndarray:
+        """Something of each mode (n,), the same for any number of ranks, little of the stiff ones."""
         lattice, free = self.functional.lattice, fetch(self.unknowns.free)
         random = uniform(lattice.global_numbers[: lattice.owned])[free].T.ravel() - 0.5
-        self.rigid = self._rigid_motions() if at_length else None
-        self.basis[0] = beside(self.basis, random)
-        self._precondition(0)  # which leaves little of the stiff modes
-        if hint is not None:
-            self.basis[0] /= max(self._length(self.basis[0]), TINY)
-            self.basis[0] += self.memory.read(hint) / max(self._length(self.memory.read(hint)), TINY)
-        if self.mode is not None:
-            self.basis[2] = self.mode
-            if not at_length:
-                self.basis[[0, 2]] = self.basis[[2, 0]]
-        for row in (0, 2) if self.mode is not None else (0,):
+        self.basis[1] = beside(self.basis, random)
+        self._precondition(1)
+        return self.basis[1] / max(self._length(self.basis[1]), TINY)
+
+    def _begin(self, *rows: int) -> None:
+        """Iterations from directions that stand in the first row, and in another."""
+        for row in rows:
             self._leave_out_rigid(row)
             self.basis[row] /= max(self._length(self.basis[row]), TINY)
             self.hessian.mult(None, self.vectors[row], self.images[row])
-        self.directions = 1 if self.mode is None else 2
+        self.directions = len(rows)
 
-    def _search(self, at_length: bool) -> float:
+    def _iterate(self, most: int, least: int) -> float:
         """The lowest eigenvalue that the iterations come to; basis[0] is its direction."""
-        values = [self._sum(self.basis[0] @ self.products[0])]
-        for its in range(1, (MOST if at_length else FOLLOWED) + 1):
+        values = [float(self._sum(self.basis[0] @ self.products[0]))]
+        for its in range(1, most + 1):
             values.append(self._improve(values[-1]))
             if values[-1] < 0:
                 if its >= 4 and values[-1] > SHARPENED * values[-5]:
                     break
-            elif at_length and its >= LEAST and values[-1] > SETTLED * values[its // 2]:
+            elif its >= least and values[-1] > SETTLED * values[its // 2]:
                 break
         return values[-1]
 
@@ -164,8 +175,7 @@ class LowestCurvature:
         self.basis[row] = self.products[row]
 
     def _rigid_motions(self) -> np.ndarray | None:
-        """Translations and rotations of a free body at functional.q, whose curvature mostly is about 1: among them it
-        would show late that there is a lower one. They are left out of a long search, and looked at by themselves."""
+        """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
         columns = self.functional.q[self.unknowns.free].T
@@ -185,19 +195,18 @@ class LowestCurvature:
             parts = self._sum(fetch(self.rigid @ (self.functional.mass * self.basis[row])))
             self.basis[row] -= beside(self.basis, parts) @ self.rigid
 
-    def _with_rigid(self, value: float) -> float:
-        """The lowest curvature in the span of the mode, of curvature ``value``, and the rigid motions."""
-        span = np.concatenate([self.basis[:1], self.rigid])
+    def _combine(self, span: np.ndarray) -> None:
+        """basis[0] becomes the direction of lowest curvature in the span of the rows (k, n)."""
         products = np.empty_like(span)
-        products[0] = self.products[0]
-        for row in range(1, len(span)):
+        for row in range(len(span)):
             self.basis[1] = span[row]
             self.hessian.mult(None, self.vectors[1], self.images[1])
             products[row] = self.products[1]
-        gram = self._sum(fetch(span @ products.T))
-        values, parts = np.linalg.eigh(0.5 * (gram + gram.T))
-        self.basis[0] = beside(self.basis, parts[:, 0]) @ span
-        return min(value, float(values[0]))
+        grams = self._sum(np.stack([fetch(span @ products.T), fetch((span * self.functional.mass) @ span.T)]))
+        sizes, parts = np.linalg.eigh(grams[1])
+        parts = parts[:, sizes > DEPENDENT * sizes[-1]] / np.sqrt(sizes[sizes > DEPENDENT * sizes[-1]])
+        _, best = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
+        self.basis[0] = beside(self.basis, parts @ best[:, 0]) @ span
 
     def _create_arrays(self) -> None:
         """Mode, residual and last move (3, n), and what H makes of each; vectors of PETSc's over the rows."""

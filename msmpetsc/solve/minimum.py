@@ -16,7 +16,8 @@ from msmpetsc.solve.curvature import Compression, LowestCurvature
 from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.functional import StepFunctional
 
-SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
+SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there, and that the error
+DOUBTFUL = 30.0  # may be so many times what they say: it was seen 10 times as large in a valley
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
@@ -61,12 +62,14 @@ class Minimum:
         return Finding(self._second_estimate(bound, enough, value), None)
 
     def _second_estimate(self, bound: float, enough: float, lowest: float) -> float:
-        """The error of x by both corrections; infinite where the second cannot be had, or is no smaller."""
+        """The error of x by both corrections; infinite where the second cannot be had."""
         functional, correction = self.functional, self.estimate.correction
         first = functional.norm(self.first)
         second = self.estimate(self.f, bound, enough, lowest)
-        if not (second < SMALL * first or first == 0 and np.isfinite(second)):
+        if not np.isfinite(second):
             return np.inf
+        if first > 0 and second > SMALL * first:
+            return DOUBTFUL * max(first, second) / functional.away()
         self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
         return functional.norm(self.first) / functional.away(correction)
 

@@ -20,11 +20,12 @@ from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.operators import Preconditioner, TrueHessian
 
 MOST = 300  # iterations of a long search
-FOLLOWED = 6  # of a short one
+FOLLOWED = 4  # of a short one
 LEAST = 24  # of a long one that finds nothing
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature four iterations ago: further ones lead down no steeper
-MORE = 1.25  # times the compression of the last long search: time for another
+MORE = 4.0  # times the compression of the last long search: time for another, and sooner if that found less than
+ALLOWED = 0.5  # that the curvature may have lost since, in proportion to the compression
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of three unit directions: one of them is none
 
@@ -47,8 +48,8 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if not self.resists else 0.0
 
-    def exceeds(self, other: "Compression") -> bool:
-        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
+    def exceeds(self, other: "Compression", times: float) -> bool:
+        return self.greatest > times * other.greatest or self.total > times * other.total
 
 
 NONE = Compression(0.0, 0.0, False)
@@ -65,6 +66,7 @@ class LowestCurvature:
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
         self.searched = NONE  # the compression that the last long search was at
+        self.value = 1.0  # that it found
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
         self.basis: np.ndarray | None = None
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
@@ -84,17 +86,21 @@ class LowestCurvature:
         alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
-        at_length = alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched)
+        at_length = alarmed or compression.resists or self.mode is None or self._is_time(compression)
         self._create_arrays()
         if at_length:
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
-            value = self._search_at_length(hint)
+            value = self.value = self._search_at_length(hint)
         else:
             self.basis[0], self.basis[2] = self.mode, self._random()
             self._begin(0, 2)
             value = self._iterate(FOLLOWED, FOLLOWED)
         self.mode = self.basis[0].copy()
         return value, self.mode
+
+    def _is_time(self, compression: Compression) -> bool:
+        """For a long search."""
+        return compression.exceeds(self.searched, min(MORE, ALLOWED / max(1 - self.value, ALLOWED / MORE)))
 
     def _search_at_length(self, hint: PETSc.Vec | None) -> float:
         """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
@@ -159,7 +165,8 @@ class LowestCurvature:
         if size == 1:
             return value
         (value, *_), parts = eigh(*(0.5 * (gram + gram.T)[:size, :size] for gram in grams))
-        first, rest = parts[0, 0], beside(basis, parts[1:, 0])
+        parts = parts[:, 0] * np.copysign(1.0, parts[0, 0])  # so that the way it points does not hang on rounding
+        first, rest = parts[0], beside(basis, parts[1:])
         moved, moved_product = rest @ basis[1:size], rest @ products[1:size]
         basis[0], products[0] = first * basis[0] + moved, first * products[0] + moved_product
         length = self._length(moved)
@@ -206,7 +213,8 @@ class LowestCurvature:
         sizes, parts = np.linalg.eigh(grams[1])
         parts = parts[:, sizes > DEPENDENT * sizes[-1]] / np.sqrt(sizes[sizes > DEPENDENT * sizes[-1]])
         _, best = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
-        self.basis[0] = beside(self.basis, parts @ best[:, 0]) @ span
+        best = parts @ best[:, 0]
+        self.basis[0] = beside(self.basis, best * np.copysign(1.0, best[0])) @ span
 
     def _create_arrays(self) -> None:
         """Mode, residual and last move (3, n), and what H makes of each; vectors of PETSc's over the rows."""
@@ -231,13 +239,13 @@ class LowestCurvature:
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
         saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
-        saved.numbers["knows_mode"] = self.mode is not None
+        saved.numbers |= {"searched_value": self.value, "knows_mode": self.mode is not None}
 
     def restore(self, saved: Saved) -> None:
         """Go on from there; from nothing saved as if no step had been taken."""
         numbers = saved.numbers
         self.searched = Compression(numbers.get("searched_greatest", 0.0), numbers.get("searched_total", 0.0), False)
-        self.mode = None
+        self.value, self.mode = numbers.get("searched_value", 1.0), None
         if numbers.get("knows_mode"):
             rows = beside(self.functional.mass, saved.rows["lowest_mode"])
             self.mode = rows[self.unknowns.free].T.ravel()

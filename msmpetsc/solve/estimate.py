@@ -17,19 +17,19 @@ from msmpetsc.solve.operators import Preconditioner, TrueHessian, python_matrix
 LOOK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
-YOUNG, FALLING = 16, 0.2  # iterations in which the least Ritz value must not fall so much while k doubles: it may soon be less
+LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: nowhere convex is the error then more than three times what was found
 MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; ``correction`` is the e it found."""
+    """Estimates |x - x*|_M of a step; ``correction`` is the e it found, ``residual`` what F - H e is left."""
 
     def __init__(
         self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str
     ):
         self.functional, self.hessian = functional, hessian
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
-        self.correction = self.operator.createVecRight()
+        self.correction, self.residual = self.operator.createVecs()
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
         self.ksp.setType(PETSc.KSP.Type.CG)
@@ -50,14 +50,19 @@ class ErrorEstimate:
         Infinite where the Hessian is not positive definite: there no linear correction tells the way.
         """
         self.enough, self.f, self.bound = enough, f, bound
-        self.lengths, self.leasts = {}, {}  # |e_k|_M and the least Ritz value, by iteration
-        self.close = CLOSE * np.sqrt(min(lowest, 1.0))
+        self.lengths = {}  # |e_k|_M by iteration
+        self.lowest = min(lowest, 1.0)
         self.linearise()
         self.ksp.solve(f, self.correction)
-        if self.ksp.reason <= 0:
-            return np.inf
+        self.length = self._length_found() if self.ksp.reason > 0 else np.inf
+        return self.length
+
+    def _length_found(self) -> float:
+        """|e_k|_M, grown once more as it has since k was half of it; or, where CG was cut short, all that it may be."""
         length, its = self.functional.norm(self.correction), self.ksp.its
-        half = self.lengths.get(its // 2, 0.0)
+        left, half = self._left(), self.lengths.get(its // 2, 0.0)
+        if its >= MOST and left > LEFT * length:
+            return length + left
         return length * max(length / half, 1.0) if half > 0 else length
 
     def linearise(self) -> None:
@@ -74,8 +79,6 @@ class ErrorEstimate:
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if residual == 0 or its >= MOST or length > self.enough:
             return reasons.CONVERGED_ITS
-        if its <= YOUNG:
-            self.leasts[its] = ksp.computeExtremeSingularValues()[1]
         if its % LOOK_EVERY or 4 * its**2 * length < self.bound or length > GROWTH * self.lengths[its // 2]:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
@@ -83,11 +86,16 @@ class ErrorEstimate:
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """In the norm of H, as far as CG can tell."""
         least = ksp.computeExtremeSingularValues()[1]
-        if least < FALLING * self.leasts.get(ksp.its // 2, 0.0):
-            return False
         found = ksp.getSolution().dot(self.f)
-        return min(least, found) > 0 and residual < self.close * np.sqrt(least * found)
+        if not (min(least, found) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * found)):
+            return False
+        return self._left() < LEFT * self.lengths[ksp.its]
+
+    def _left(self) -> float:
+        """No less than what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""
+        self.residual = self.ksp.buildResidual(self.residual)
+        return self.functional.dual_norm(self.residual) / self.lowest
 
     def destroy(self) -> None:
-        for owned in (self.ksp, self.correction, self.operator):
+        for owned in (self.ksp, self.correction, self.residual, self.operator):
             owned.destroy()

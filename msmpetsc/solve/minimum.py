@@ -4,7 +4,6 @@ The estimate of a step's error is the Newton correction e at x. Where a body is 
 between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,9 @@ from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.functional import StepFunctional
 
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there, and that the error
+CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 DOUBTFUL = 30.0  # may be so many times what they say: it was seen 10 times as large in a valley
+SLOPE = 1e-6  # of the direction over |F|_(M^-1): a symmetric body's is rounding
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
@@ -53,13 +54,19 @@ class Minimum:
             self.nearer.axpy(-1.0, self.first)
         functional.gradient_at(self.nearer, self.f)  # functional.q is there from now on
         estimate.linearise()
+        bent = self._bent()
         value, direction = self.curvature.lowest(compression, alarmed, estimate.correction if alarmed else None)
         if value < 0:
             return Finding(np.inf, direction)
-        bound, first = functional.dual_norm(self.f) / min(value, 1.0), functional.norm(self.first)
-        if corrected and bound <= SMALL * first:
-            return Finding(first / functional.away(), None)
-        return Finding(self._second_estimate(bound, enough, value), None)
+        value = min(value, 1.0)
+        if corrected and bent <= SMALL * estimate.length and value > CONVEX:
+            return Finding(estimate.length / functional.away(), None)
+        return Finding(self._second_estimate(functional.dual_norm(self.f) / value, enough, value), None)
+
+    def _bent(self) -> float:
+        """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
+        self.estimate.residual.aypx(-1.0, self.f)
+        return self.functional.dual_norm(self.estimate.residual)
 
     def _second_estimate(self, bound: float, enough: float, lowest: float) -> float:
         """The error of x by both corrections; infinite where the second cannot be had."""
@@ -88,7 +95,9 @@ class Minimum:
         base[:] = functional.q
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
         longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
-        move = -math.copysign(FIRST_MOVE * functional.lattice.cell_size / longest, slope)
+        move = FIRST_MOVE * functional.lattice.cell_size / longest
+        if slope > SLOPE * functional.dual_norm(self.f):  # else both ways lead down alike, and ranks must not differ
+            move = -move
         best = lowest = 0.0
         for _ in range(MOVES):
             self.memory.write(self.f)[:] = self.memory.read(x) + move * direction

@@ -10,7 +10,7 @@ from msmpetsc.solve.functional import StepFunctional
 
 ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
 OF_ONE_ROW = 10.0  # times as much in a single row
-NEGLIGIBLE = 1e-9  # of the body's size: rounding that moves it less is of no concern
+NEGLIGIBLE = 1e-6  # of the body's size: rounding that moves it less is of no concern
 HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
 
 

@@ -2,11 +2,14 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from time import monotonic
 from typing import TextIO
 
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
+from msmpetsc.comm import log
 from msmpetsc.output.progress import duration
 from msmpetsc.study.figures import Row
 
@@ -20,8 +23,10 @@ class StudyProgress:
         self._stream = stream or sys.stderr
         self._begun = monotonic()
         self._bar: tqdm | None = None
+        self._redirected = ExitStack()  # log lines, above the bar
         if self._stream.isatty():
             self._bar = tqdm(total=self._total, initial=done, unit="case", file=self._stream, dynamic_ncols=True)
+            self._redirected.enter_context(logging_redirect_tqdm([log]))
         elif done:
             self._tell(f"{done} of {self._total} cases are done already")
 
@@ -38,6 +43,7 @@ class StudyProgress:
         self._bar.update()
 
     def close(self) -> None:
+        self._redirected.close()
         if self._bar is not None:
             self._bar.close()
 

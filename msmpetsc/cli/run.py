@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import resume
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.describe import log_end, log_model
 from msmpetsc.cli.resume import Resumed
@@ -88,6 +88,8 @@ class ListPresets(argparse.Action):
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
     comm, started = MPI.COMM_WORLD, perf_counter()
+    refuse_other_format("-o", args.output, RESULT_NAMES)
+    refuse_other_format("--measure", args.measure, MEASURE_NAMES)
     earlier = resume.look(comm, args)
     petsc4py.init(["msmpetsc", *args.petsc_options])
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line

@@ -4,11 +4,11 @@ import argparse
 import signal
 from pathlib import Path
 
-from mpi4py import MPI
-
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import refuse_below_one, refuse_name_of_a_file, refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+
+RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -31,8 +31,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; returns the exit status."""
-    refuse_ranks("study")
+    refuse_ranks("study", RUNS_ITSELF)
     refuse_below_one(args, "jobs")
+    refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.study import run_study
@@ -97,9 +98,3 @@ def tell_of(rows: list[dict]) -> None:
 def stop(*_) -> None:
     """A signal to end is Ctrl-C: the runs under way end with this process."""
     raise KeyboardInterrupt
-
-
-def refuse_ranks(command: str) -> None:
-    """Cases start mpiexec themselves."""
-    if MPI.COMM_WORLD.size > 1:
-        raise InputError(f"{command} is started without mpiexec: it starts its runs on as many ranks as they need")

@@ -463,6 +463,13 @@ def test_repeats_become_medians():
     assert together(runs) == {"time_ksp": 2.0, "memory": 7, "true_error": 0.1}
 
 
+def test_the_range_of_the_repeats_is_kept_and_a_single_run_has_none():
+    runs = [{"time_frame": t} for t in (0.3, 0.1, 0.2)]
+    assert together(runs) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+    assert together(runs[:1]) == {"time_frame": 0.3}
+    assert together([*runs[:2], {}]) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+
+
 # Plans
 
 

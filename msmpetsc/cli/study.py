@@ -86,11 +86,14 @@ def tell_cases(args: argparse.Namespace, folder: Path) -> None:
 def tell_of(rows: list[dict]) -> None:
     """What to look at: cases that failed; and of each map how it went, for there failing is an answer."""
     from msmpetsc.study.outcome import counted
-    from msmpetsc.study.rows import mapped, swept
+    from msmpetsc.study.rows import mapped, swept, timed
 
     failed = sum(row["status"] != "ok" for row in swept(rows))
     if failed:
         log.warning("%d case%s without figures: see the column reason", failed, "s" * (failed > 1))
+    once = timed(row for row in swept(rows) if row["repeats"] == 1)
+    if once:
+        log.info("%d case%s run once: how much their times vary is not known", len(once), "s were" if len(once) > 1 else " was")
     for name, group in mapped(rows).items():
         log.info("map %s: %s", name, counted(group))
 

@@ -76,4 +76,6 @@ def _outcome(row: Row) -> str:
     errors = {"step": row.get("true_error"), "trajectory": row.get("trajectory_error")}
     told = [f"{name} error {value:.1e}" for name, value in errors.items() if value is not None]
     time = row.get("time_frame")
-    return "  ".join([f"{time:.3g} s a step" if time else "no step", *told, *filter(None, [row["reason"]])])
+    low, high = row.get("time_frame_min"), row.get("time_frame_max")
+    range_of_repeats = f" ({low:.3g} to {high:.3g})" if low is not None and high is not None else ""
+    return "  ".join([f"{time:.3g} s a step{range_of_repeats}" if time else "no step", *told, *filter(None, [row["reason"]])])

@@ -11,9 +11,11 @@ from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 
+from msmpetsc.cli.describe import log_model, taken
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body
+from msmpetsc.model.reach import Reach
 from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
@@ -166,16 +168,30 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if "compiling" not in line]
     said = [line.removeprefix("msmpetsc: note: ") for line in lines if line.startswith("msmpetsc:")]
-    assert said[:4] == [
-        "body of 0.5 x 0.5 x 0.25 m; its surface is closed",
-        f"32 cells of 0.125 m, 75 nodes, 554 springs on {ranks} rank{'s' * (ranks > 1)}",
-        "lattice: 0.0625 m^3, 62.5 kg; mesh: 0.0625 m^3, 62.5 kg",
-        "15 nodes pinned, anchor.0 leads 15, force.0 pulls 45 (15 of them held)",
+    assert said[:3] == [
+        "body of 0.5 x 0.5 x 0.25 m; closed mesh of 0.0625 m^3, 62.5 kg; lattice of 0.0625 m^3, 62.5 kg",
+        f"32 cells of 0.125 m, 75 nodes (15 pinned), 554 springs on {ranks} rank{'s' * (ranks > 1)}",
+        "anchor.0 leads 15 nodes, force.0 pulls 45 nodes (15 of them held)",
     ]
-    assert lines[:4] == [f"msmpetsc: note: {line}" for line in said[:4]] and lines[4].startswith("frame 0/2")
-    assert len(said) == 6 and said[4].startswith("took ") and said[4].endswith(" s of it before the first step")
-    assert said[5].startswith(f"left 3 frames in {out} (") and f"{out.with_suffix('.xdmf')} (" in said[5]
-    assert f"{tmp_path / 'cost.json'} (" in said[5] and ".png" not in said[5]
+    assert lines[:3] == [f"msmpetsc: note: {line}" for line in said[:3]] and lines[3].startswith("frame 0/2")
+    assert len(said) == 5 and said[3].startswith("took ") and said[3].endswith(" s of it before the first step")
+    assert said[4].startswith(f"left 3 frames in {out} (") and f"{out.with_suffix('.xdmf')} (" in said[4]
+    assert f"{tmp_path / 'cost.json'} (" in said[4] and ".png" not in said[4]
+
+
+def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
+    """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half the density."""
+    half = {"region": {"box": [[0, 0, 0], [0.25, 1, 1]]}, "density": 500.0}
+    scene = load_scene(block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half]))
+    log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
+    told = "body of 0.45 x 0.45 x 0.2 m; closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg"
+    assert heard()[0] == ("INFO", told)
+
+
+def test_of_many_tables_the_first_are_named():
+    reaches = [Reach(f"force.{number}", 5, 0) for number in range(20)]
+    assert taken(reaches)[-2:] == ["force.11 pulls 5 nodes", "and 8 more"] and len(taken(reaches)) == 13
+    assert len(taken(reaches[:13])) == 13
 
 
 def test_an_open_mesh_has_no_volume_to_say(tmp_path):
@@ -183,8 +199,8 @@ def test_an_open_mesh_has_no_volume_to_say(tmp_path):
     box = trimesh.load(tmp_path / "scene.ply")
     trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "scene.ply")
     done = run(1, "-m", "msmpetsc.cli.main", "run", scene, "-o", tmp_path / "x.h5")
-    assert "body of 0.5 x 0.5 x 0.25 m; its surface is open, 3 boundary edges" in done.stderr
-    assert "lattice: 0.0625 m^3, 62.5 kg; mesh: unknown, for it is open" in done.stderr
+    mesh = "open mesh (3 boundary edges), its volume unknown"
+    assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
 
 
 def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):

@@ -21,18 +21,21 @@ def log_model(comm: MPI.Comm, model: "Model") -> None:
     """Size of the body, counts of the lattice, volumes and masses side by side, nodes that the scene's tables take
     (collective)."""
     lattice, body = model.lattice, model.body
-    own = len(lattice.cells), lattice.springs_owned, int(lattice.pinned[: lattice.owned].sum()), float(lattice.mass.sum())
+    held = int(lattice.pinned[: lattice.owned].sum())
+    own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum())
     cells, springs, pinned, mass = (comm.allreduce(number) for number in own)
-    surface = "closed" if body.report.closed else f"open, {body.report.boundary_edges} boundary edges"
-    log.info("body of %s m; its surface is %s", sides(body.bounds[1] - body.bounds[0]), surface)
-    log.info(
-        "%d cells of %.4g m, %d nodes, %d springs on %d rank%s",
-        cells, lattice.cell_size, lattice.table.total, springs, comm.size, "s" * (comm.size > 1),
-    )  # fmt: skip
     volume, enclosed = cells * lattice.cell_size**3, abs(body.report.volume)
-    of_mesh = f"{enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg" if body.report.closed else "unknown, for it is open"
-    log.info("lattice: %.4g m^3, %.4g kg; mesh: %s", volume, mass, of_mesh)
-    log.info("%s", ", ".join([f"{pinned} node{'s' * (pinned != 1)} pinned", *taken(model.reaches)]))
+    mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
+    if body.report.closed:
+        mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
+    size = sides(body.bounds[1] - body.bounds[0])
+    log.info("body of %s m; %s; lattice of %.4g m^3, %.4g kg", size, mesh, volume, mass)
+    log.info(
+        "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
+        cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
+    )  # fmt: skip
+    if named := taken(model.reaches):
+        log.info("%s", ", ".join(named))
 
 
 def sides(lengths: Iterable[float]) -> str:
@@ -45,9 +48,10 @@ def taken(reaches: Iterable["Reach"]) -> list[str]:
     named = []
     for reach in reaches:
         if reach.key.startswith("anchor"):
-            named.append(f"{reach.key} leads {reach.nodes - reach.held}")
+            named.append(f"{reach.key} leads {reach.nodes - reach.held} nodes")
         elif reach.key.startswith("force"):
-            named.append(f"{reach.key} pulls {reach.nodes}" + (f" ({reach.held} of them held)" if reach.held else ""))
+            held = f" ({reach.held} of them held)" if reach.held else ""
+            named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
     more = len(named) - MOST_NAMED
     return named if more <= 1 else [*named[:MOST_NAMED], f"and {more} more"]
 

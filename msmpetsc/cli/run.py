@@ -136,7 +136,8 @@ def run(args: argparse.Namespace) -> int:
         on_root(comm, lambda: write_beside(path))  # the frames before the failure are worth a look
         if args.measure:
             cost.write(args.measure, failure)
-        on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, files_of(path, args)))
+        left = files_of(path, args, whole=False)
+        on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, left))
         raise
     if args.measure:
         cost.write(args.measure)
@@ -144,7 +145,8 @@ def run(args: argparse.Namespace) -> int:
         on_root(comm, lambda: write_beside(path))
     else:
         on_root(comm, lambda: finish(path, args))
-    on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, files_of(path, args)))
+    left = files_of(path, args, whole=not stopped)
+    on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, left))
     if stopped:
         return tell_stop(stopped, path, simulation)
     simulation.refuse_unused_options(at_end=True)
@@ -238,7 +240,7 @@ def attributes(comm: MPI.Comm, scene: Scene, args: argparse.Namespace) -> dict:
     }
 
 
-def files_of(path: Path, args: argparse.Namespace) -> list[Path]:
-    """What a run may have left: the result first."""
-    beside = [path.with_suffix(".xdmf"), *([path.with_suffix(".png")] if args.picture else [])]
+def files_of(path: Path, args: argparse.Namespace, whole: bool) -> list[Path]:
+    """What a run leaves: the result first; a picture is drawn of a ``whole`` one."""
+    beside = [path.with_suffix(".xdmf"), *([path.with_suffix(".png")] if args.picture and whole else [])]
     return [path, *beside, *([args.measure] if args.measure else [])]

@@ -93,7 +93,8 @@ def tell_of(rows: list[dict]) -> None:
         log.warning("%d case%s without figures: see the column reason", failed, "s" * (failed > 1))
     once = timed(row for row in swept(rows) if row["repeats"] == 1)
     if once:
-        log.info("%d case%s run once: how much their times vary is not known", len(once), "s were" if len(once) > 1 else " was")
+        count = f"{len(once)} cases were" if len(once) > 1 else "1 case was"
+        log.info("%s run once: how much their times vary is not known", count)
     for name, group in mapped(rows).items():
         log.info("map %s: %s", name, counted(group))
 

@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import reduce
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -34,8 +36,8 @@ class Reach:
 
 def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndarray]:
     """The nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
-    tables = [(kind, number, table) for kind in ("pin", "anchor", "force") for number, table in enumerate(getattr(scene, kind))]
-    return {f"{kind}.{number}": finder.find(f"{kind}.{number}", table.region, lattice) for kind, number, table in tables}
+    tables = dict(chain.from_iterable(_keyed(scene, kind) for kind in ("pin", "anchor", "force")))
+    return {key: finder.find(key, table.region, lattice) for key, table in tables.items()}
 
 
 def reach_of(
@@ -60,7 +62,8 @@ def reach_of(
         where = found[f"anchor.{number}"]
         reach = Reach(f"anchor.{number}", count(where), count(where & ~anchor.where))
         reaches.append(reach)
-        alike = reduce(np.logical_or, (a.where for a in anchors[:number] if _leads_alike(a, anchor)), np.zeros_like(pinned))
+        same = (before.where for before in anchors[:number] if _leads_alike(before, anchor))
+        alike = reduce(np.logical_or, same, np.zeros_like(pinned))
         _tell_overruled(reach, count(where & pinned), count(where & ~anchor.where & ~pinned & ~alike))
     for number, force in enumerate(scene.force):
         where = found[f"force.{number}"]
@@ -127,21 +130,21 @@ def _warn_of_idle_parts(
 
 def _note_what_never_acts(scene: Scene) -> None:
     """Of forces and obstacles that are there at the end of no step."""
-    for key, table in _timed(scene):
-        if _acts_in_a_step(table, scene.time):
+    time = scene.time
+    for key, table in chain(_keyed(scene, "force"), _keyed(scene, "obstacle")):
+        if _acts_in_a_step(table, time):
             continue
         until = "on" if table.stop is None else f"to {table.stop:g} s"
-        late = table.start > scene.time.duration
-        tell = log.info if late else log.warning
-        tell(
-            "%s acts in no step: it is there from %g s %s, %s", key, table.start, until,
-            f"and the run ends at {scene.time.duration:g} s" if late else f"between the ends of steps of {scene.time.step:g} s",
-        )  # fmt: skip
+        told = f"{key} acts in no step: it is there from {table.start:g} s {until}"
+        if table.start > time.duration:  # as --frames has it, too
+            log.info("%s, and the run ends at %g s", told, time.duration)
+        else:
+            log.warning("%s, between the ends of steps of %g s", told, time.step)
 
 
-def _timed(scene: Scene) -> Iterator[tuple[str, Force | Obstacle]]:
-    for kind in ("force", "obstacle"):
-        yield from ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
+def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:
+    """The tables of a kind, each with its key: ("force.0", ...)."""
+    return ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
 
 
 def _acts_in_a_step(table: Force | Obstacle, time: Time) -> bool:

@@ -78,4 +78,5 @@ def _outcome(row: Row) -> str:
     time = row.get("time_frame")
     low, high = row.get("time_frame_min"), row.get("time_frame_max")
     range_of_repeats = f" ({low:.3g} to {high:.3g})" if low is not None and high is not None else ""
-    return "  ".join([f"{time:.3g} s a step{range_of_repeats}" if time else "no step", *told, *filter(None, [row["reason"]])])
+    stepping = f"{time:.3g} s a step{range_of_repeats}" if time else "no step"
+    return "  ".join([stepping, *told, *filter(None, [row["reason"]])])

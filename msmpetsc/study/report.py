@@ -23,12 +23,14 @@ from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, cost_of, 
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
 from msmpetsc.study.outcome import counted
-from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept, timed
+from msmpetsc.study.rows import (
+    NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept, timed,
+)  # fmt: skip
 from msmpetsc.study.spread import UNKNOWN, is_known
 
 PRINTED = {
-    "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_frame_min",
-    "time_frame_max", "time_second",
+    "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame",
+    "time_frame_min", "time_frame_max", "time_second",
     "ksp_its", "memory", "true_error", "trajectory_error",
 }  # fmt: skip
 NOT_PRINTED = {*TEXT, *NUMBERS} - PRINTED
@@ -141,8 +143,9 @@ def overview(charts: list[Chart]) -> str:
         for chart in charts for name, best in chart.cheapest.items()
     ]  # fmt: skip
     known = all(is_known(best) for chart in charts for levels in chart.cheapest.values() for best in levels)
-    note = f"The cheapest measured method{', then those whose repeats overlap with its own' if known else ''}; for the step "
-    note += "error with its time a frame, for the trajectory error with its time a simulated second and its time step."
+    note = f"The cheapest measured method{', then those whose repeats overlap with its own' if known else ''}; for the "
+    note += "step error with its time a frame, for the trajectory error with its time a simulated second and its "
+    note += "time step."
     caption = f"<p class='caption'>{escape(note if known else f'{note} {UNKNOWN}')}</p>"
     cells = [[(text, text) for text in line] for line in lines]
     return f"<section class='overview'><h2>At a glance</h2>{caption}{html_table(head, cells)}</section>"

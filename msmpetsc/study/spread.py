@@ -5,7 +5,10 @@ from collections.abc import Callable, Iterable
 from msmpetsc.study.rows import Row
 
 Cost = Callable[[Row], float]
-UNKNOWN = "Each was run once: how much its time varies is not known, so that close times decide nothing; repeats = 3 would tell."
+UNKNOWN = (
+    "Each was run once: how much its time varies is not known, so that close times decide nothing; "
+    "repeats = 3 would tell."
+)
 
 
 def spread(row: Row, cost: Cost) -> tuple[float, float] | None:

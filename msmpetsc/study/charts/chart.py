@@ -40,7 +40,8 @@ class Point:
 class Chart:
     """name: of its file; kind: the heading it stands under; points: by panel, then by the id of
     the group of marks in the SVG that stands for them, in its order;
-    findings: lines in plain words by their heading; cheapest: by kind of error, for each level of it the row that wins and those within its noise."""
+    findings: lines in plain words by their heading; cheapest: by kind of error, for each level of it the row that wins
+    and those within its noise."""
 
     name: str
     kind: str

@@ -126,7 +126,8 @@ def overtaken(curve: str, group: list[Row], iterative: list[Row]) -> str:
         row, rival = pairs[-1]
         cells = wording.count(row["cells"])
         if not is_below(rival, row, FPS):
-            return f"{curve} and {rival['curve']} are as fast within their noise at {cells} cells, the most measured ({duel(row, rival)})."
+            both = f"{curve} and {rival['curve']} are as fast within their noise"
+            return f"{both} at {cells} cells, the most measured ({duel(row, rival)})."
         return f"{curve} is still faster at {cells} cells, the most measured ({duel(row, rival)})."
     row, rival = won[0]
     start = f"{'' if slower else 'at every cell count measured, '}from {wording.count(row['cells'])} cells on"

@@ -18,8 +18,8 @@ from msmpetsc.study.spread import ends
 KIND = "Growth with the number of cells"
 CAPTION = (
     "A level curve means a cost in proportion to the cells; a rising one grows faster than the body. Memory is the "
-    "peak of all ranks, the program itself and the surface mesh included. Whiskers reach from the least to the greatest of "
-    "the repeats."
+    "peak of all ranks, the program itself and the surface mesh included. Whiskers reach from the least to the "
+    "greatest of the repeats."
 )
 
 

@@ -24,8 +24,8 @@ FRONT = "Pareto front"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
     "small and hollow. Whiskers reach from the least to the greatest of the repeats, whose median is the point. Ringed "
-    "points on the grey stair are the Pareto front: nothing measured is both cheaper and more exact, errors taken to two "
-    "digits. The step error is that of solving a step; the trajectory error is that of the "
+    "points on the grey stair are the Pareto front: nothing measured is both cheaper and more exact, errors taken to "
+    "two digits. The step error is that of solving a step; the trajectory error is that of the "
     "whole motion, time step included."
 )
 

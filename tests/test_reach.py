@@ -1,5 +1,6 @@
 """What a run says at its start: what takes which nodes, what has no effect, and a body of an odd size."""
 
+import json
 import logging
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import trimesh
 from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
+from test_cli import IN_ONE_PROCESS
 
 from msmpetsc.cli.describe import log_model, taken
 from msmpetsc.cli.main import main
@@ -243,3 +245,31 @@ def test_a_wait_for_the_compiler_is_told_once_and_only_where_there_is_one(tmp_pa
     assert said("f8") == "compiling kernels, once, about a minute\n"
     assert said("f8") == ""
     assert said("f8", "f4", "i4") == "compiling kernels, once\n"  # for other types
+
+
+def test_ranks_refuse_and_warn_as_one(tmp_path):
+    """Nodes of a region may all lie on one of the ranks."""
+    block_scene(tmp_path, time=TIME)
+    tables = {
+        "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
+        "it leads none": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "anchor.1": {"region": LEFT, "path": ASIDE}},
+        "part.0 has no effect": {"part.0": {"region": LEFT_CELLS, "density": 500.0}, "pin.0.region": TWO_LAYERS},
+    }
+    commands = [
+        ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]
+        + [word for key, value in given.items() for word in ("--set", f"{key}={toml(value)}")]
+        for number, given in enumerate(tables.values())
+    ]
+    done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands))
+    assert done.returncode == 0, done.stderr
+    for words, status, line in zip(tables, (2, 2, 0), done.stdout.splitlines(), strict=True):
+        answers = json.loads(line)
+        assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
+        assert answers[0][1].count(words) == 1
+
+
+def toml(value) -> str:
+    """Inline."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + "}"
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list) else str(value)

@@ -66,12 +66,12 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
     lattice = build_lattice(
         cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening, of_cells
     )
-    found = regions(scene, lattice, finder)
-    lattice = lattice.pin(_any_of(found, "pin", lattice.pinned))
-    anchors = _anchors(scene, lattice, found)
+    masks = regions(scene, lattice, finder)
+    lattice = lattice.pin(_any_of(masks, "pin", lattice.pinned))
+    anchors = _anchors(scene, lattice, masks)
     held = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, held, anchors)
-    reaches = reach_of(comm, scene, lattice, anchors, found, finder)
+    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     embedding = None
     if scene.output.surface:
         points = np.empty((0, 3)) if body.surface is None else body.surface.points
@@ -80,7 +80,7 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
         body.surface,
         lattice,
         embedding,
-        _loads(comm, scene, lattice, found),
+        _loads(comm, scene, lattice, masks),
         anchors,
         _reflections(scene),
         _penalties(comm, scene, lattice, body),
@@ -134,16 +134,16 @@ def fill_cages(body: Body, scene: Scene) -> Cages:
     return fill(body, cell_size, cages.method, cages.max_cells)
 
 
-def _any_of(found: Regions, kind: str, where: np.ndarray) -> np.ndarray:
+def _any_of(masks: Regions, kind: str, where: np.ndarray) -> np.ndarray:
     """(l,) bool: the nodes of all regions of this kind, and those of ``where``."""
-    return reduce(np.logical_or, (nodes for key, nodes in found.items() if key.startswith(kind)), where)
+    return reduce(np.logical_or, (nodes for key, nodes in masks.items() if key.startswith(kind)), where)
 
 
-def _anchors(scene: Scene, lattice: Lattice, found: Regions) -> list[Anchor]:
+def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
     """A pin is stronger than an anchor, and of two anchors on a node the first."""
     anchors, taken = [], lattice.pinned
     for number, anchor in enumerate(scene.anchor):
-        where = found[f"anchor.{number}"] & ~taken
+        where = masks[f"anchor.{number}"] & ~taken
         anchors.append(Anchor(where, Path.through(anchor.path), anchor.stop))
         taken = taken | where
     return anchors
@@ -155,12 +155,12 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, held: np.ndarr
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
 
 
-def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, found: Regions) -> list[Load]:
+def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> list[Load]:
     loads = []
     if scene.gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
     for number, force in enumerate(scene.force):
-        where = found[f"force.{number}"][: lattice.owned]
+        where = masks[f"force.{number}"][: lattice.owned]
         loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
 

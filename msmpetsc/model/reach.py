@@ -41,7 +41,7 @@ def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndar
 
 
 def reach_of(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], found: Regions, finder: Finder
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions, finder: Finder
 ) -> tuple[Reach, ...]:
     """Of pins, anchors and forces in this order; warns of what is overruled (collective).
 
@@ -55,18 +55,18 @@ def reach_of(
 
     reaches, pinned = [], np.zeros_like(lattice.pinned)
     for number in range(len(scene.pin)):
-        where = found[f"pin.{number}"]
+        where = masks[f"pin.{number}"]
         reaches.append(Reach(f"pin.{number}", count(where), count(where & pinned)))
         pinned = pinned | where
     for number, anchor in enumerate(anchors):
-        where = found[f"anchor.{number}"]
+        where = masks[f"anchor.{number}"]
         reach = Reach(f"anchor.{number}", count(where), count(where & ~anchor.where))
         reaches.append(reach)
         same = (before.where for before in anchors[:number] if _leads_alike(before, anchor))
         alike = reduce(np.logical_or, same, np.zeros_like(pinned))
-        _tell_overruled(reach, count(where & pinned), count(where & ~anchor.where & ~pinned & ~alike))
+        _warn_of_overruled(reach, count(where & pinned), count(where & ~anchor.where & ~pinned & ~alike))
     for number, force in enumerate(scene.force):
-        where = found[f"force.{number}"]
+        where = masks[f"force.{number}"]
         reach = Reach(f"force.{number}", count(where), count(where & _held_while(force, lattice.pinned, anchors)))
         reaches.append(reach)
         if reach.held == reach.nodes and any(force.total):
@@ -85,16 +85,16 @@ def _leads_alike(one: Anchor, other: Anchor) -> bool:
     return same and np.array_equal(one.path.displacements, other.path.displacements) and one.stop == other.stop
 
 
-def _tell_overruled(reach: Reach, pinned: int, led: int) -> None:
+def _warn_of_overruled(reach: Reach, pinned: int, led: int) -> None:
     """Of an anchor's nodes so many are pinned, and so many led another way by earlier anchors."""
     why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
     why += [f"{led} {'is' if led == 1 else 'are'} led by an anchor before it"] if led else []
     if not why:
         return
-    told = f"{reach.key}: of the {_nodes(reach.nodes)} in its region {' and '.join(why)}"
+    text = f"{reach.key}: of the {_nodes(reach.nodes)} in its region {' and '.join(why)}"
     if pinned + led == reach.nodes:
-        raise InputError(f"{told}: it leads none")
-    log.warning("%s, which it does not lead", told)
+        raise InputError(f"{text}: it leads none")
+    log.warning("%s, which it does not lead", text)
 
 
 def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.ndarray:
@@ -135,11 +135,11 @@ def _note_what_never_acts(scene: Scene) -> None:
         if _acts_in_a_step(table, time):
             continue
         until = "on" if table.stop is None else f"to {table.stop:g} s"
-        told = f"{key} acts in no step: it is there from {table.start:g} s {until}"
+        text = f"{key} acts in no step: it is there from {table.start:g} s {until}"
         if table.start > time.duration:  # as --frames has it, too
-            log.info("%s, and the run ends at %g s", told, time.duration)
+            log.info("%s, and the run ends at %g s", text, time.duration)
         else:
-            log.warning("%s, between the ends of steps of %g s", told, time.step)
+            log.warning("%s, between the ends of steps of %g s", text, time.step)
 
 
 def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:

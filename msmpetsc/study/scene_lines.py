@@ -30,14 +30,14 @@ def lines(method: Method) -> str:
 
 def overrides(scene: Path, method: Method) -> list[str]:
     """The same as changes of the scene file, as --set takes them. Raises InputError for a file that is no TOML."""
-    (_, document), found = read_toml(scene), []
+    (_, document), changes = read_toml(scene), []
     for name, table in tables(method).items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):
-            found.append(f"{name}={inline(given | table)}")  # --set changes keys, and takes none away
+            changes.append(f"{name}={inline(given | table)}")  # --set changes keys, and takes none away
         else:
-            found += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
-    return found
+            changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
+    return changes
 
 
 def put_into(scene: Path, method: Method) -> None:

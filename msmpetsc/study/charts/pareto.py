@@ -196,14 +196,14 @@ def finding(measure: Measure, level: float, best: list[Row]) -> str:
     reached = wording.error(row[measure.error])
     step = f", {stepping(row)}" if measure is TRAJECTORY else ""
     asked = f"asked for {wording.error(row['error'])}, " if row["error"] else ""
-    told = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
+    sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
     if not others:
-        return f"{told}."
+        return f"{sentence}."
     near = ", ".join(f"{other['label']} {cost_of(other, measure)}" for other in others)
-    return f"{told}; within its noise: {near}."
+    return f"{sentence}; within its noise: {near}."
 
 
 def cost_of(row: Row, measure: Measure) -> str:
     """34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
-    cost, found = wording.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
-    return f"{cost} [{' to '.join(map(wording.seconds, found))}]" if found else cost
+    cost, repeats_range = wording.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
+    return f"{cost} [{' to '.join(map(wording.seconds, repeats_range))}]" if repeats_range else cost

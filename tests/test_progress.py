@@ -1,13 +1,16 @@
 """Progress on a terminal and in a batch log."""
 
 import io
+import logging
 
 import numpy as np
 import pytest
 
+from msmpetsc.comm import log
 from msmpetsc.model.frame import Frame
 from msmpetsc.output import progress
 from msmpetsc.output.progress import Progress
+from msmpetsc.study.progress import StudyProgress
 
 
 def frame(index: int) -> Frame:
@@ -84,3 +87,27 @@ def test_other_ranks_are_silent(kind):
     shown.update(frame(10))
     shown.close()
     assert stream.getvalue() == ""
+
+
+@pytest.mark.parametrize("shown", [lambda: Progress(10), lambda: StudyProgress([1.0] * 10)], ids=["run", "study"])
+def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch, shown):
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    handlers = [logging.StreamHandler(terminal)]
+    monkeypatch.setattr(log, "handlers", handlers)
+    bar = shown()
+    log.warning("a cell is inside out")
+    bar.close()
+    log.warning("afterwards")
+    screen = terminal.getvalue().split("\n")
+    assert screen[0].split("\r")[-1] == "a cell is inside out"  # the bar before it was wiped out
+    assert "0/10" in screen[1] and screen[-2] == "afterwards"
+    assert log.handlers is handlers
+
+
+def test_in_a_batch_log_there_is_nothing_to_keep_whole(monkeypatch):
+    handlers = [logging.StreamHandler(io.StringIO())]
+    monkeypatch.setattr(log, "handlers", handlers)
+    shown = Progress(10, stream=io.StringIO())
+    assert log.handlers is handlers
+    shown.close()

@@ -347,3 +347,44 @@ def test_without_opengl_one_line_names_the_package(result, tmp_path):
     assert done.returncode == 1
     assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
     assert "WARN" not in done.stderr
+
+
+@pytest.fixture
+def drawing(result, tmp_path, monkeypatch):
+    """What a sheet of frames 0 and 8 is drawn from: panels, triangles, camera."""
+    with monkeypatch.context() as patch:
+        patch.setattr(render, "draw", lambda *given: calls.append(given))
+        calls = []
+        render.contact_sheet(result, tmp_path / "x.png", frames=[0, 8])
+    return calls[0][:3]
+
+
+def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
+    """Wider than the 8192 pixels at which Mesa's pictures end."""
+    panels, triangles, camera = drawing
+    render.draw(13 * panels, triangles, camera, tmp_path / "x.png")
+    drawn = np.array(Image.open(tmp_path / "x.png"))
+    assert drawn.shape[1] > 8192
+    sheets = np.split(drawn, 26, axis=1)
+    for first, other in zip(sheets[:2] * 12, sheets[2:]):
+        np.testing.assert_array_equal(other, first)
+    assert body_rows(sheets[1])[0] > body_rows(sheets[0])[0] > 0
+
+
+def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
+    panels, triangles, camera = drawing
+    with pytest.raises(InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"):
+        render.draw(100 * panels, triangles, camera, tmp_path / "y.png")
+    monkeypatch.setattr(render, "WIDEST", 2000)
+    monkeypatch.setattr(render, "surface_points", lambda *_: pytest.fail("a surface was read"))
+    for options in ({"count": 10**9}, {"frames": list(range(11))}):
+        with pytest.raises(InputError, match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000"):
+            render.contact_sheet(result, tmp_path / "y.png", **options)
+    assert not (tmp_path / "y.png").exists()
+
+
+def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
+    monkeypatch.setattr(render.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(InputError, match="y.png cannot be drawn: the graphics library gives a black picture"):
+        render.draw(*drawing, tmp_path / "y.png")
+    assert not (tmp_path / "y.png").exists()

@@ -16,8 +16,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cell_sweep import curves
 from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
+from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import looks
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts, winners
 from msmpetsc.study.report import write_report
 from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, succeeded, typed
 
@@ -159,6 +160,82 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
     assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
     assert step[3] == "1e-6 or less: nothing measured reaches it."
     assert trajectory[2] == "1e-3 or less: verlet, 2 s a simulated second (reached 4e-4, substeps of 1 ms)."
+
+
+def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
+    return case(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
+
+
+NOISY = [  # of those that reach 1e-2 the first overlaps with two others, not with the fourth
+    repeated("newton", 0.009, 0.010, 0.021, true_error=4e-3, trajectory_error=0.05),
+    repeated("pipecg", 0.009, 0.012, 0.022, true_error=4e-3, trajectory_error=0.05),
+    repeated("anderson", 0.020, 0.028, 0.037, true_error=5e-3, trajectory_error=0.05),
+    repeated("anderson", 0.014, 0.029, 0.037, error=1e-4, true_error=1e-4, trajectory_error=0.05),
+    repeated("lbfgs", 0.022, 0.030, 0.031, true_error=1e-4, trajectory_error=0.05),
+]
+
+
+def test_the_cheapest_names_all_within_its_noise():
+    rows = succeeded(typed_rows(*NOISY))
+    assert [row["label"] for row in winners(rows, STEP, 1e-2)] == ["newton", "pipecg", "anderson"]
+    assert [row["label"] for row in winners(rows, STEP, 1e-3)] == ["anderson", "lbfgs"]
+    assert winners(rows, STEP, 1e-6) == []
+    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
+    assert step[1] == (
+        "1e-2 or less: newton, 10 ms [9 ms to 21 ms] a frame (reached 4e-3); "
+        "within its noise: pipecg 12 ms [9 ms to 22 ms], anderson 28 ms [20 ms to 37 ms]."
+    )
+    assert "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0]
+    assert len(step) == 4  # no word of unknown noise
+
+
+def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_path: Path, text: str):
+    rows = succeeded(typed_rows(*ERRORS))
+    assert [row["label"] for row in winners(rows, STEP, 1e-1)] == ["anderson"]
+    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    unknown = "Each was run once: how much its time varies is not known"
+    assert all(lines[-1].startswith(unknown) for lines in chart.findings.values())
+    assert f"<dt>Repeats</dt><dd>1. {unknown}" in text
+    page = spaced(write_report(write_table(tmp_path, NOISY)).read_text())
+    assert unknown not in page and "<dt>Repeats</dt><dd>3: times are medians" in page
+
+
+def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
+    rows = typed_rows(*NOISY, *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm") for n, t in ((10, 0.1), (99, 1.0))))
+    named = looks(row["label"] for row in rows)
+    (pareto,), (figure6,), (growth,) = pareto_charts(rows, named), figure6_charts(rows, named), growth_charts(rows, named)
+
+    def whiskers(axes) -> set:
+        found = [path.vertices for lines in axes.collections for path in lines.get_paths()]
+        return {tuple(round(end, 9) for end in sorted(path[:, 1])) for path in found}
+
+    assert whiskers(pareto.figure.axes[0]) == {(0.009, 0.021), (0.009, 0.022), (0.02, 0.037), (0.014, 0.037), (0.022, 0.031)}
+    assert (0.9, 2.1) in whiskers(pareto.figure.axes[1])
+    assert whiskers(figure6.figure.axes[0]) == {(round(1 / 0.3, 9), 20.0), (round(1 / 3.0, 9), 2.0)}
+    assert whiskers(growth.figure.axes[0]) == {(0.005, 0.03), (round(0.5 / 99, 9), round(3 / 99, 9))}
+    for figure in (pareto, figure6, growth):
+        for axes in figure.figure.axes:
+            low, high = axes.get_ylim()
+            assert all(low <= end <= high for ends in whiskers(axes) for end in ends)
+    assert "least of the repeats: 9 ms\ngreatest of the repeats: 21 ms" in spaced(str(next(iter(pareto.points["over the step error, time step 10\N{NO-BREAK SPACE}ms"].values()))[0]))
+    once = pareto_charts(typed_rows(*ERRORS), looks(row["label"] for row in ERRORS))[0]
+    assert not any(whiskers(axes) for axes in once.figure.axes)
+
+
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [((0.4, 0.6), "cg is faster than cholesky from 100,000 cells on"), ((0.4, 2.5), "cholesky and cg are as fast within their noise")],
+)
+def test_within_the_noise_nothing_overtakes(ends: tuple[float, float], expected: str):
+    rows = [
+        repeated("cholesky", 1.9, 2.0, 2.1, scene="bunny", cells=100000, preset="fast-msm"),
+        repeated("cholesky", 0.009, 0.01, 0.02, scene="bunny", cells=1000, preset="fast-msm"),
+        *(repeated("cg", ends[0], 0.5, ends[1], scene="bunny", cells=n) for n in (1000, 100000)),
+    ]
+    (chart,) = figure6_charts(typed_rows(*rows), looks(["cholesky", "cg"]))
+    ((line,),) = chart.findings.values()
+    assert line.startswith(expected)
 
 
 def test_what_failed_is_listed_and_counts_nowhere():

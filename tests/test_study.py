@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -21,11 +22,12 @@ from msmpetsc.cli.main import main
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.frames import ResultFile
+from msmpetsc.scene_reading import load_scene
 from msmpetsc.study import case, measure
 from msmpetsc.study.figures import of_frames, together
 from msmpetsc.study.plan import Method, Trial, cheapest, plan_step, plan_trajectory
 from msmpetsc.study.reading import load_study
-from msmpetsc.study.scene_lines import put_into
+from msmpetsc.study.scene_lines import overrides, put_into
 from msmpetsc.study.study import Part, list_study, run_study
 from msmpetsc.study.sweep import cases
 from msmpetsc.study.table import COLUMNS, read_table, write_table
@@ -461,6 +463,13 @@ def test_repeats_become_medians():
     assert together(runs) == {"time_ksp": 2.0, "memory": 7, "true_error": 0.1}
 
 
+def test_the_range_of_the_repeats_is_kept_and_a_single_run_has_none():
+    runs = [{"time_frame": t} for t in (0.3, 0.1, 0.2)]
+    assert together(runs) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+    assert together(runs[:1]) == {"time_frame": 0.3}
+    assert together([*runs[:2], {}]) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+
+
 # Plans
 
 
@@ -566,10 +575,33 @@ def test_the_command_tells_the_answer_and_writes_it(
     told = capsys.readouterr().out
     if status == 0:
         assert "step = 0.005 " in path.read_text() and "# how" in path.read_text()
-        assert f"msmpetsc run {path} -pc_type icc" in told and 'preset = "newton"' in told
+        command = next(line for line in told.splitlines() if line.startswith("msmpetsc run "))
+        assert shlex.split(command)[:3] == ["msmpetsc", "run", str(path)] and command.endswith(" -pc_type icc")
+        assert "--set time.step=0.005 " in command and 'preset = "newton"' in told
     else:
         assert path.read_text() == COMMENTED
         assert "nothing tried meets 0.05" in told and "1.0e-01" in told
+
+
+BEFORE = {
+    "bare": "time = { step = 0.02, duration = 1.0 }",
+    "implicit": "time = { step = 0.02, duration = 1.0, integrator = 'implicit-euler' }\nsolver = { preset = 'anderson', max_iterations = 5 }",
+    "verlet": "time = { step = 0.02, duration = 1.0, integrator = 'verlet', substep = 1e-4 }\nsolver.error = 0.1",
+}
+
+
+@pytest.mark.parametrize("method", [Method("verlet", 0.02), Method("implicit-euler", 0.005, "lbfgs", "", 1e-5)], ids=["explicit", "implicit"])
+@pytest.mark.parametrize("given", BEFORE)
+def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Method):
+    """Run with these changes the scene is the same as with the answer written into it."""
+    mesh = 'mesh.source = "beam.obj"\ncages.count = 10\nmaterial = { density = 1, young_modulus = 1 }\n'
+    path = tmp_path / "scene.toml"
+    path.write_text(mesh + BEFORE[given])
+    changed = load_scene(path, overrides(path, method))
+    put_into(path, method)
+    written = load_scene(path)
+    assert (changed.time, changed.solver) == (written.time, written.solver)
+    assert changed.time.step == method.time_step and changed.time.integrator == method.integrator
 
 
 def test_an_answer_that_cannot_be_written_is_told_all_the_same(tmp_path: Path, monkeypatch, capsys, own_log):

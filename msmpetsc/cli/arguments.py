@@ -1,6 +1,9 @@
 """What several commands ask of their arguments."""
 
 import argparse
+from pathlib import Path
+
+from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 
@@ -11,3 +14,27 @@ def refuse_below_one(args: argparse.Namespace, *names: str) -> None:
         number = getattr(args, name)
         if number is not None and number < 1:
             raise InputError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
+
+
+RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
+NO_FOLDERS = (*RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES) + (
+    ".csv", ".gif", ".html", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"
+)  # fmt: skip
+
+
+def refuse_other_format(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    """Raises InputError for the name of a file of another format than is written."""
+    if path is not None and path.suffix.lower() not in endings:
+        raise InputError(f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}")
+
+
+def refuse_name_of_a_file(option: str, folder: Path | None) -> None:
+    """Raises InputError for a folder that is to be made under the name of a file."""
+    if folder is not None and folder.suffix.lower() in NO_FOLDERS and not folder.is_dir():
+        raise InputError(f"{option} {folder}: what is written there is a folder, no {folder.suffix} file")
+
+
+def refuse_ranks(command: str, why: str) -> None:
+    """Raises InputError where mpiexec has started more than one of a command that is for one process alone."""
+    if MPI.COMM_WORLD.size > 1:
+        raise InputError(f"{command} is started without mpiexec: {why}")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.cli.study import refuse_ranks
+from msmpetsc.cli.arguments import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.output.comparison import AT_REST, Comparison, Field, compare, place
 from msmpetsc.output.result import Result, refuse_deadly
@@ -35,7 +35,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare; returns the exit status."""
-    refuse_ranks("compare")
+    refuse_ranks("compare", "it reads two files, which one process does alone")
     if not 0 <= args.rtol < np.inf:
         raise InputError(f"--rtol must be a number from 0 on, not {args.rtol:g}")
     names = None if args.fields is None else [name.strip() for name in args.fields.split(",")]

@@ -12,9 +12,9 @@ import petsc4py
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
 from msmpetsc.cli.cost import peak_memory
-from msmpetsc.cli.study import refuse_ranks, stop
+from msmpetsc.cli.study import stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene import Scene
@@ -53,7 +53,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Inspect; returns the exit status."""
-    refuse_ranks("inspect")
+    refuse_ranks("inspect", "it counts for --ranks R on one process")
     refuse_bad_numbers(args)
     petsc4py.init(["msmpetsc", *args.petsc_options])
     from msmpetsc.model.build import read_body

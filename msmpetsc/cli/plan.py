@@ -7,8 +7,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from msmpetsc.cli.arguments import refuse_below_one
-from msmpetsc.cli.study import refuse_ranks, stop
+from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
+from msmpetsc.cli.study import RUNS_ITSELF, stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 
@@ -35,7 +35,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Plan; returns the exit status."""
-    refuse_ranks("plan")
+    refuse_ranks("plan", RUNS_ITSELF)
     target = args.error if args.step_error is None else args.step_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
@@ -96,13 +96,16 @@ def tell_what_was_reached(trials: Sequence, target: float) -> None:
 
 
 def tell_answer(args: argparse.Namespace, best) -> None:
-    """Lines to paste, or the file changed."""
-    from msmpetsc.study.scene_lines import lines, put_into
+    """Lines to paste and a command that says the same, or the file changed."""
+    from msmpetsc.study.case import launcher
+    from msmpetsc.study.scene_lines import lines, overrides, put_into
 
     print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")
+    print("each was tried once: how much its time varies is not known")
     print(f"\n{lines(best.method)}\n")
-    launcher = f"mpiexec -n {args.ranks} " if args.ranks > 1 else ""
-    print(f"{launcher}msmpetsc run {shlex.quote(str(args.scene))} {best.method.options}".rstrip(), flush=True)
+    changes = [word for change in overrides(args.scene, best.method) for word in ("--set", change)]
+    options = shlex.split(best.method.options)
+    print(shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes, *options]), flush=True)
     if args.write:
         try:
             put_into(args.scene, best.method)

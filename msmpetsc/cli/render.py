@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import PICTURE_NAMES, refuse_below_one, refuse_other_format, refuse_ranks
 from msmpetsc.errors import InputError
 
 
@@ -27,7 +27,9 @@ def run(args: argparse.Namespace) -> int:
     from msmpetsc.output.render import contact_sheet  # here: the other commands need no graphics
     from msmpetsc.output.result import refuse_deadly
 
+    refuse_ranks("render", "it draws on one process")
     refuse_below_one(args, "count")
+    refuse_other_format("-o", args.output, PICTURE_NAMES)
     picture = args.output or args.result.with_suffix(".png")
     frames = _numbers("--frames", args.frames, int, "0,10,20")
     eye = _numbers("--eye", args.eye, float, "1,-2,0.6")

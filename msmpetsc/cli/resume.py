@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from msmpetsc import __version__
+from msmpetsc.cli.arguments import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.output.continued import Anew, InPlace
@@ -42,6 +43,7 @@ def look(comm: MPI.Comm, args: argparse.Namespace) -> Earlier | None:
     args.output = args.resume
     there = comm.bcast(on_root(comm, args.resume.exists))
     if not there and args.scene:
+        refuse_other_format("--resume", args.resume, RESULT_NAMES)
         return None  # the first start of a job that may be started again
     earlier = comm.bcast(on_root(comm, lambda: look_closely(args.resume)))
     args.petsc_options = [*_stored_options(earlier, _as_options(args.petsc_options)), *args.petsc_options]

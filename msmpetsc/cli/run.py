@@ -14,8 +14,9 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import resume
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
+from msmpetsc.cli.describe import log_end, log_model
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
 from msmpetsc.cli.storing import tell_stop, write_frames, write_model
@@ -26,8 +27,7 @@ from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene import Scene
 
-if TYPE_CHECKING:  # these import PETSc, which must first be given its options
-    from msmpetsc.model.build import Model
+if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.measured import Measured
 
 
@@ -87,10 +87,15 @@ class ListPresets(argparse.Action):
 
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
-    comm = MPI.COMM_WORLD
+    comm, started = MPI.COMM_WORLD, perf_counter()
+    refuse_other_format("-o", args.output, RESULT_NAMES)
+    refuse_other_format("--measure", args.measure, MEASURE_NAMES)
     earlier = resume.look(comm, args)
     petsc4py.init(["msmpetsc", *args.petsc_options])
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
+    from msmpetsc.place.compiling import cache_is_empty, compilation_logged
+
+    all_are_new = cache_is_empty()
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.device import choose
     from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
@@ -110,12 +115,13 @@ def run(args: argparse.Namespace) -> int:
         return 0
     try:
         with (
+            compilation_logged(all_are_new),
             Signals(comm) as signals,
             resumed.file(comm, about) if resumed else ResultFile(path, comm, about, args.overwrite) as file,
         ):
             file.gathers = args.gather
             model = build_model(comm, scene)
-            describe(comm, model)
+            log_model(comm, model)
             if resumed:
                 resumed.refuse_other_lattice(comm, model)
             with Simulation(comm, scene, model, measured) as simulation:
@@ -130,13 +136,19 @@ def run(args: argparse.Namespace) -> int:
         on_root(comm, lambda: write_beside(path))  # the frames before the failure are worth a look
         if args.measure:
             cost.write(args.measure, failure)
+        left = files_of(path, args, whole=False)
+        on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, left))
         raise
     if args.measure:
         cost.write(args.measure)
     if stopped:
         on_root(comm, lambda: write_beside(path))
+    else:
+        on_root(comm, lambda: finish(path, args))
+    left = files_of(path, args, whole=not stopped)
+    on_root(comm, lambda: log_end(file.finished, perf_counter() - started, cost.setup, left))
+    if stopped:
         return tell_stop(stopped, path, simulation)
-    on_root(comm, lambda: finish(path, args))
     simulation.refuse_unused_options(at_end=True)
     return 0
 
@@ -228,11 +240,7 @@ def attributes(comm: MPI.Comm, scene: Scene, args: argparse.Namespace) -> dict:
     }
 
 
-def describe(comm: MPI.Comm, model: "Model") -> None:
-    """One line on the lattice."""
-    lattice = model.lattice
-    cells, springs = comm.allreduce(len(lattice.cells)), comm.allreduce(lattice.springs_owned)
-    log.info(
-        "%d cells of %.4g m, %d nodes, %d springs on %d rank%s",
-        cells, lattice.cell_size, lattice.table.total, springs, comm.size, "s" * (comm.size > 1),
-    )  # fmt: skip
+def files_of(path: Path, args: argparse.Namespace, whole: bool) -> list[Path]:
+    """What a run leaves: the result first; a picture is drawn of a ``whole`` one."""
+    beside = [path.with_suffix(".xdmf"), *([path.with_suffix(".png")] if args.picture and whole else [])]
+    return [path, *beside, *([args.measure] if args.measure else [])]

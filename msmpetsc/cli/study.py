@@ -4,11 +4,11 @@ import argparse
 import signal
 from pathlib import Path
 
-from mpi4py import MPI
-
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import refuse_below_one, refuse_name_of_a_file, refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+
+RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -31,8 +31,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; returns the exit status."""
-    refuse_ranks("study")
+    refuse_ranks("study", RUNS_ITSELF)
     refuse_below_one(args, "jobs")
+    refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.study import run_study
@@ -85,11 +86,15 @@ def tell_cases(args: argparse.Namespace, folder: Path) -> None:
 def tell_of(rows: list[dict]) -> None:
     """What to look at: cases that failed; and of each map how it went, for there failing is an answer."""
     from msmpetsc.study.outcome import counted
-    from msmpetsc.study.rows import mapped, swept
+    from msmpetsc.study.rows import mapped, swept, timed
 
     failed = sum(row["status"] != "ok" for row in swept(rows))
     if failed:
         log.warning("%d case%s without figures: see the column reason", failed, "s" * (failed > 1))
+    once = timed(row for row in swept(rows) if row["repeats"] == 1)
+    if once:
+        count = f"{len(once)} cases were" if len(once) > 1 else "1 case was"
+        log.info("%s run once: how much their times vary is not known", count)
     for name, group in mapped(rows).items():
         log.info("map %s: %s", name, counted(group))
 
@@ -97,9 +102,3 @@ def tell_of(rows: list[dict]) -> None:
 def stop(*_) -> None:
     """A signal to end is Ctrl-C: the runs under way end with this process."""
     raise KeyboardInterrupt
-
-
-def refuse_ranks(command: str) -> None:
-    """Cases start mpiexec themselves."""
-    if MPI.COMM_WORLD.size > 1:
-        raise InputError(f"{command} is started without mpiexec: it starts its runs on as many ranks as they need")

@@ -40,3 +40,7 @@ class Grid:
     def node_positions(self, ijk: np.ndarray) -> np.ndarray:
         """Positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
+
+    def nearest_nodes(self, points: np.ndarray) -> np.ndarray:
+        """Grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
+        return np.rint((points - self.origin) / self.cell_size).astype(np.int64)

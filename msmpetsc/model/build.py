@@ -21,6 +21,7 @@ from msmpetsc.model.motion import Path
 from msmpetsc.model.obstacle import Obstacle
 from msmpetsc.model.part import cell_materials
 from msmpetsc.model.penalty import Penalty
+from msmpetsc.model.reach import Reach, Regions, reach_of, regions
 from msmpetsc.model.reflection import Reflection
 from msmpetsc.model.region import Finder
 from msmpetsc.model.start import State, start_of
@@ -30,6 +31,7 @@ SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
 STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
+USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Model:
     embedding : None where the scene stores no surface
     loads     : gravity first, where there is any
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
+    body, reaches : what the first lines of a run say of the surface, and of pins, anchors and forces
     """
 
     surface: Surface | None
@@ -49,6 +52,8 @@ class Model:
     reflections: list[Reflection]
     penalties: list[Penalty]
     start: State
+    body: Body | None = None
+    reaches: tuple[Reach, ...] = ()
 
 
 def build_model(comm: MPI.Comm, scene: Scene) -> Model:
@@ -61,10 +66,12 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
     lattice = build_lattice(
         cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening, of_cells
     )
-    lattice = _pin(comm, scene, lattice, finder)
-    anchors = _anchors(scene, lattice, finder)
+    masks = regions(scene, lattice, finder)
+    lattice = lattice.pin(_any_of(masks, "pin", lattice.pinned))
+    anchors = _anchors(scene, lattice, masks)
     held = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, held, anchors)
+    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     embedding = None
     if scene.output.surface:
         points = np.empty((0, 3)) if body.surface is None else body.surface.points
@@ -73,11 +80,13 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
         body.surface,
         lattice,
         embedding,
-        _loads(comm, scene, lattice, finder),
+        _loads(comm, scene, lattice, masks),
         anchors,
         _reflections(scene),
         _penalties(comm, scene, lattice, body),
         start_of(comm, scene.start, lattice, held, body.bounds),
+        body,
+        reaches,
     )
 
 
@@ -88,7 +97,7 @@ def read_body(comm: MPI.Comm, scene: Scene) -> Body:
         surface = prepare(load(scene.mesh.source, scene.folder), scene.mesh.prepare, scene.mesh.size, scene.mesh.base)
         _check_in_range(surface)
         report = examine(surface)
-        for warning in check_encloses(surface, report):
+        for warning in (*check_encloses(surface, report), *_doubtful_unit(surface, scene.mesh.size)):
             log.warning("%s: %s", scene.mesh.source, warning)
         surface = compact(surface.points, surface.triangles)  # a point of no triangle may lie in no cell
         return surface, (report, np.array([surface.points.min(axis=0), surface.points.max(axis=0)]))
@@ -109,6 +118,15 @@ def _check_in_range(surface: Surface) -> None:
         )
 
 
+def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
+    """A warning of a body whose longest side is unusual, unless the scene says what it is."""
+    side = np.ptp(surface.points[np.unique(surface.triangles)], axis=0).max()
+    if size is not None or USUAL[0] <= side <= USUAL[1]:
+        return []
+    unit = "millimetres" if side > USUAL[1] else "another unit than metres"
+    return [f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"]
+
+
 def fill_cages(body: Body, scene: Scene) -> Cages:
     """The scene's valid cells (collective)."""
     cages = scene.cages
@@ -116,17 +134,16 @@ def fill_cages(body: Body, scene: Scene) -> Cages:
     return fill(body, cell_size, cages.method, cages.max_cells)
 
 
-def _pin(comm: MPI.Comm, scene: Scene, lattice: Lattice, finder: Finder) -> Lattice:
-    for number, pin in enumerate(scene.pin):
-        lattice = lattice.pin(finder.find(f"pin.{number}", pin.region, lattice))
-    return lattice
+def _any_of(masks: Regions, kind: str, where: np.ndarray) -> np.ndarray:
+    """(l,) bool: the nodes of all regions of this kind, and those of ``where``."""
+    return reduce(np.logical_or, (nodes for key, nodes in masks.items() if key.startswith(kind)), where)
 
 
-def _anchors(scene: Scene, lattice: Lattice, finder: Finder) -> list[Anchor]:
+def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
     """A pin is stronger than an anchor, and of two anchors on a node the first."""
     anchors, taken = [], lattice.pinned
     for number, anchor in enumerate(scene.anchor):
-        where = finder.find(f"anchor.{number}", anchor.region, lattice) & ~taken
+        where = masks[f"anchor.{number}"] & ~taken
         anchors.append(Anchor(where, Path.through(anchor.path), anchor.stop))
         taken = taken | where
     return anchors
@@ -138,12 +155,12 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, held: np.ndarr
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
 
 
-def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, finder: Finder) -> list[Load]:
+def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> list[Load]:
     loads = []
     if scene.gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
     for number, force in enumerate(scene.force):
-        where = finder.find(f"force.{number}", force.region, lattice)[: lattice.owned]
+        where = masks[f"force.{number}"][: lattice.owned]
         loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
 

@@ -78,9 +78,7 @@ class Finder:
 
     def _corners_of(self, cells: np.ndarray, lattice: Lattice) -> np.ndarray:
         keys = np.unique(morton.encode(cells[:, None, :] + CORNERS))
-        grid = self.cages.grid
-        ijk = np.rint((lattice.nodes - grid.origin) / grid.cell_size).astype(np.int64)
-        return np.isin(morton.encode(ijk), keys)
+        return np.isin(morton.encode(self.cages.grid.nearest_nodes(lattice.nodes)), keys)
 
 
 def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -2,10 +2,13 @@
 
 import sys
 import time
+from contextlib import ExitStack
 from typing import TextIO
 
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
+from msmpetsc.comm import log
 from msmpetsc.model.frame import Frame
 
 LINE_EVERY = 10.0  # [s] at the least between two lines of a log
@@ -22,8 +25,10 @@ class Progress:
         self._enabled = enabled
         self._stream = stream or sys.stderr
         self._bar: tqdm | None = None
+        self._redirected = ExitStack()  # log lines, above the bar
         if enabled and self._stream.isatty():
             self._bar = tqdm(total=total, unit="frame", file=self._stream, dynamic_ncols=True, smoothing=0.1)
+            self._redirected.enter_context(logging_redirect_tqdm([log]))
         self._begun: tuple[float, int] | None = None  # when the first frame came [s], and its index
         self._told = 0.0  # when the last line was printed [s]
         self._untold: Frame | None = None  # the newest frame, if it had no line
@@ -47,6 +52,7 @@ class Progress:
 
     def close(self) -> None:
         """Leave the bar as it is, or tell of the last frame if that had no line."""
+        self._redirected.close()
         if self._bar is not None:
             self._bar.close()
         elif self._untold is not None:

@@ -1,7 +1,7 @@
 """A contact sheet: some moments of a result side by side in one picture.
 
-All bodies stand in one scene, seen by one camera without perspective, each shifted to the right by one panel: so
-scale and height can be compared between them. Beside each stand the obstacles and forces of its own time.
+All panels are seen by one camera without perspective, drawn one by one and pasted: so scale and height can be compared
+between them. Beside each body stand the obstacles and forces of its own time.
 """
 
 import os
@@ -30,6 +30,7 @@ GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
 GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.22
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
 CAPTION = 94  # [px]
+WIDEST = 32767  # [px]: where 16 bits end, and with them what many programs show
 DRAWN = ("lattice/cells", "surface/points", "surface/triangles", "embedding/indptr", "embedding/indices")
 DRAWN += ("frames/kinetic", "frames/elastic", "frames/potential")
 FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must be numbers, too
@@ -117,6 +118,7 @@ def _moments(file: h5py.File, scene: SceneFile, frames: Sequence[int] | None, co
     total = finished(file)
     if total == 0:
         raise InputError(f"{file.filename} has no finished frame")
+    refuse_wide(len(set(frames)) if frames else min(count or 0, total))  # before the surfaces of all are read
     if frames:
         moments = dict.fromkeys(frames, "")
     elif count is None and scene.picture.times:
@@ -182,26 +184,40 @@ def _on_surface(file: h5py.File, nodes: np.ndarray) -> np.ndarray:
 
 
 def draw(panels: list[Panel], triangles: np.ndarray, camera: Camera, path: Path) -> None:
-    """Render the panels from left to right, with captions below."""
+    """Render the panels one by one, each with its caption, and paste them from left to right: a graphics library's own
+    pictures end at some width, and beyond it they are black."""
     low, high = _frame(panels, camera)
     scale = min(PANEL_WIDTH / (high - low)[0], PANEL_HEIGHT / (high - low)[1])  # [px/m]
     width, height = np.maximum([NARROWEST, 1], np.round(scale * (high - low))).astype(int)  # [px]
+    refuse_wide(len(panels), int(width))
+    shown = np.concatenate([points for panel in panels for points in (panel.points, panel.marks.corners)])
+    depth = np.linalg.norm(np.ptp(shown, axis=0))  # nothing reaches farther towards the eye
+    across, upward = (low + high) / 2 - [0, CAPTION / 2 / scale]
+    middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
+    sheet = np.empty((height + CAPTION, width * len(panels), 3), np.uint8)
     with _quiet_opengl():
-        plotter = pv.Plotter(off_screen=True, window_size=(width * len(panels), height + CAPTION), lighting="none")
-        plotter.set_background("white")
-        shown = np.concatenate([points for panel in panels for points in (panel.points, panel.marks.corners)])
-        depth = np.linalg.norm(np.ptp(shown, axis=0))  # nothing reaches farther towards the eye
         for number, panel in enumerate(panels):
-            _draw_panel(plotter, panel, triangles, number * width / scale * camera.right, 2 * depth * camera.to_eye)
-            _write_caption(plotter, panel.caption, (number + 0.5) * width)
-        row = np.array([(len(panels) - 1) / 2 * width / scale, -CAPTION / 2 / scale])
-        across, upward = (low + high) / 2 + row
-        middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
-        _set_eye(plotter, camera, middle, (height + CAPTION) / scale, 4 * depth)
-        plotter.enable_anti_aliasing("ssaa")
-        picture = plotter.screenshot(return_img=True)
-        plotter.close()
-    _save(picture, path)
+            plotter = pv.Plotter(off_screen=True, window_size=(width, height + CAPTION), lighting="none")
+            plotter.set_background("white")
+            _draw_panel(plotter, panel, triangles, 2 * depth * camera.to_eye)
+            _write_caption(plotter, panel.caption, width / 2)
+            _set_eye(plotter, camera, middle, (height + CAPTION) / scale, 4 * depth)
+            plotter.enable_anti_aliasing("ssaa")
+            picture = plotter.screenshot(return_img=True)
+            plotter.close()
+            if not picture.any():
+                raise InputError(f"{path} cannot be drawn: the graphics library gives a black picture")
+            sheet[:, number * width : (number + 1) * width] = picture
+    _save(sheet, path)
+
+
+def refuse_wide(panels: int, width: int = NARROWEST) -> None:
+    """Raise InputError for a picture of so many panels of this width [px], or more, that few programs would show."""
+    if panels * width > WIDEST:
+        raise InputError(
+            f"{panels} moments are too many for one picture: of panels {width} pixels wide "
+            f"at most {WIDEST // width} fit into {WIDEST}"
+        )
 
 
 def _save(picture: np.ndarray, path: Path) -> None:
@@ -223,31 +239,31 @@ def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]
     return rows.min(axis=0), rows.max(axis=0)
 
 
-def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, shift: np.ndarray, front: np.ndarray) -> None:
-    """shift: (3,) from the first panel to this one; front: (3,) towards the eye, out of what could hide anything."""
+def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front: np.ndarray) -> None:
+    """front: (3,) towards the eye, out of what could hide anything."""
     for ground in panel.marks.grounds:
-        _draw_ground(plotter, ground, panel.points, triangles, shift)
-    body = pv.PolyData.from_regular_faces(panel.points + shift, triangles)
+        _draw_ground(plotter, ground, panel.points, triangles)
+    body = pv.PolyData.from_regular_faces(panel.points, triangles)
     colours = (1 - panel.held[:, None]) * _rgb(BODY) + panel.held[:, None] * _rgb(HELD)
     look = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
     plotter.add_mesh(body, scalars=colours.astype(np.uint8), rgb=True, **look)
     for corners in panel.marks.glass:
-        _draw_glass(plotter, corners + shift)
+        _draw_glass(plotter, corners)
     for tail, tip in panel.marks.arrows:  # without perspective, nearer to the eye is the same place of the picture
         shape = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045, tip_resolution=40, shaft_resolution=40)
         length = float(np.linalg.norm(tip - tail))
-        arrow = pv.Arrow(start=tail + shift + front, direction=tip - tail, scale=length, **shape)
+        arrow = pv.Arrow(start=tail + front, direction=tip - tail, scale=length, **shape)
         plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4)
 
 
-def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray, shift) -> None:
+def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray) -> None:
     """With the body's projection as a shadow: it shows where the body is above the ground, and how high."""
-    patch = pv.PolyData.from_regular_faces(ground.corners + shift, [[0, 1, 2, 3]])
+    patch = pv.PolyData.from_regular_faces(ground.corners, [[0, 1, 2, 3]])
     plotter.add_mesh(patch, color=GROUND, lighting=False, show_edges=True, edge_color=GROUND_EDGE, line_width=2)
     above = (points - ground.corners[0]) @ ground.normal
     lift = 2e-3 * np.ptp(points, axis=0).max()  # or the two surfaces would flicker into each other
     shadow = points - np.outer(above - lift, ground.normal)
-    plotter.add_mesh(pv.PolyData.from_regular_faces(shadow + shift, triangles), color=SHADOW, lighting=False)
+    plotter.add_mesh(pv.PolyData.from_regular_faces(shadow, triangles), color=SHADOW, lighting=False)
 
 
 def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:

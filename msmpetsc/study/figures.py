@@ -92,7 +92,8 @@ def _rms(values: np.ndarray) -> float | None:
 
 
 def together(runs: Sequence[Row]) -> Row:
-    """One row of the repeats' figures: medians of times; what was measured once, from the run that measured it.
+    """One row of the repeats' figures: medians of times, and the range of a step's; what was measured once, from the
+    run that measured it.
 
     Memory is that of the leanest: the first run may have measured errors beside its work.
     """
@@ -103,7 +104,8 @@ def together(runs: Sequence[Row]) -> Row:
             row[name] = median(given)
         elif name == "memory" and given:
             row[name] = min(given)
-    return row
+    times = [run["time_frame"] for run in runs if run.get("time_frame") is not None]
+    return row | ({"time_frame_min": min(times), "time_frame_max": max(times)} if len(times) > 1 else {})
 
 
 def rates(row: Row, time_step: float) -> Row:

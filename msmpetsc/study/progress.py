@@ -2,11 +2,14 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from time import monotonic
 from typing import TextIO
 
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
+from msmpetsc.comm import log
 from msmpetsc.output.progress import duration
 from msmpetsc.study.figures import Row
 
@@ -20,8 +23,10 @@ class StudyProgress:
         self._stream = stream or sys.stderr
         self._begun = monotonic()
         self._bar: tqdm | None = None
+        self._redirected = ExitStack()  # log lines, above the bar
         if self._stream.isatty():
             self._bar = tqdm(total=self._total, initial=done, unit="case", file=self._stream, dynamic_ncols=True)
+            self._redirected.enter_context(logging_redirect_tqdm([log]))
         elif done:
             self._tell(f"{done} of {self._total} cases are done already")
 
@@ -38,6 +43,7 @@ class StudyProgress:
         self._bar.update()
 
     def close(self) -> None:
+        self._redirected.close()
         if self._bar is not None:
             self._bar.close()
 
@@ -70,4 +76,7 @@ def _outcome(row: Row) -> str:
     errors = {"step": row.get("true_error"), "trajectory": row.get("trajectory_error")}
     told = [f"{name} error {value:.1e}" for name, value in errors.items() if value is not None]
     time = row.get("time_frame")
-    return "  ".join([f"{time:.3g} s a step" if time else "no step", *told, *filter(None, [row["reason"]])])
+    low, high = row.get("time_frame_min"), row.get("time_frame_max")
+    range_of_repeats = f" ({low:.3g} to {high:.3g})" if low is not None and high is not None else ""
+    stepping = f"{time:.3g} s a step{range_of_repeats}" if time else "no step"
+    return "  ".join([stepping, *told, *filter(None, [row["reason"]])])

@@ -19,14 +19,18 @@ from msmpetsc.study.charts.figure6 import figure6_charts
 from msmpetsc.study.charts.growth import growth_charts
 from msmpetsc.study.charts.look import RC, looks
 from msmpetsc.study.charts.order import order_charts
-from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, pareto_charts
+from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, cost_of, pareto_charts
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
 from msmpetsc.study.outcome import counted
-from msmpetsc.study.rows import NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept
+from msmpetsc.study.rows import (
+    NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept, timed,
+)  # fmt: skip
+from msmpetsc.study.spread import UNKNOWN, is_known
 
 PRINTED = {
-    "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame", "time_second",
+    "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame",
+    "time_frame_min", "time_frame_max", "time_second",
     "ksp_its", "memory", "true_error", "trajectory_error",
 }  # fmt: skip
 NOT_PRINTED = {*TEXT, *NUMBERS} - PRINTED
@@ -92,10 +96,19 @@ def facts(date: str, rows: list[Row]) -> str:
     count = f"{len(plain)}, " + (f"{lost} of them <a href='#failed'>failed</a>" if lost else "none failed")
     entries = [("Date", escape(date))] + ([("Cases", count)] if plain or not rows else [])
     entries += [(f"Map {escape(name)}", f"{len(group)}: {counted(group)}") for name, group in mapped(rows).items()]
+    entries += [("Repeats", escape(repeated(plain)))] if timed(plain) else []
     for name in ("machine", "versions"):
         texts = dict.fromkeys(readable(str(row[name])) for row in rows if row[name])
         entries += [(name.capitalize(), "<br>".join(map(escape, texts)))] if texts else []
     return "<dl class='facts'>" + "".join(f"<dt>{name}</dt><dd>{text}</dd>" for name, text in entries) + "</dl>"
+
+
+def repeated(rows: list[Row]) -> str:
+    """How often cases were run, and what follows for their times."""
+    counts = sorted({int(row["repeats"] or 1) for row in timed(rows)})
+    if not is_known(timed(rows)):
+        return f"{' or '.join(map(str, counts))}. {UNKNOWN}"
+    return f"{' or '.join(map(str, counts))}: times are medians, ranges and whiskers from the least to the greatest"
 
 
 def readable(text: str) -> str:
@@ -129,18 +142,23 @@ def overview(charts: list[Chart]) -> str:
         [chart.title.partition(": ")[2], name, *(winner(name, row) for row in best)]
         for chart in charts for name, best in chart.cheapest.items()
     ]  # fmt: skip
-    note = "The cheapest measured method; for the step error with its time a frame, for the trajectory error with its "
-    caption = f"<p class='caption'>{note}time a simulated second and its time step.</p>"
+    known = all(is_known(best) for chart in charts for levels in chart.cheapest.values() for best in levels)
+    note = f"The cheapest measured method{', then those whose repeats overlap with its own' if known else ''}; for the "
+    note += "step error with its time a frame, for the trajectory error with its time a simulated second and its "
+    note += "time step."
+    caption = f"<p class='caption'>{escape(note if known else f'{note} {UNKNOWN}')}</p>"
     cells = [[(text, text) for text in line] for line in lines]
     return f"<section class='overview'><h2>At a glance</h2>{caption}{html_table(head, cells)}</section>"
 
 
-def winner(name: str, row: Row | None) -> str:
-    """The label of a row and what it costs."""
-    if row is None:
+def winner(name: str, best: list[Row]) -> str:
+    """The label of the cheapest and what it costs; then those within its noise."""
+    if not best:
         return "none"
+    row, *others = best
     step = f", {stepping(row)}" if name == TRAJECTORY.name else ""
-    return f"{row['label']}: {wording.seconds(row[MEASURES[name].cost])}{step}"
+    near = f"; or {', '.join(other['label'] for other in others)}" if others else ""
+    return f"{row['label']}: {cost_of(row, MEASURES[name])}{step}{near}"
 
 
 def sections(charts: Iterable[Chart]) -> list[str]:

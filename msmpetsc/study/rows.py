@@ -74,6 +74,11 @@ def measured(rows: Iterable[Row], *columns: str) -> list[Row]:
     return [row for row in rows if all(isinstance(row[name], float) and row[name] > 0 for name in columns)]
 
 
+def timed(rows: Iterable[Row]) -> list[Row]:
+    """Rows of cases that ran to their end and have a time."""
+    return measured(succeeded(rows), "time_frame")
+
+
 def stepping(row: Row) -> str:
     """How a case steps, in words; an explicit run has substeps within its time step, the time between its frames."""
     if row["integrator"] == "verlet":

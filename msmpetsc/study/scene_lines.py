@@ -6,6 +6,8 @@ from pathlib import Path
 
 import tomlkit
 
+from msmpetsc.scene_reading import read_toml
+from msmpetsc.study.overrides import inline
 from msmpetsc.study.plan import Method
 
 
@@ -24,6 +26,18 @@ def lines(method: Method) -> str:
         for name, table in tables(method).items()
     }
     return tomlkit.dumps(shown).strip()
+
+
+def overrides(scene: Path, method: Method) -> list[str]:
+    """The same as changes of the scene file, as --set takes them. Raises InputError for a file that is no TOML."""
+    (_, document), changes = read_toml(scene), []
+    for name, table in tables(method).items():
+        given = document.get(name, {})
+        if any(value is None and key in given for key, value in table.items()):
+            changes.append(f"{name}={inline(given | table)}")  # --set changes keys, and takes none away
+        else:
+            changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
+    return changes
 
 
 def put_into(scene: Path, method: Method) -> None:

@@ -51,6 +51,8 @@ COLUMNS = {
     "frames": Column(float, "1", "frames stored"),
     "steps": Column(float, "1", "steps done"),
     "time_frame": Column(float, "s", "mean time of a step, the first left out, median of the repeats"),
+    "time_frame_min": Column(float, "s", "the least of the repeats; none of a single run"),
+    "time_frame_max": Column(float, "s", "the greatest of the repeats; none of a single run"),
     "fps": Column(float, "1/s", "steps a second: 1 / time_frame"),
     "time_second": Column(float, "1", "computing seconds a simulated second"),
     "time_setup": Column(float, "s", "whole run: mesh, cages, lattice"),

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 
 from msmpetsc.study.charts.look import Look
 from msmpetsc.study.rows import Row
+from msmpetsc.study.spread import Cost, spread
 
 WIDTH = 12.2  # [in], 72 points each: 1171 pixels of the page
 PANEL = 4.3  # [in]: height of the axes with their labels
@@ -39,7 +40,8 @@ class Point:
 class Chart:
     """name: of its file; kind: the heading it stands under; points: by panel, then by the id of
     the group of marks in the SVG that stands for them, in its order;
-    findings: lines in plain words by their heading; cheapest: by kind of error, the row that wins each level of it."""
+    findings: lines in plain words by their heading; cheapest: by kind of error, for each level of it the row that wins
+    and those within its noise."""
 
     name: str
     kind: str
@@ -49,7 +51,7 @@ class Chart:
     points: dict[str, dict[str, list[Point]]] = field(default_factory=dict)
     findings: dict[str, list[str]] = field(default_factory=dict)
     failed: list[Row] = field(default_factory=list)
-    cheapest: dict[str, list[Row | None]] = field(default_factory=dict)
+    cheapest: dict[str, list[list[Row]]] = field(default_factory=dict)
 
     def mark(self, axes: Axes, x: list[float], y: list[float], points: list[Point], look: Look, **style) -> None:
         """Draws measured points; panels are told apart by their titles."""
@@ -60,6 +62,14 @@ class Chart:
         panel[group] = points
         shape = {"marker": look.marker, "markersize": look.size, "markerfacecolor": look.color} | EDGE | style
         axes.plot(x, y, linestyle="none", zorder=4, clip_on=False, gid=group, **shape)
+
+    def whiskers(self, axes: Axes, x: list[float], rows: list[Row], cost: Cost, look: Look) -> None:
+        """From the least to the greatest of the repeats of each row, where it was repeated."""
+        spreads = [(at, *spread(row, cost)) for at, row in zip(x, rows) if spread(row, cost)]
+        if spreads:
+            at, low, high = zip(*spreads)
+            axes.vlines(at, low, high, color=look.color, linewidth=1.1, zorder=3.5)
+            axes.plot([*at, *at], [*low, *high], "_", color=look.color, markersize=7, zorder=3.5)
 
 
 def new_figure(panels: int, legend: Sequence[str]) -> tuple[Figure, Sequence[Axes]]:
@@ -93,3 +103,9 @@ def legend_below(figure: Figure, handles: dict[str, Line2D]) -> None:
 def handle(look: Look, line: str = "-") -> Line2D:
     """What stands for a curve in a legend."""
     return Line2D([], [], color=look.color, marker=look.marker, linestyle=line, markersize=look.size, **EDGE)
+
+
+def repeats(row: Row, cost: Cost, word: Callable[[float | None], str]) -> dict:
+    """Numbers of a Point: the range of the repeats, empty where it is not known."""
+    low, high = spread(row, cost) or (None, None)
+    return {"least of the repeats": (word, low), "greatest of the repeats": (word, high)}

@@ -1,19 +1,24 @@
 """The paper's Figure 6: frames a second over valid cells, for Cholesky factors and for CG."""
 
+from operator import itemgetter
+
 from msmpetsc.study import wording
 from msmpetsc.study.charts.cell_sweep import curves, file_name, sweeps, titled
-from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
+from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
 from msmpetsc.study.charts.look import COUNT, Look, log_axes
 from msmpetsc.study.rows import Row, failed, grouped, measured
+from msmpetsc.study.spread import ends, is_below
 
 KIND = "Frames a second over cells (the paper's Figure 6)"
 CAPTION = (
     "Higher is faster. A frame is one time step; set-up and factorisation, done once, are not counted. The legend says "
-    "which true step error each curve reached: only curves of like error compare."
+    "which true step error each curve reached: only curves of like error compare. Whiskers reach from the least to the "
+    "greatest of the repeats."
 )
 CHOLESKY_PRESETS = ("fast-msm", "fast-msm-kronecker")
 FACTORS = ("cholesky", "lu")
 GPU_TYPES = ("cuda", "cusparse", "hip", "kokkos")  # parts of the names of PETSc's types
+FPS = itemgetter("fps")
 LINES = ("-", "--", ":", "-.")
 
 
@@ -50,10 +55,11 @@ def figure6_chart(name: str, scene: str, time_step: float | None, rows: list[Row
     chart = Chart(name, KIND, titled("Frames a second over cells", scene, time_step), CAPTION, figure)
     axes.set_xlabel("valid cells (k: thousand, M: million)")
     axes.set_ylabel("frames a second")
-    log_axes(axes, [row["cells"] for row in rows], [row["fps"] for row in rows], COUNT, COUNT)
+    log_axes(axes, [row["cells"] for row in rows], [end for row in rows for end in ends(row, FPS)], COUNT, COUNT)
     for curve, group in by_curve.items():
         cells, fps = [row["cells"] for row in group], [row["fps"] for row in group]
         axes.plot(cells, fps, lines[curve], color=look_of[curve].color)
+        chart.whiskers(axes, cells, group, FPS, look_of[curve])
         chart.mark(axes, cells, fps, [point(row, curve) for row in group], look_of[curve])
     legend_below(figure, handles)
     lines_found = overtaking(by_curve)
@@ -88,6 +94,7 @@ def point(row: Row, curve: str) -> Point:
         "valid cells": (wording.count, row["cells"]),
         "frames a second": (wording.plain, row["fps"]),
         "computing time a frame": (wording.seconds, row["time_frame"]),
+        **repeats(row, itemgetter("time_frame"), wording.seconds),
         "true step error": (wording.error, row["true_error"]),
         "iterations a step": (wording.count, row["iterations"]),
         "KSP iterations a step": (wording.count, row["ksp_its"]),
@@ -113,11 +120,14 @@ def overtaken(curve: str, group: list[Row], iterative: list[Row]) -> str:
     pairs = [(row, rivals[row["cells"]]) for row in group if rivals[row["cells"]]]
     if not pairs:
         return f"{curve}: no iterative method was measured at the same cell counts."
-    slower = [row["cells"] for row, rival in pairs if rival["fps"] <= row["fps"]]
+    slower = [row["cells"] for row, rival in pairs if not is_below(row, rival, FPS)]
     won = [(row, rival) for row, rival in pairs if row["cells"] > max(slower, default=0)]
     if not won:
         row, rival = pairs[-1]
         cells = wording.count(row["cells"])
+        if not is_below(rival, row, FPS):
+            both = f"{curve} and {rival['curve']} are as fast within their noise"
+            return f"{both} at {cells} cells, the most measured ({duel(row, rival)})."
         return f"{curve} is still faster at {cells} cells, the most measured ({duel(row, rival)})."
     row, rival = won[0]
     start = f"{'' if slower else 'at every cell count measured, '}from {wording.count(row['cells'])} cells on"

@@ -9,15 +9,17 @@ from matplotlib.ticker import Formatter
 
 from msmpetsc.study import wording
 from msmpetsc.study.charts.cell_sweep import curves, file_name, sweeps, titled
-from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
+from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
 from msmpetsc.study.charts.figure6 import line_styles
 from msmpetsc.study.charts.look import BYTES, COUNT, SECONDS, Look, log_axes
 from msmpetsc.study.rows import Row, failed, measured
+from msmpetsc.study.spread import ends
 
 KIND = "Growth with the number of cells"
 CAPTION = (
     "A level curve means a cost in proportion to the cells; a rising one grows faster than the body. Memory is the "
-    "peak of all ranks, the program itself and the surface mesh included."
+    "peak of all ranks, the program itself and the surface mesh included. Whiskers reach from the least to the "
+    "greatest of the repeats."
 )
 
 
@@ -71,7 +73,8 @@ def growth_chart(
     for ax, (quantity, shown) in zip(axes, panels):
         ax.set_title(quantity.title, loc="left")
         ax.set_xlabel("valid cells (k: thousand, M: million)")
-        log_axes(ax, [row["cells"] for row in shown], [quantity.value(row) for row in shown], COUNT, quantity.tick)
+        values = [end for row in shown for end in ends(row, quantity.value)]
+        log_axes(ax, [row["cells"] for row in shown], values, COUNT, quantity.tick)
         for curve, group in by_curve.items():
             known = measured(group, quantity.column)
             draw_curve(chart, ax, quantity, curve, known, looks[group[0]["label"]], lines[curve])
@@ -85,6 +88,8 @@ def draw_curve(
     """One curve of one panel."""
     cells, values = [row["cells"] for row in rows], [quantity.value(row) for row in rows]
     axes.plot(cells, values, line, color=look.color)
+    if quantity.column == "time_frame":
+        chart.whiskers(axes, cells, rows, quantity.value, look)
     chart.mark(axes, cells, values, [point(row, curve, quantity, value) for row, value in zip(rows, values)], look)
 
 
@@ -94,6 +99,7 @@ def point(row: Row, curve: str, quantity: Quantity, value: float) -> Point:
         "valid cells": (wording.count, row["cells"]),
         quantity.title: (quantity.word, value),
         "computing time a frame": (wording.seconds, row["time_frame"]),
+        **repeats(row, itemgetter("time_frame"), wording.seconds),
         "memory": (wording.size, row["memory"]),
         "KSP iterations a step": (wording.count, row["ksp_its"]),
         "true step error": (wording.error, row["true_error"]),

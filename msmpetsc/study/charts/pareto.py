@@ -8,21 +8,24 @@ of the lattice: explicit and implicit runs of any time step can be compared by i
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from msmpetsc.study import wording
-from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
+from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
 from msmpetsc.study.charts.look import ERROR, FAINT, INK, SECONDS, Look, log_axes
 from msmpetsc.study.rows import Row, failed, grouped, measured, stepping, succeeded
+from msmpetsc.study.spread import UNKNOWN, ends, is_known, spread, within_noise
 
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins a method's own best points; its other measurements are "
-    "small and hollow. Ringed points on the grey stair are the Pareto front: nothing measured is both cheaper and more "
-    "exact, errors taken to two digits. The step error is that of solving a step; the trajectory error is that of the "
+    "small and hollow. Whiskers reach from the least to the greatest of the repeats, whose median is the point. Ringed "
+    "points on the grey stair are the Pareto front: nothing measured is both cheaper and more exact, errors taken to "
+    "two digits. The step error is that of solving a step; the trajectory error is that of the "
     "whole motion, time step included."
 )
 
@@ -75,6 +78,16 @@ def cheapest(rows: list[Row], measure: Measure, level: float) -> Row | None:
     return min(reached, key=lambda row: row[measure.cost], default=None)
 
 
+def winners(rows: list[Row], measure: Measure, level: float) -> list[Row]:
+    """The cheapest, then those that its repeats do not tell from it, each method once; none where nothing reaches the
+    level."""
+    first = cheapest(rows, measure, level)
+    if first is None:
+        return []
+    reached = [row for row in measured(rows, measure.error, measure.cost) if row[measure.error] <= level]
+    return [first, *(within_noise(first, reached, itemgetter(measure.cost)) if is_known([first]) else [])]
+
+
 def pareto_charts(rows: list[Row], looks: dict[str, Look]) -> list[Chart]:
     """One chart for each scene, and for each of its cell counts where a method was swept over errors or time steps."""
     charts = []
@@ -110,9 +123,9 @@ def pareto_chart(name: str, scene: str, cells: float | None, rows: list[Row], lo
     chart = Chart(name, "Speed against accuracy", f"Speed against accuracy: {where}", CAPTION, figure)
     for ax, (measure, shown) in zip(axes, panels):
         draw(chart, ax, measure, shown, looks)
-        chart.cheapest[measure.name] = [cheapest(shown, measure, level) for level in LEVELS]
-        pairs = zip(LEVELS, chart.cheapest[measure.name])
-        chart.findings[f"The cheapest by {measure.name}"] = [finding(measure, level, row) for level, row in pairs]
+        chart.cheapest[measure.name] = [winners(shown, measure, level) for level in LEVELS]
+        lines = [finding(measure, *pair) for pair in zip(LEVELS, chart.cheapest[measure.name])]
+        chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_known(shown) else [UNKNOWN])
     legend_below(figure, handles)
     return chart
 
@@ -130,11 +143,13 @@ def draw(chart: Chart, axes: Axes, measure: Measure, rows: list[Row], looks: dic
     axes.set_title(f"over the {measure.name}{where}", loc="left")
     axes.set_xlabel(measure.x_label)
     axes.set_ylabel(measure.y_label)
-    log_axes(axes, [row[measure.error] for row in rows], [row[measure.cost] for row in rows], ERROR, SECONDS)
+    costs = [end for row in rows for end in ends(row, itemgetter(measure.cost))]
+    log_axes(axes, [row[measure.error] for row in rows], costs, ERROR, SECONDS)
     draw_front(axes, front_rows(rows, measure), measure)
     for label, group in grouped(rows, lambda row: row["label"]).items():
         best = front_rows(group, measure)
         axes.plot(*columns(best, measure), color=looks[label].color, linewidth=1.6, zorder=3)
+        chart.whiskers(axes, columns(group, measure)[0], group, itemgetter(measure.cost), looks[label])
         others = [row for row in group if not any(row is one for one in best)]
         hollow = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": looks[label].color}
         for chosen, style in ((best, {}), (others, hollow)):
@@ -161,6 +176,7 @@ def point(row: Row, measure: Measure) -> Point:
     numbers = {
         measure.name: (wording.error, row[measure.error]),
         measure.y_label: (wording.seconds, row[measure.cost]),
+        **repeats(row, itemgetter(measure.cost), wording.seconds),
         "time step": (wording.seconds, row["time_step"]),
         "substep": (wording.seconds, row["substep"]),
         "error asked for": (wording.error, row["error"]),
@@ -171,12 +187,23 @@ def point(row: Row, measure: Measure) -> Point:
     return Point(row["label"], numbers, row["command"])
 
 
-def finding(measure: Measure, level: float, row: Row | None) -> str:
-    """Which method is the cheapest that reached this level, in plain words."""
+def finding(measure: Measure, level: float, best: list[Row]) -> str:
+    """Which method is the cheapest that reached this level, and which may be just as cheap, in plain words."""
     start = f"{wording.error(level)} or less:"
-    if row is None:
+    if not best:
         return f"{start} nothing measured reaches it."
-    cost, reached = wording.seconds(row[measure.cost]), wording.error(row[measure.error])
+    row, *others = best
+    reached = wording.error(row[measure.error])
     step = f", {stepping(row)}" if measure is TRAJECTORY else ""
     asked = f"asked for {wording.error(row['error'])}, " if row["error"] else ""
-    return f"{start} {row['label']}, {cost} {measure.unit} ({asked}reached {reached}{step})."
+    sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
+    if not others:
+        return f"{sentence}."
+    near = ", ".join(f"{other['label']} {cost_of(other, measure)}" for other in others)
+    return f"{sentence}; within its noise: {near}."
+
+
+def cost_of(row: Row, measure: Measure) -> str:
+    """34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
+    cost, repeats_range = wording.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
+    return f"{cost} [{' to '.join(map(wording.seconds, repeats_range))}]" if repeats_range else cost

@@ -1,0 +1,159 @@
+"""What the pins, anchors, forces and parts of a scene reach, and which of them do nothing or not what they say.
+
+What could not have any effect at all is refused; what is overruled in part is warned of.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import reduce
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError
+from msmpetsc.model.anchor import Anchor
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.motion import SAME, within
+from msmpetsc.model.region import Finder
+from msmpetsc.scene import Force, Obstacle, Scene, Time
+
+Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Of one table, over all ranks: how many ``nodes`` its region holds, and how many of them are not its own, for
+    they are held by a pin or an anchor that comes before it."""
+
+    key: str
+    nodes: int
+    held: int
+
+
+def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndarray]:
+    """The nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
+    tables = dict(chain.from_iterable(_keyed(scene, kind) for kind in ("pin", "anchor", "force")))
+    return {key: finder.find(key, table.region, lattice) for key, table in tables.items()}
+
+
+def reach_of(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions, finder: Finder
+) -> tuple[Reach, ...]:
+    """Of pins, anchors and forces in this order; warns of what is overruled (collective).
+
+    lattice : with its pins
+    anchors : each with the nodes that it leads, those of its region aside that a pin or an earlier anchor has
+    Raises InputError on all ranks for an anchor or a force that does nothing.
+    """
+
+    def count(where: np.ndarray) -> int:
+        return comm.allreduce(int(where[: lattice.owned].sum()))
+
+    reaches, pinned = [], np.zeros_like(lattice.pinned)
+    for number in range(len(scene.pin)):
+        where = masks[f"pin.{number}"]
+        reaches.append(Reach(f"pin.{number}", count(where), count(where & pinned)))
+        pinned = pinned | where
+    for number, anchor in enumerate(anchors):
+        where = masks[f"anchor.{number}"]
+        reach = Reach(f"anchor.{number}", count(where), count(where & ~anchor.where))
+        reaches.append(reach)
+        same = (before.where for before in anchors[:number] if _leads_alike(before, anchor))
+        alike = reduce(np.logical_or, same, np.zeros_like(pinned))
+        _warn_of_overruled(reach, count(where & pinned), count(where & ~anchor.where & ~pinned & ~alike))
+    for number, force in enumerate(scene.force):
+        where = masks[f"force.{number}"]
+        reach = Reach(f"force.{number}", count(where), count(where & _held_while(force, lattice.pinned, anchors)))
+        reaches.append(reach)
+        if reach.held == reach.nodes and any(force.total):
+            raise InputError(
+                f"{reach.key} moves nothing: of the {_nodes(reach.nodes)} in its region none is free while it acts, "
+                "pins and anchors hold all"
+            )
+    _warn_of_idle_parts(comm, scene, lattice, anchors, finder)
+    _note_what_never_acts(scene)
+    return tuple(reaches)
+
+
+def _leads_alike(one: Anchor, other: Anchor) -> bool:
+    """Along the same path and as long: on a node of both it makes no difference which of them has it."""
+    same = np.array_equal(one.path.times, other.path.times)
+    return same and np.array_equal(one.path.displacements, other.path.displacements) and one.stop == other.stop
+
+
+def _warn_of_overruled(reach: Reach, pinned: int, led: int) -> None:
+    """Of an anchor's nodes so many are pinned, and so many led another way by earlier anchors."""
+    why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
+    why += [f"{led} {'is' if led == 1 else 'are'} led by an anchor before it"] if led else []
+    if not why:
+        return
+    text = f"{reach.key}: of the {_nodes(reach.nodes)} in its region {' and '.join(why)}"
+    if pinned + led == reach.nodes:
+        raise InputError(f"{text}: it leads none")
+    log.warning("%s, which it does not lead", text)
+
+
+def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.ndarray:
+    """The nodes (l,) bool that are not free at any time at which the force acts."""
+    until = math.inf if force.stop is None else force.stop
+    lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
+    return reduce(np.logical_or, lasting, pinned)
+
+
+def _warn_of_idle_parts(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder
+) -> None:
+    """Of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
+    if not scene.part:
+        return
+    own = lattice.local_cells[: lattice.cells_owned]
+    ijk = finder.cages.grid.nearest_nodes(lattice.nodes[own[:, 0]])
+    held = reduce(np.logical_or, (a.where for a in anchors if a.stop is None), lattice.pinned)
+    free = ~held[own].all(axis=1)
+    replaced = {name: np.zeros(len(own), bool) for name in ("density", "young_modulus", "stiffness")}
+    for number, part in reversed(list(enumerate(scene.part))):
+        where = finder.find_cells(f"part.{number}", part.region, ijk)
+        given = [name for name in replaced if getattr(part, name) is not None]
+        counts = where, where & ~np.all([replaced[name] for name in given], axis=0), where & free
+        cells, kept, moving = comm.allreduce(np.array([mask.sum() for mask in counts]))
+        if kept == 0:
+            log.warning("part.%d has no effect: later parts give all that it gives, on all its %d cells", number, cells)
+        elif moving == 0:
+            log.warning("part.%d has no effect: pins and anchors hold all nodes of its %d cells", number, cells)
+        for name in given:
+            replaced[name] |= where
+
+
+def _note_what_never_acts(scene: Scene) -> None:
+    """Of forces and obstacles that are there at the end of no step."""
+    time = scene.time
+    for key, table in chain(_keyed(scene, "force"), _keyed(scene, "obstacle")):
+        if _acts_in_a_step(table, time):
+            continue
+        until = "on" if table.stop is None else f"to {table.stop:g} s"
+        text = f"{key} acts in no step: it is there from {table.start:g} s {until}"
+        if table.start > time.duration:  # as --frames has it, too
+            log.info("%s, and the run ends at %g s", text, time.duration)
+        else:
+            log.warning("%s, between the ends of steps of %g s", text, time.step)
+
+
+def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:
+    """The tables of a kind, each with its key: ("force.0", ...)."""
+    return ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
+
+
+def _acts_in_a_step(table: Force | Obstacle, time: Time) -> bool:
+    """Whether it is there at the end of a step; or, where steps are taken in substeps, at any time of the run."""
+    if time.integrator == "verlet":
+        return table.start < time.duration and (table.stop is None or table.stop > 0)
+    first = max(1, math.ceil(table.start / time.step * (1 - SAME)))
+    return first <= time.steps and within(first * time.step, table.start, table.stop)
+
+
+def _nodes(count: int) -> str:
+    return f"{count} node{'s' * (count != 1)}"

@@ -2,16 +2,16 @@
 
 F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
 positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
-for by locally optimal conjugate gradients, preconditioned as the step is (Knyazev 2001, Toward the optimal preconditioned
-eigensolver, Algorithm 4.1): at some length when the body is compressed anew or more than it was, or something showed a
+for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
+the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when the body is compressed anew or more than it was, or something showed a
 negative curvature; at all other steps the mode found last is followed in a few iterations.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.linalg import eigh
 
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.start import uniform
@@ -19,15 +19,18 @@ from msmpetsc.place.arrays import beside, fetch, greatest
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.operators import Preconditioner, TrueHessian
 
-MOST = 300  # iterations of a long search
-FOLLOWED = 4  # of a short one
-LEAST = 24  # of a long one that finds nothing
+BLOCK = 4  # directions of a long search
+MOST = 100  # iterations of it
+LEAST = 12  # of one that finds nothing
+FOLLOWED = 2  # of a short one, of two directions
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
-SHARPENED = 1.1  # times a negative curvature four iterations ago: further ones lead down no steeper
-MORE = 4.0  # times the compression of the last long search: time for another, and sooner if that found less than
-ALLOWED = 0.5  # that the curvature may have lost since, in proportion to the compression
+SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
+MORE = 1.25  # times the compression of the last long search: time for another, for modes come and go
+ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
-DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of three unit directions: one of them is none
+DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
+
+Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,8 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if not self.resists else 0.0
 
-    def exceeds(self, other: "Compression", times: float) -> bool:
-        return self.greatest > times * other.greatest or self.total > times * other.total
+    def exceeds(self, other: "Compression") -> bool:
+        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
 
 
 NONE = Compression(0.0, 0.0, False)
@@ -66,9 +69,8 @@ class LowestCurvature:
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
         self.searched = NONE  # the compression that the last long search was at
-        self.value = 1.0  # that it found
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
-        self.basis: np.ndarray | None = None
+        self.vectors: list[PETSc.Vec] | None = None
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
     def compression(self, q: np.ndarray) -> Compression:
@@ -81,105 +83,83 @@ class LowestCurvature:
         return Compression(max(most), sum(sums), any(resist))
 
     def lowest(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray]:
-        """The lowest eigenvalue of M^(-1) H that was found, and its direction (n,), about where H was linearised last.
+        """The lowest eigenvalue of M^(-1) H that was found, and a direction (n,) of about that curvature, about where H
+        was linearised last.
 
         alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
-        at_length = alarmed or compression.resists or self.mode is None or self._is_time(compression)
-        self._create_arrays()
-        if at_length:
+        if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
-            value = self.value = self._search_at_length(hint)
+            values, modes = self._search_at_length(hint)
         else:
-            self.basis[0], self.basis[2] = self.mode, self._random()
-            self._begin(0, 2)
-            value = self._iterate(FOLLOWED, FOLLOWED)
-        self.mode = self.basis[0].copy()
-        return value, self.mode
+            values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
+        self.mode = modes[0]
+        if values[0] < 0:
+            return values[0], self._way_down(modes[values <= ALIKE * values[0]])
+        return values[0], self.mode
 
-    def _is_time(self, compression: Compression) -> bool:
-        """For a long search."""
-        return compression.exceeds(self.searched, min(MORE, ALLOWED / max(1 - self.value, ALLOWED / MORE)))
+    def _way_down(self, modes: np.ndarray) -> np.ndarray:
+        """What a random direction has of all of them (k, n): where a body may buckle to many sides, no matter which of
+        them rounding has made the first, so that it goes the same way on any ranks."""
+        direction = self._sum(fetch((modes * self.functional.mass) @ self._random(1)[0]))
+        return beside(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(self, hint: PETSc.Vec | None) -> float:
+    def _search_at_length(self, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
         """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
         for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
-        rigid = self.rigid = self._rigid_motions()
-        self.basis[0] = self._random()
+        start = self._random(BLOCK)
         if hint is not None:
-            self.basis[0] += self.memory.read(hint) / max(self._length(self.memory.read(hint)), TINY)
-        self._begin(0)
-        self._iterate(MOST, LEAST)
-        self.rigid = None
-        known = [self.mode[None]] if self.mode is not None else []
-        self._combine(np.concatenate([self.basis[:1], *known, *([] if rigid is None else [rigid])]))
-        self._begin(0)
-        return self._iterate(MOST, LEAST // 2)
+            start[0] += self._unit(self.memory.read(hint)[None])[0]
+        self.rigid = self._rigid_motions()
+        _, modes = self._iterate(self._without_rigid(start), MOST, LEAST)
+        known = [] if self.mode is None else [self.mode[None]]
+        rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
+        return self._iterate(np.concatenate([modes, *known, *rigid]), MOST, LEAST // 2)
 
-    def _random(self) -> np.ndarray:
-        """Something of each mode (n,), the same for any number of ranks, little of the stiff ones."""
+    def _random(self, count: int) -> np.ndarray:
+        """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
         lattice, free = self.functional.lattice, fetch(self.unknowns.free)
-        random = uniform(lattice.global_numbers[: lattice.owned])[free].T.ravel() - 0.5
-        self.basis[1] = beside(self.basis, random)
-        self._precondition(1)
-        return self.basis[1] / max(self._length(self.basis[1]), TINY)
+        numbers = lattice.global_numbers[: lattice.owned][free]
+        seeds = lattice.table.total * np.arange(count)
+        random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
+        return self._unit(self._preconditioned(beside(self.functional.mass, random)))
 
-    def _begin(self, *rows: int) -> None:
-        """Iterations from directions that stand in the first row, and in another."""
-        for row in rows:
-            self._leave_out_rigid(row)
-            self.basis[row] /= max(self._length(self.basis[row]), TINY)
-            self.hessian.mult(None, self.vectors[row], self.images[row])
-        self.directions = len(rows)
-
-    def _iterate(self, most: int, least: int) -> float:
-        """The lowest eigenvalue that the iterations come to; basis[0] is its direction."""
-        values = [float(self._sum(self.basis[0] @ self.products[0]))]
+    def _iterate(self, start: np.ndarray, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest eigenvalues (k,) that the iterations come to from directions (l, n), and theirs (k, n)."""
+        size, mass = min(BLOCK, len(start)), self.functional.mass
+        values, (x, last) = self._ritz((start, self._product(start)), size)
+        size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
-            values.append(self._improve(values[-1]))
-            if values[-1] < 0:
-                if its >= 4 and values[-1] > SHARPENED * values[-5]:
+            residuals = self._without_rigid(self._preconditioned(x[1] - values[:, None] * mass * x[0]))
+            w = self._unit(residuals)
+            blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
+            values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
+            lowest.append(values[0])
+            self.its += len(w)
+            if lowest[-1] < 0:
+                if its >= 2 and lowest[-1] > SHARPENED * lowest[-3]:
                     break
-            elif its >= least and values[-1] > SETTLED * values[its // 2]:
+            elif its >= least and lowest[-1] > SETTLED * lowest[its // 2]:
                 break
-        return values[-1]
+        return values, x[0]
 
-    def _improve(self, value: float) -> float:
-        """One iteration: the lowest curvature in the span of the mode, its preconditioned residual and the last move."""
-        mass, basis, products = self.functional.mass, self.basis, self.products
-        basis[1] = products[0] - value * mass * basis[0]
-        self._precondition(1)
-        self.its += 1
-        self._leave_out_rigid(1)
-        length = self._length(basis[1])
-        if not length > 0:
-            return value
-        basis[1] /= length
-        self.hessian.mult(None, self.vectors[1], self.images[1])
-        self.directions = min(self.directions + 1, 3)
-        grams = self._sum(np.stack([fetch(basis @ products.T), fetch((basis * mass) @ basis.T)]))
-        size = self.directions
-        while np.linalg.eigvalsh(grams[1, :size, :size])[0] < DEPENDENT:
-            size -= 1
-        if size == 1:
-            return value
-        (value, *_), parts = eigh(*(0.5 * (gram + gram.T)[:size, :size] for gram in grams))
-        parts = parts[:, 0] * np.copysign(1.0, parts[0, 0])  # so that the way it points does not hang on rounding
-        first, rest = parts[0], beside(basis, parts[1:])
-        moved, moved_product = rest @ basis[1:size], rest @ products[1:size]
-        basis[0], products[0] = first * basis[0] + moved, first * products[0] + moved_product
-        length = self._length(moved)
-        if length > 0:
-            basis[2], products[2] = moved / length, moved_product / length
-        else:
-            self.directions = 1
-        return float(value)
-
-    def _precondition(self, row: int) -> None:
-        """basis[row] becomes P^(-1) times itself."""
-        self.preconditioner.apply(None, self.vectors[row], self.images[row])
-        self.basis[row] = self.products[row]
+    def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
+        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
+        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        span, products = block
+        grams = self._sum(np.stack([fetch(span @ products.T), fetch((span * self.functional.mass) @ span.T)]))
+        sizes, parts = np.linalg.eigh(grams[1])
+        kept = sizes > DEPENDENT * max(sizes[-1], TINY)
+        parts = parts[:, kept] / np.sqrt(sizes[kept])
+        values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
+        parts = (parts @ turns)[:, :size].T
+        best = tuple(beside(a, parts) @ a for a in block)
+        if len(span) <= size:
+            return values[:size], (best, None)
+        moved = tuple(beside(a, parts[:, size:]) @ a[size:] for a in block)
+        lengths = np.maximum(self._lengths(moved[0]), TINY)
+        return values[:size], (best, tuple(a / beside(a, lengths)[:, None] for a in moved))
 
     def _rigid_motions(self) -> np.ndarray | None:
         """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
@@ -197,40 +177,41 @@ class LowestCurvature:
             motions = beside(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions
 
-    def _leave_out_rigid(self, row: int) -> None:
-        if self.rigid is not None:
-            parts = self._sum(fetch(self.rigid @ (self.functional.mass * self.basis[row])))
-            self.basis[row] -= beside(self.basis, parts) @ self.rigid
+    def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
+        if self.rigid is None:
+            return directions
+        parts = self._sum(fetch((directions * self.functional.mass) @ self.rigid.T))
+        return directions - beside(directions, parts) @ self.rigid
 
-    def _combine(self, span: np.ndarray) -> None:
-        """basis[0] becomes the direction of lowest curvature in the span of the rows (k, n)."""
-        products = np.empty_like(span)
-        for row in range(len(span)):
-            self.basis[1] = span[row]
-            self.hessian.mult(None, self.vectors[1], self.images[1])
-            products[row] = self.products[1]
-        grams = self._sum(np.stack([fetch(span @ products.T), fetch((span * self.functional.mass) @ span.T)]))
-        sizes, parts = np.linalg.eigh(grams[1])
-        parts = parts[:, sizes > DEPENDENT * sizes[-1]] / np.sqrt(sizes[sizes > DEPENDENT * sizes[-1]])
-        _, best = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
-        best = parts @ best[:, 0]
-        self.basis[0] = beside(self.basis, best * np.copysign(1.0, best[0])) @ span
+    def _product(self, directions: np.ndarray) -> np.ndarray:
+        """H of each."""
+        return self._of_each(self.hessian.mult, directions)
 
-    def _create_arrays(self) -> None:
-        """Mode, residual and last move (3, n), and what H makes of each; vectors of PETSc's over the rows."""
-        if self.basis is not None:
-            return
-        like = self.functional.mass
-        self.basis, self.products = np.zeros((3, len(like)), like=like), np.zeros((3, len(like)), like=like)
-        self.vectors = [self.memory.over(row, self.comm) for row in self.basis]
-        self.images = [self.memory.over(row, self.comm) for row in self.products]
+    def _preconditioned(self, directions: np.ndarray) -> np.ndarray:
+        """P^(-1) of each."""
+        return self._of_each(self.preconditioner.apply, directions)
 
-    def _length(self, direction: np.ndarray) -> float:
-        """In the norm of M."""
-        return float(np.sqrt(self._sum(float(direction**2 @ self.functional.mass))))
+    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
+        if self.vectors is None:
+            self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
+        given, made = self.vectors
+        results = np.empty_like(directions)
+        for direction, result in zip(directions, results, strict=True):
+            self.memory.write(given)[:] = direction
+            act(None, given, made)
+            result[:] = self.memory.read(made)
+        return results
 
-    def _sum(self, values: np.ndarray | float) -> np.ndarray:
-        return self.comm.allreduce(np.asarray(fetch(values) if isinstance(values, np.ndarray) else float(values)))
+    def _unit(self, directions: np.ndarray) -> np.ndarray:
+        """Of unit length in the norm of M; those of no length stay so."""
+        return directions / beside(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+
+    def _lengths(self, directions: np.ndarray) -> np.ndarray:
+        return np.sqrt(self._sum(fetch(directions**2 @ self.functional.mass)))
+
+    def _sum(self, values: np.ndarray) -> np.ndarray:
+        """Over all ranks."""
+        return self.comm.allreduce(values)
 
     def save(self, saved: Saved) -> None:
         """What the next step's search depends on."""
@@ -239,18 +220,17 @@ class LowestCurvature:
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
         saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
-        saved.numbers |= {"searched_value": self.value, "knows_mode": self.mode is not None}
+        saved.numbers["knows_mode"] = self.mode is not None
 
     def restore(self, saved: Saved) -> None:
         """Go on from there; from nothing saved as if no step had been taken."""
         numbers = saved.numbers
         self.searched = Compression(numbers.get("searched_greatest", 0.0), numbers.get("searched_total", 0.0), False)
-        self.value, self.mode = numbers.get("searched_value", 1.0), None
+        self.mode = None
         if numbers.get("knows_mode"):
             rows = beside(self.functional.mass, saved.rows["lowest_mode"])
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def destroy(self) -> None:
-        if self.basis is not None:
-            for vector in (*self.vectors, *self.images):
-                vector.destroy()
+        for vector in self.vectors or ():
+            vector.destroy()

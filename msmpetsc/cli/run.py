@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
-import petsc4py
 from mpi4py import MPI
 
 from msmpetsc import __version__
@@ -25,6 +24,7 @@ from msmpetsc.output.earlier import Earlier
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene import Scene
+from msmpetsc.solve.initialise import initialise
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model
@@ -89,16 +89,19 @@ def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
     comm = MPI.COMM_WORLD
     earlier = resume.look(comm, args)
-    petsc4py.init(["msmpetsc", *args.petsc_options])
+    initialise(comm, args.petsc_options)
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.device import choose
-    from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
+    from msmpetsc.solve.options import refuse_early
+    from msmpetsc.solve.simulate import Simulation, refuse_bad_options  # imports PETSc, which reads its options only once
 
+    refuse_early(comm, args.parser._option_string_actions)
     choose(comm, args.device)
     began = perf_counter()
     measured, interval = what_is_measured(args), Interval(args.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(args, earlier)))
+    refuse_bad_options(comm, scene, measured)
     refuse_steps_beyond(scene.time.steps, args, earlier.step if earlier else 0)
     on_root(comm, lambda: refuse_unwritable(args.measure))
     path = args.output or Path("out") / f"{args.scene.stem}.h5"

@@ -5,14 +5,17 @@ from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, StepFailed
+
+NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked to make an error of it
 
 
 @contextmanager
 def refusal(what: str) -> Iterator[None]:
     """PETSc's errors in the block, or in the function decorated, become InputError ``what``: its last words.
 
-    ImportError is that of an object of type python whose context is not there.
+    ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
+    option made that an error, becomes StepFailed.
     """
     try:
         yield
@@ -21,6 +24,8 @@ def refusal(what: str) -> Iterator[None]:
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError)):
             raise error.__cause__
+        if getattr(error, "ierr", 0) == NOT_CONVERGED:
+            raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
         raise InputError(f"{what}: {last_words(error.__cause__ or error)}") from None
 
 

@@ -7,6 +7,7 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
@@ -20,7 +21,12 @@ from msmpetsc.solve.balance import EnergyBalance
 from msmpetsc.solve.device import sender
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
-from msmpetsc.solve.rescue import Done, Rescue
+from msmpetsc.solve.options import refuse_bad_values, refuse_unused
+from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.reference import PREFIX as REFERENCE
+from msmpetsc.solve.reference import PRESET
+from msmpetsc.solve.rescue import PREFIX as FALLBACK
+from msmpetsc.solve.rescue import ROBUST, Done, Rescue
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 from msmpetsc.solve.surface import SurfaceMotion
@@ -28,6 +34,18 @@ from msmpetsc.solve.verlet import Verlet
 from msmpetsc.solve.watch import Watch
 
 INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+
+
+def refuse_bad_options(comm: MPI.Comm, scene: Scene, measured: Measured) -> None:
+    """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
+    if INTEGRATORS[scene.time.integrator] is Verlet:
+        refuse_unused(comm, set(), awaited=(FALLBACK,) if scene.safety.on_failure == "fallback" else ())
+    else:
+        on_root(comm, lambda: refuse_bad_values(find_preset(scene.solver.preset)))
+    if scene.safety.on_failure == "fallback":
+        on_root(comm, lambda: refuse_bad_values(find_preset(ROBUST), FALLBACK))
+    if measured != Measured():
+        on_root(comm, lambda: refuse_bad_values(find_preset(PRESET), REFERENCE))
 
 
 WHOLE = Done()  # a step that needed no rescue

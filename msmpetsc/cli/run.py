@@ -23,7 +23,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.earlier import Earlier
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
-from msmpetsc.scene import Scene
+from msmpetsc.scene import Scene, Solver
 from msmpetsc.solve.initialise import initialise
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
@@ -67,6 +67,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
     parser.add_argument("--measure", type=Path, metavar="OUT.json", help="write what the run cost: times, memory")
+    parser.add_argument(
+        "--show-options", action="store_true", help="say which PETSc options a preset sets, as an options file"
+    )
     parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
 
 
@@ -88,6 +91,8 @@ class ListPresets(argparse.Action):
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
     comm = MPI.COMM_WORLD
+    if args.show_options:
+        return show_options(comm, args)
     earlier = resume.look(comm, args)
     initialise(comm, args.petsc_options)
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
@@ -141,6 +146,29 @@ def run(args: argparse.Namespace) -> int:
         return tell_stop(stopped, path, simulation)
     on_root(comm, lambda: finish(path, args))
     simulation.refuse_unused_options(at_end=True)
+    return 0
+
+
+def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
+    """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
+    earlier = resume.look(comm, args) if args.scene or args.resume else None
+    initialise(comm, args.petsc_options)
+    from msmpetsc.solve.device import choose
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early
+    from msmpetsc.solve.presets import find_preset, shown_options
+    from msmpetsc.solve.simulate import solvers_of
+
+    refuse_early(comm, args.parser._option_string_actions)
+    choose(comm, args.device)
+    if args.scene or earlier:
+        solvers = solvers_of(comm.bcast(on_root(comm, lambda: read_scene(args, earlier))), what_is_measured(args))
+    elif args.set or args.frames:
+        raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
+    else:
+        solvers = {"": (find_preset(args.preset or Solver().preset), 0)}
+    on_root(comm, lambda: refuse_bad_values(solvers))
+    if comm.rank == 0:
+        print("\n".join(shown_options(solvers)))
     return 0
 
 

@@ -17,7 +17,7 @@ from msmpetsc.solve.library import Integer, library_file, open_viewer, petsc_lib
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
 
-READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view)$")
+READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$")
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
 SWITCHES_READ_AT_THE_END = ("options_left", "get_total_flops", "mpidump")
 VIEWERS_READ_AT_THE_END = ("log_view", "options_view", "memory_view")
@@ -64,21 +64,25 @@ def refuse_early(comm: MPI.Comm, ours: Collection[str]) -> None:
     _check_what_is_read_at_the_end(database)
 
 
-def refuse_bad_values(preset: Preset, prefix: str = "") -> None:
-    """Raise InputError for types and values of options that PETSc's solvers refuse, before there is anything to solve."""
+def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
+    """Raise InputError for types and values of options that PETSc's solvers refuse, before there is anything to solve.
+
+    solvers : prefix of their options -> preset and budget of iterations
+    """
     if "help" in PETSc.Options().getAll():  # once is enough
         return
-    names, objects = set_defaults(preset, prefix), []
-    try:
-        with refusal("PETSc refuses its options"):
-            for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
-                objects.append(kind().create(PETSc.COMM_SELF))
-                objects[-1].setOptionsPrefix(prefix)
-                objects[-1].setFromOptions()
-    finally:
-        for one in objects:
-            one.destroy()
-        forget_defaults(names)
+    for prefix, (preset, budget) in solvers.items():
+        names, objects = set_defaults(preset, prefix, budget), []
+        try:
+            with refusal("PETSc refuses its options"):
+                for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
+                    objects.append(kind().create(PETSc.COMM_SELF))
+                    objects[-1].setOptionsPrefix(prefix)
+                    objects[-1].setFromOptions()
+        finally:
+            for one in objects:
+                one.destroy()
+            forget_defaults(names)
 
 
 def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:

@@ -22,7 +22,7 @@ from msmpetsc.solve.device import sender
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
 from msmpetsc.solve.options import refuse_bad_values, refuse_unused
-from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.reference import PREFIX as REFERENCE
 from msmpetsc.solve.reference import PRESET
 from msmpetsc.solve.rescue import PREFIX as FALLBACK
@@ -36,16 +36,24 @@ from msmpetsc.solve.watch import Watch
 INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
 
 
+def solvers_of(scene: Scene, measured: Measured) -> dict[str, tuple[Preset, int]]:
+    """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations."""
+    solvers = {}
+    if INTEGRATORS[scene.time.integrator] is not Verlet:
+        solvers[""] = find_preset(scene.solver.preset), scene.solver.max_iterations or 0
+    if scene.safety.on_failure == "fallback":
+        solvers[FALLBACK] = find_preset(ROBUST), 0
+    if measured != Measured():
+        solvers[REFERENCE] = find_preset(PRESET), 0
+    return solvers
+
+
 def refuse_bad_options(comm: MPI.Comm, scene: Scene, measured: Measured) -> None:
     """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
-    if INTEGRATORS[scene.time.integrator] is Verlet:
-        refuse_unused(comm, set(), awaited=(FALLBACK,) if scene.safety.on_failure == "fallback" else ())
-    else:
-        on_root(comm, lambda: refuse_bad_values(find_preset(scene.solver.preset)))
-    if scene.safety.on_failure == "fallback":
-        on_root(comm, lambda: refuse_bad_values(find_preset(ROBUST), FALLBACK))
-    if measured != Measured():
-        on_root(comm, lambda: refuse_bad_values(find_preset(PRESET), REFERENCE))
+    solvers = solvers_of(scene, measured)
+    if "" not in solvers:
+        refuse_unused(comm, set(), at_end=True, awaited=tuple(solvers))
+    on_root(comm, lambda: refuse_bad_values(solvers))
 
 
 WHOLE = Done()  # a step that needed no rescue

@@ -18,10 +18,12 @@ from msmpetsc.solve.estimate import ErrorEstimate
 from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
-from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
+from msmpetsc.solve.operators import (
+    ContactBlocks, Preconditioned, Preconditioner, ThreeColumns, TrueHessian, python_matrix,
+)  # fmt: skip
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
-from msmpetsc.solve.system import assemble
+from msmpetsc.solve.system import ViewOfA, assemble
 from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
@@ -107,16 +109,18 @@ class Stepper:
     @refusal("PETSc refuses its options")
     def _create_solver(self, time_step: float, touches: bool) -> None:
         self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step, prefix=self.prefix))
+        self._keep(ViewOfA(self.prefix))
         self.touches = touches
         self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self._contact_blocks(time_step))
         self.projected = False  # whether newton's is, at the moment
         self.linear = self.hessian
         if not self.preset.true_hessian:
-            self.linear = ThreeColumns(self.matrix, self.memory, self._contact_blocks(time_step))
+            self.linear = ThreeColumns(self.matrix, self.unknowns, self._contact_blocks(time_step))
         self.operator = self._keep(python_matrix(self.unknowns, self.linear, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
         preconditioner = self._create_preconditioner(time_step)
+        self.pmat = self._keep(python_matrix(self.unknowns, Preconditioned(self.preconditioned), self.comm))
         self.snes = self._keep(PETSc.SNES().create(self.comm))
         self.snes.setOptionsPrefix(self.prefix)
         self.inner = self.snes
@@ -130,7 +134,7 @@ class Stepper:
         pc.setPythonContext(preconditioner)
         self.estimate = self._keep(ErrorEstimate(self.functional, self.hessian, preconditioner, self.prefix))
         self.snes.setFunction(self._residual, self.f)
-        self.snes.setJacobian(self._linearise, self.operator, self.operator)
+        self.snes.setJacobian(self._linearise, self.operator, self.pmat)
         self.snes.setObjective(self._objective)
         self.snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -167,7 +171,7 @@ class Stepper:
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
-        self.ksp.setOperators(self.operator, self.operator)
+        self.ksp.setOperators(self.operator, self.pmat)
         self.ksp.setUp()
 
     @refusal("PETSc cannot take a step with these options")
@@ -299,6 +303,8 @@ class Stepper:
         changed = self.touches and self._precondition_contact()
         if self.preset.true_hessian or changed:
             self.operator.assemble()
+        if changed:
+            self.pmat.assemble()
         self.local.end()
         if self.preset.start_from_b:
             self._start_from_b(snes, x)
@@ -331,6 +337,8 @@ class Stepper:
 
     def _start_from_estimate(self, snes: PETSc.SNES, given: bool) -> None:
         """CG goes on from what the estimate at this x, if it was ``given``, found of the same correction."""
+        if f"{self.prefix}ksp_initial_guess_nonzero" in PETSc.Options().getAll():
+            return
         given = given and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
         if given:
             self.estimate.correction.copy(snes.getSolutionUpdate())
@@ -378,7 +386,7 @@ class Stepper:
         if not np.isfinite(self.residual):
             return reasons.DIVERGED_FNORM_NAN
         if self.last_error <= (self.error or 0.0):
-            return reasons.CONVERGED_FNORM_RELATIVE
+            return reasons.CONVERGED_SNORM_RELATIVE if self.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
             if not self.corrected:
                 self.last_error = self._estimated(f, self.functional.away(), 0.0)

@@ -39,6 +39,7 @@ NO_USE = {  # names -> what is so instead
     r"snes_(mf|mf_.*|fd|fd_.*)": NO_DIFFERENCES,
     r"snes_lag_.*|ksp_reuse_preconditioner": NO_LAG,
     r"(snes|ksp)_error_if_not_converged": "a step that does not converge ends the run already, with exit status 3",
+    r"(three_columns|estimate)_.*": "the preconditioner of A, and of all that needs one, has the bare -pc_ options",
     r"snes_(grid_sequence|adapt_.*)": "there is one lattice: cages.count or cages.cell_size say how fine it is",
 }
 NO_USE_AS = {  # names -> values, what is so instead

@@ -1,6 +1,6 @@
 """What PETSc says of options that it cannot use, as the one line of an InputError."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from petsc4py import PETSc
@@ -11,11 +11,13 @@ NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked
 
 
 @contextmanager
-def refusal(what: str) -> Iterator[None]:
+def refusal(what: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """PETSc's errors in the block, or in the function decorated, become InputError ``what``: its last words.
 
     ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
     option made that an error, becomes StepFailed.
+
+    abandon : called after such an error
     """
     try:
         yield
@@ -24,6 +26,7 @@ def refusal(what: str) -> Iterator[None]:
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError)):
             raise error.__cause__
+        abandon()
         if getattr(error, "ierr", 0) == NOT_CONVERGED:
             raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
         raise InputError(f"{what}: {last_words(error.__cause__ or error)}") from None

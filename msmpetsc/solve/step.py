@@ -1,5 +1,6 @@
 """One implicit Euler step as one PETSc SNES (design: one step, many methods): it solves F(x) = grad g(x) = 0."""
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -165,16 +166,15 @@ class Stepper:
         self.owned_objects.append(owned)
         return owned
 
-    @refusal("PETSc cannot set up the solver")
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
-        self.ksp.setOperators(self.operator, self.pmat)
-        self.ksp.setUp()
+        with refusal("PETSc cannot set up the solver", self._abandon):
+            self.ksp.setOperators(self.operator, self.pmat)
+            self.ksp.setUp()
 
-    @refusal("PETSc cannot take a step with these options")
     def step(
         self,
         q: np.ndarray,
@@ -193,6 +193,10 @@ class Stepper:
 
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
+        with refusal("PETSc cannot take a step with these options", self._abandon):
+            return self._step(q, y, load, contact, led, start)
+
+    def _step(self, q, y, load, contact, led, start) -> StepResult:
         its_before = self.all_its()
         self.functional.begin(q, y, load, contact, led)
         self.base[:] = self.functional.q
@@ -426,6 +430,12 @@ class Stepper:
             f"relative error {self.last_error:.2e}, worst at {worst}{cells}; try {advice}",
             kind,
         )
+
+    def _abandon(self) -> None:
+        """After an error within PETSc its objects may be in the middle of something, and crash when they are destroyed: they
+        stay, even when the interpreter ends."""
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
+        self.owned_objects = [owned for owned in self.owned_objects if isinstance(owned, ViewOfA)]
 
     def destroy(self) -> None:
         """Collective, and in the same order on all ranks; the garbage collector's would differ."""

@@ -59,6 +59,8 @@ NO_USE = {
     "snes_type": ("newtontr", "newtonls"),
     "three_columns_pc_type": ("bjacobi", "-pc_"),
     "ksp_error_if_not_converged": ("", "status 3"),
+    "ksp_monitor": ("binary:f.dat", "ascii:FILE"),
+    "ksp_view_diagonal_scale": ("", "not scaled"),
     "ksp_tpye": ("cg", "did you mean 'ksp_type'"),
     "ksp_vieww": ("", "did you mean 'ksp_view'"),
     "mg_levels_ksp_typ": ("cg", "no option of this name"),
@@ -227,6 +229,17 @@ def test_newton_starts_its_solves_where_the_user_says(petsc_options):  # noqa: F
     stepper.step(lattice.nodes, lattice.nodes, weight(lattice))
     assert stepper.ksp.getInitialGuessNonzero()
     stepper.destroy()
+
+
+def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):  # noqa: F811
+    petsc_options(ksp_type="chebyshev")
+    assert all(result.error <= 1e-3 for result in swing("newton", 2, error=1e-3))
+
+
+def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):  # noqa: F811
+    petsc_options(snes_monitor_python="gone.monitor")
+    with pytest.raises(InputError, match="gone"):
+        refuse_bad_values({"": (find_preset("newton"), 0)})
 
 
 # Matrices

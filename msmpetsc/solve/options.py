@@ -40,12 +40,15 @@ NO_USE = {  # names -> what is so instead
     r"snes_lag_.*|ksp_reuse_preconditioner": NO_LAG,
     r"(snes|ksp)_error_if_not_converged": "a step that does not converge ends the run already, with exit status 3",
     r"(three_columns|estimate)_.*": "the preconditioner of A, and of all that needs one, has the bare -pc_ options",
+    r"ksp_view_diagonal_scale": "the operator is not scaled",
     r"snes_(grid_sequence|adapt_.*)": "there is one lattice: cages.count or cages.cell_size say how fine it is",
 }
-NO_USE_AS = {  # names -> values, what is so instead
-    "snes_stol": (r"(?!0+\.?0*$).*", BY_ERROR),  # 0 is what presets set
-    "snes_type": (r"newtontr(dc)?", TRUST_REGION),
-}
+NO_USE_AS = [  # names, values, what is so instead; the last two would crash
+    ("snes_stol", r"(?!0+\.?0*$).*", BY_ERROR),  # 0 is what presets set
+    ("snes_type", r"newtontr(dc)?", TRUST_REGION),
+    ("snes_type", r"aspin|nasm|patch", "it needs a DM of PETSc's, and the lattice is none"),
+    (r"(.*_)?ksp_monitor\w*", r"(binary|hdf5|vtk|socket|string|saws)\b.*", "what it shows is text: ascii:FILE"),
+]
 
 
 def refuse_early(comm: MPI.Comm, ours: Collection[str]) -> None:
@@ -75,7 +78,7 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
     for prefix, (preset, budget) in solvers.items():
         names, objects = set_defaults(preset, prefix, budget), []
         try:
-            with refusal("PETSc refuses its options"):
+            with refusal("PETSc refuses its options", others=Exception):  # of what it is to load, a Python file maybe
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
                     objects.append(kind().create(PETSc.COMM_SELF))
                     objects[-1].setOptionsPrefix(prefix)
@@ -110,9 +113,9 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited:
 def _no_use(name: str, value: str | None) -> str | None:
     """Why an option of this name and value is refused; None if it is not."""
     bare = OF_STEPPERS.sub("", name)
-    values, instead = NO_USE_AS.get(bare, ("(?!)", ""))
-    if re.fullmatch(values, value or ""):
-        return f"-{name} {value or ''}: {instead}"
+    for names, values, instead in NO_USE_AS:
+        if re.fullmatch(names, bare) and re.fullmatch(values, value or ""):
+            return f"-{name} {value or ''}: {instead}".replace(" :", ":")
     return next((f"-{name}: {instead}" for names, instead in NO_USE.items() if re.fullmatch(names, bare)), None)
 
 

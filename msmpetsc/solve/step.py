@@ -172,6 +172,7 @@ class Stepper:
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
         with refusal("PETSc cannot set up the solver", self._abandon):
+            self.hessian.linearise(self.lattice.nodes, None)  # some solvers try it: Chebyshev's, for its eigenvalues
             self.ksp.setOperators(self.operator, self.pmat)
             self.ksp.setUp()
 

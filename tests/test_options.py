@@ -63,7 +63,7 @@ NO_USE = {
     "ksp_view_diagonal_scale": ("", "not scaled"),
     "ksp_tpye": ("cg", "did you mean 'ksp_type'"),
     "ksp_vieww": ("", "did you mean 'ksp_view'"),
-    "mg_levels_ksp_typ": ("cg", "no option of this name"),
+    "mg_levels_ksp_typ": ("cg", "no part of this run"),
     "presett": ("newton", "did you mean '--preset'"),
     "options_left": ("abc", "abc"),
     "log_view": ("foo:bar", "foo"),

@@ -24,6 +24,7 @@ VIEWERS_READ_AT_THE_END = ("log_view", "options_view", "memory_view")
 LITERAL = re.compile(rb"-([A-Za-z]\w*(?:%l*d\w*)?)\0")  # %d: of a block
 OF_STEPPERS = re.compile(r"^(reference_|fallback_)")
 
+NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
 NO_DIFFERENCES = "Hessians are applied spring by spring already, without differences"
 NO_LAG = "each solve takes the Hessian of its iterate; A is constant, and made ready once"
@@ -104,7 +105,8 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited:
         and (at_end or not READ_WHILE_SOLVING.search(name))
         and not name.startswith(awaited)
     ]
-    message = "\n".join(f"-{name}: no part of this run uses this PETSc option" for name in unused)
+    lines = (f"-{name}: {NO_PART}" if _is_in_library(name) else _unknown(name, ()) for name in unused)
+    message = "\n".join(lines)
     message = comm.bcast(message)
     if message:
         raise InputError(message)
@@ -122,7 +124,7 @@ def _no_use(name: str, value: str | None) -> str | None:
 def _unknown(name: str, ours: Collection[str]) -> str:
     valid = {known: known for known in _names_in_library() if "_" in known} | {own.lstrip("-"): own for own in ours}
     near = nearest(name, valid)
-    return f"-{name}: PETSc knows no option of this name" + (f", did you mean {valid[near]!r}?" if near else "")
+    return f"-{name}: {NO_PART}" + (f", did you mean {valid[near]!r}?" if near else "")
 
 
 def _is_in_library(name: str) -> bool:

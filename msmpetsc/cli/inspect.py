@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import petsc4py
 from mpi4py import MPI
 from scipy.optimize import brentq
 
@@ -19,6 +18,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene import Scene
 from msmpetsc.scene_reading import load_scene
+from msmpetsc.solve.initialise import initialise
 
 if TYPE_CHECKING:
     from msmpetsc.geometry.surface import Surface
@@ -55,11 +55,13 @@ def run(args: argparse.Namespace) -> int:
     """Inspect; returns the exit status."""
     refuse_ranks("inspect", "it counts for --ranks R on one process")
     refuse_bad_numbers(args)
-    petsc4py.init(["msmpetsc", *args.petsc_options])
+    initialise(MPI.COMM_WORLD, args.petsc_options)
     from msmpetsc.model.build import read_body
     from msmpetsc.model.shares import shares_of
+    from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.presets import PRESETS
 
+    refuse_early(MPI.COMM_WORLD, args.parser._option_string_actions)
     signal.signal(signal.SIGTERM, stop)
     scene = load_scene(args.scene, args.set, PRESETS)
     before = peak_memory()

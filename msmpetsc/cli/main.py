@@ -24,9 +24,9 @@ def main(arguments: list[str] | None = None) -> int:
     _speak_on_root(comm)
     try:
         ours, petsc = split_petsc_options(sys.argv[1:] if arguments is None else arguments)
-        args = _parser().parse_args(ours)
-        if petsc and not args.takes_petsc_options:
-            raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
+        parser = _parser()
+        _refuse_one_dash(parser, ours, petsc)
+        args = parser.parse_args(ours)
         args.petsc_options = petsc
         return args.run(args)
     except MsmpetscError as error:
@@ -58,6 +58,20 @@ def _is_petsc_option(word: str) -> bool:
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
 
 
+def _refuse_one_dash(parser: argparse.ArgumentParser, ours: list[str], petsc: list[str]) -> None:
+    """Raise InputError for options of ours that have lost a dash, and for any of PETSc's where there is no use for them."""
+    command = parser.get_default("commands").choices.get(ours[0] if ours else "")
+    if command is None:  # argparse says so
+        return
+    takes_them, known = command.get_default("takes_petsc_options"), command._option_string_actions
+    for word in petsc:
+        name = f"-{word.partition('=')[0]}"
+        if name in known and not (takes_them and name == "--help"):  # PETSc has a -help, too
+            raise InputError(f"{word}: options of one dash are PETSc's, did you mean {name!r}?")
+    if petsc and not takes_them:
+        raise InputError(f"{petsc[0]}: {ours[0]} takes no PETSc options{did_you_mean(f'-{petsc[0]}', known)}")
+
+
 class _Parser(argparse.ArgumentParser):
     """Speaks on rank 0 only, and names the nearest option for one it does not know."""
 
@@ -80,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="msmpetsc", description=__import__("msmpetsc").__doc__)
     parser.add_argument("--version", action="version", version=f"msmpetsc {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parser.set_defaults(commands=commands)
     for command in COMMANDS:
         command.add_parser(commands)
         sub = commands.choices[command.__name__.rpartition(".")[2]]

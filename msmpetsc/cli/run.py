@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
-import petsc4py
 from mpi4py import MPI
 
 from msmpetsc import __version__
@@ -25,7 +24,8 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.earlier import Earlier
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
-from msmpetsc.scene import Scene
+from msmpetsc.scene import Scene, Solver
+from msmpetsc.solve.initialise import initialise
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.measured import Measured
@@ -67,6 +67,9 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
     parser.add_argument("--measure", type=Path, metavar="OUT.json", help="write what the run cost: times, memory")
+    parser.add_argument(
+        "--show-options", action="store_true", help="say which PETSc options a preset sets, as an options file"
+    )
     parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
 
 
@@ -88,22 +91,27 @@ class ListPresets(argparse.Action):
 def run(args: argparse.Namespace) -> int:
     """Simulate; returns the exit status (collective)."""
     comm, started = MPI.COMM_WORLD, perf_counter()
+    if args.show_options:
+        return show_options(comm, args)
     refuse_other_format("-o", args.output, RESULT_NAMES)
     refuse_other_format("--measure", args.measure, MEASURE_NAMES)
     earlier = resume.look(comm, args)
-    petsc4py.init(["msmpetsc", *args.petsc_options])
+    initialise(comm, args.petsc_options)
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
     from msmpetsc.place.compiling import cache_is_empty, compilation_logged
 
     all_are_new = cache_is_empty()
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.device import choose
-    from msmpetsc.solve.simulate import Simulation  # imports PETSc, which reads its options only once
+    from msmpetsc.solve.options import refuse_early
+    from msmpetsc.solve.simulate import Simulation, refuse_bad_options  # imports PETSc, which reads its options only once
 
+    refuse_early(comm, args.parser._option_string_actions)
     choose(comm, args.device)
     began = perf_counter()
     measured, interval = what_is_measured(args), Interval(args.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(args, earlier)))
+    refuse_bad_options(comm, scene, measured)
     refuse_steps_beyond(scene.time.steps, args, earlier.step if earlier else 0)
     on_root(comm, lambda: refuse_unwritable(args.measure))
     path = args.output or Path("out") / f"{args.scene.stem}.h5"
@@ -150,6 +158,29 @@ def run(args: argparse.Namespace) -> int:
     if stopped:
         return tell_stop(stopped, path, simulation)
     simulation.refuse_unused_options(at_end=True)
+    return 0
+
+
+def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
+    """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
+    earlier = resume.look(comm, args) if args.scene or args.resume else None
+    initialise(comm, args.petsc_options)
+    from msmpetsc.solve.device import choose
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early
+    from msmpetsc.solve.presets import find_preset, shown_options
+    from msmpetsc.solve.simulate import solvers_of
+
+    refuse_early(comm, args.parser._option_string_actions)
+    choose(comm, args.device)
+    if args.scene or earlier:
+        solvers = solvers_of(comm.bcast(on_root(comm, lambda: read_scene(args, earlier))), what_is_measured(args))
+    elif args.set or args.frames:
+        raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
+    else:
+        solvers = {"": (find_preset(args.preset or Solver().preset), 0)}
+    on_root(comm, lambda: refuse_bad_values(solvers))
+    if comm.rank == 0:
+        print("\n".join(shown_options(solvers)))
     return 0
 
 

@@ -1,6 +1,7 @@
 """PETSc's C functions that petsc4py lacks."""
 
 import ctypes
+import os
 
 from petsc4py import PETSc
 
@@ -25,3 +26,29 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
     found = array.value or 0
     library.MatDenseRestoreArrayAndMemType(handle, ctypes.byref(array))
     return found
+
+
+def library_file() -> str:
+    """Where PETSc's C library is, as the loader has it (dladdr)."""
+    info, place = _DlInfo(), ctypes.cast(petsc_library().PetscInitialize, ctypes.c_void_p)
+    found = ctypes.CDLL(None).dladdr(place, ctypes.byref(info))
+    return os.fsdecode(info.file) if found and info.file else PETSc.__file__
+
+
+def open_viewer(option: str) -> None:
+    """Open and close the viewer that an option of the user's names (PetscOptionsGetViewer) (collective).
+
+    Raises PETSc.Error where there is no such viewer, or its file cannot be written.
+    """
+    library, viewer, kind, given = petsc_library(), ctypes.c_void_p(), ctypes.c_int(), ctypes.c_int()
+    world = ctypes.c_void_p.in_dll(library, "PETSC_COMM_WORLD")
+    wanted = (world, None, None, f"-{option}".encode(), *map(ctypes.byref, (viewer, kind, given)))
+    error = library.PetscOptionsGetViewer(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))
+    if error:
+        raise PETSc.Error(error)
+
+
+class _DlInfo(ctypes.Structure):
+    _fields_ = [
+        ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("symbol", ctypes.c_char_p), ("address", ctypes.c_void_p)
+    ]  # fmt: skip

@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.penalty import Contact
 from msmpetsc.place.arrays import beside, fetch
+from msmpetsc.solve.explicit import asks_for_entries, explicit
 from msmpetsc.solve.memory import HOST, Memory
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -55,12 +56,24 @@ class ContactBlocks:
             y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
 
 
-class ThreeColumns:
+class Viewable:
+    """A MATPYTHON context that can be written to a file: an empty one would be all that PETSc could make of it."""
+
+    unknowns: Unknowns
+
+    def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        if asks_for_entries(viewer):
+            matrix = explicit(operator, self.unknowns)
+            matrix.view(viewer)
+            matrix.destroy()
+
+
+class ThreeColumns(Viewable):
     """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
 
-    def __init__(self, matrix: PETSc.Mat, memory: Memory, contact: ContactBlocks | None = None):
-        self.matrix, self.memory, self.contact = matrix, memory, contact
-        self.input = Block(matrix, memory)
+    def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
+        self.matrix, self.unknowns, self.memory, self.contact = matrix, unknowns, unknowns.memory, contact
+        self.input = Block(matrix, self.memory)
         self.product = matrix.matMult(self.input.mat)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -75,7 +88,7 @@ class ThreeColumns:
         self.product.destroy()
 
 
-class TrueHessian:
+class TrueHessian(Viewable):
     """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring."""
 
     def __init__(
@@ -99,6 +112,16 @@ class TrueHessian:
         self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
         if self.contact:
             self.contact.add(x, y)
+
+
+class Preconditioned:
+    """What stands for A where PETSc wants a matrix to precondition with, 3m x 3m: a MATPYTHON that A is seen through."""
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.matrix = matrix
+
+    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        self.matrix.view(viewer)
 
 
 class Preconditioner:
@@ -146,10 +169,13 @@ class Preconditioner:
             part.destroy()
 
 
-def python_matrix(unknowns: Unknowns, context: ThreeColumns | TrueHessian, comm: PETSc.Comm) -> PETSc.Mat:
+def python_matrix(
+    unknowns: Unknowns, context: ThreeColumns | TrueHessian | Preconditioned, comm: PETSc.Comm
+) -> PETSc.Mat:
     """A MATPYTHON on vectors of unknowns."""
     size = (3 * unknowns.size, 3 * unknowns.total)
     matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
+    matrix.setName(type(context).__name__)
     matrix.setVecType(unknowns.memory.vec_type)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     matrix.setUp()

@@ -199,6 +199,29 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
     return names
 
 
+def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
+    """What PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
+
+    solvers : prefix of their options -> preset and budget of iterations
+
+    A tolerance that is held to what a step needs stands in a comment: given, it would be held to as it is.
+    """
+    ours = {prefix: set_defaults(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()}
+    adapting = {f"{prefix}ksp_rtol" for prefix, (preset, _) in solvers.items() if preset.inexact}
+    adapting &= set().union(*ours.values())
+    lines = []
+    for name, value in sorted(PETSc.Options().getAll().items()):
+        line = f"-{name} {_quoted(value)}".rstrip()
+        lines.append(f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line)
+    for names in ours.values():
+        forget_defaults(names)
+    return lines
+
+
+def _quoted(value: str | None) -> str:
+    return f'"{value}"' if value and " " in value else value or ""
+
+
 def forget_defaults(names: set[str]) -> None:
     """Take them out again: another preset may follow, and -options_left is to show the user's own."""
     in_use.subtract(names)

@@ -1,26 +1,35 @@
 """What PETSc says of options that it cannot use, as the one line of an InputError."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, StepFailed
+
+NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked to make an error of it
 
 
 @contextmanager
-def refusal(what: str) -> Iterator[None]:
+def refusal(what: str, abandon: Callable[[], None] = lambda: None, others: type = PETSc.Error) -> Iterator[None]:
     """PETSc's errors in the block, or in the function decorated, become InputError ``what``: its last words.
 
-    ImportError is that of an object of type python whose context is not there.
+    ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
+    option made that an error, becomes StepFailed.
+
+    abandon : called after such an error
+    others  : further exceptions that come of options here
     """
     try:
         yield
-    except (PETSc.Error, ImportError) as error:
+    except (PETSc.Error, ImportError, others) as error:
         # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, to the end.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
-        if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError)):
+        if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError, others)):
             raise error.__cause__
+        abandon()
+        if getattr(error, "ierr", 0) == NOT_CONVERGED:
+            raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
         raise InputError(f"{what}: {last_words(error.__cause__ or error)}") from None
 
 

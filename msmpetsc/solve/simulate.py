@@ -7,6 +7,7 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.elasticity import Elasticity
@@ -20,7 +21,12 @@ from msmpetsc.solve.balance import EnergyBalance
 from msmpetsc.solve.device import sender
 from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.measured import Measured
-from msmpetsc.solve.rescue import Done, Rescue
+from msmpetsc.solve.options import refuse_bad_values, refuse_unused
+from msmpetsc.solve.presets import Preset, find_preset
+from msmpetsc.solve.reference import PREFIX as REFERENCE
+from msmpetsc.solve.reference import PRESET
+from msmpetsc.solve.rescue import PREFIX as FALLBACK
+from msmpetsc.solve.rescue import ROBUST, Done, Rescue
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 from msmpetsc.solve.surface import SurfaceMotion
@@ -28,6 +34,26 @@ from msmpetsc.solve.verlet import Verlet
 from msmpetsc.solve.watch import Watch
 
 INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+
+
+def solvers_of(scene: Scene, measured: Measured) -> dict[str, tuple[Preset, int]]:
+    """The solvers of a run: prefix of their PETSc options -> preset and budget of iterations."""
+    solvers = {}
+    if INTEGRATORS[scene.time.integrator] is not Verlet:
+        solvers[""] = find_preset(scene.solver.preset), scene.solver.max_iterations or 0
+    if scene.safety.on_failure == "fallback":
+        solvers[FALLBACK] = find_preset(ROBUST), 0
+    if measured != Measured():
+        solvers[REFERENCE] = find_preset(PRESET), 0
+    return solvers
+
+
+def refuse_bad_options(comm: MPI.Comm, scene: Scene, measured: Measured) -> None:
+    """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
+    solvers = solvers_of(scene, measured)
+    if "" not in solvers:
+        refuse_unused(comm, set(), at_end=True, awaited=tuple(solvers))
+    on_root(comm, lambda: refuse_bad_values(solvers))
 
 
 WHOLE = Done()  # a step that needed no rescue

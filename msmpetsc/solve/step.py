@@ -1,5 +1,6 @@
 """One implicit Euler step as one PETSc SNES (design: one step, many methods): it solves F(x) = grad g(x) = 0."""
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,11 +21,13 @@ from msmpetsc.solve.first_guess import FirstGuess
 from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
 from msmpetsc.solve.minimum import Minimum
-from msmpetsc.solve.operators import ContactBlocks, Preconditioner, ThreeColumns, TrueHessian, python_matrix
+from msmpetsc.solve.operators import (
+    ContactBlocks, Preconditioned, Preconditioner, ThreeColumns, TrueHessian, python_matrix,
+)  # fmt: skip
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
 from msmpetsc.solve.rounding import Rounding
-from msmpetsc.solve.system import assemble
+from msmpetsc.solve.system import ViewOfA, assemble
 from msmpetsc.solve.unknowns import Unknowns
 
 DEFAULT_ERROR = 1e-3
@@ -111,16 +114,18 @@ class Stepper:
     @refusal("PETSc refuses its options")
     def _create_solver(self, time_step: float, touches: bool) -> None:
         self.matrix = self._keep(assemble(self.comm, self.unknowns, time_step, prefix=self.prefix))
+        self._keep(ViewOfA(self.prefix))
         self.touches = touches
         self.hessian = TrueHessian(self.unknowns, self.elasticity, time_step, self._contact_blocks(time_step))
         self.projected = False  # whether newton's is, at the moment
         self.linear = self.hessian
         if not self.preset.true_hessian:
-            self.linear = ThreeColumns(self.matrix, self.memory, self._contact_blocks(time_step))
+            self.linear = ThreeColumns(self.matrix, self.unknowns, self._contact_blocks(time_step))
         self.operator = self._keep(python_matrix(self.unknowns, self.linear, self.comm))
         self.x, self.f = map(self._keep, self.operator.createVecs())
         self.work = self._keep(self.f.duplicate())
         preconditioner = self._create_preconditioner(time_step)
+        self.pmat = self._keep(python_matrix(self.unknowns, Preconditioned(self.preconditioned), self.comm))
         self.snes = self._keep(PETSc.SNES().create(self.comm))
         self.snes.setOptionsPrefix(self.prefix)
         self.inner = self.snes
@@ -136,7 +141,7 @@ class Stepper:
         self.curvature = self._keep(LowestCurvature(self.functional, self.hessian, preconditioner))
         self.minimum = self._keep(Minimum(self.functional, self.estimate, self.curvature))
         self.snes.setFunction(self._residual, self.f)
-        self.snes.setJacobian(self._linearise, self.operator, self.operator)
+        self.snes.setJacobian(self._linearise, self.operator, self.pmat)
         self.snes.setObjective(self._objective)
         self.snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -168,16 +173,16 @@ class Stepper:
         self.owned_objects.append(owned)
         return owned
 
-    @refusal("PETSc cannot set up the solver")
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
-        self.ksp.setOperators(self.operator, self.operator)
-        self.ksp.setUp()
+        with refusal("PETSc cannot set up the solver", self._abandon):
+            self.hessian.linearise(self.lattice.nodes, None)  # some solvers try it: Chebyshev's, for its eigenvalues
+            self.ksp.setOperators(self.operator, self.pmat)
+            self.ksp.setUp()
 
-    @refusal("PETSc cannot take a step with these options")
     def step(
         self,
         q: np.ndarray,
@@ -196,6 +201,10 @@ class Stepper:
 
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
+        with refusal("PETSc cannot take a step with these options", self._abandon):
+            return self._step(q, y, load, contact, led, start)
+
+    def _step(self, q, y, load, contact, led, start) -> StepResult:
         its_before = self.all_its()
         self.functional.begin(q, y, load, contact, led)
         self.base[:] = self.functional.q
@@ -341,6 +350,8 @@ class Stepper:
         changed = self.touches and self._precondition_contact()
         if self.preset.true_hessian or changed:
             self.operator.assemble()
+        if changed:
+            self.pmat.assemble()
         self.local.end()
         if self.preset.start_from_b:
             self._start_from_b(snes, x)
@@ -373,6 +384,8 @@ class Stepper:
 
     def _start_from_estimate(self, snes: PETSc.SNES, given: bool) -> None:
         """CG goes on from what the estimate at this x, if it was ``given``, found of the same correction."""
+        if f"{self.prefix}ksp_initial_guess_nonzero" in PETSc.Options().getAll():
+            return
         given = given and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
         if given:
             self.estimate.correction.copy(snes.getSolutionUpdate())
@@ -422,7 +435,9 @@ class Stepper:
         if not np.isfinite(self.residual):
             return reasons.DIVERGED_FNORM_NAN
         if self._will_do():
-            return reasons.CONVERGED_FNORM_ABS if self.at_rounding else reasons.CONVERGED_FNORM_RELATIVE
+            if self.at_rounding:
+                return reasons.CONVERGED_FNORM_ABS
+            return reasons.CONVERGED_SNORM_RELATIVE if self.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
             if not self.corrected:
                 self.last_error = self._estimated(f, self.functional.away(), 0.0)
@@ -475,6 +490,11 @@ class Stepper:
         """Where x, whose F is ``work``, is pulled farthest, and what is inside out (collective)."""
         worst = place_of_greatest(self.comm, self.lattice, *self.functional.pull(self.work))
         return f", worst at {worst}{inside_out(self.comm, self.lattice, self.functional.q)}"
+    def _abandon(self) -> None:
+        """After an error within PETSc its objects may be in the middle of something, and crash when they are destroyed: they
+        stay, even when the interpreter ends."""
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
+        self.owned_objects = [owned for owned in self.owned_objects if isinstance(owned, ViewOfA)]
 
     def destroy(self) -> None:
         """Collective, and in the same order on all ranks; the garbage collector's would differ."""

@@ -46,9 +46,26 @@ def assemble(
     matrix.setType(unknowns.memory.mat_type)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
     matrix.setFromOptions()
+    matrix.setName("A" if columns == 1 else "A (x) I_3")
     _check_memory(matrix, unknowns)
     matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
     return matrix
+
+
+class ViewOfA:
+    """Keeps -mat_view to A, which is assembled by now: PETSc would show all matrices, its own and those of solvers, and
+    write each into the same file. Given back by ``destroy``."""
+
+    def __init__(self, prefix: str):
+        self.option, given = f"{prefix}mat_view", PETSc.Options().getAll()
+        self.is_given, self.value = self.option in given, given.get(self.option)
+        if self.is_given:
+            PETSc.Options().delValue(self.option)
+
+    def destroy(self) -> None:
+        if self.is_given:
+            PETSc.Options().setValue(self.option, self.value)
+            PETSc.Options().getString(self.option)  # it has been of use
 
 
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:

@@ -5,7 +5,9 @@ A step that is solved exactly, of a convex energy, ends with no more than it beg
     T(v_(n+1)) + E(q_(n+1)) + C(q_(n+1))  <=  T(v_n) + E(q'_n) + C(q'_n) + f_ext . (q_(n+1) - q'_n) + W
 
 T of the free nodes; C the push of obstacles, both times as they stand at the end; q'_n is q_n with the nodes that
-anchors lead where they will be; W no less than the work of obstacles that drag. What the left side has more, and what later steps have not lost again, came from nowhere.
+anchors lead where they will be; W no less than the work of obstacles that drag. The left side is of the state that the
+next step starts from: where nodes bounce off, W has the obstacle's impulse times its velocity, and what else changes then
+is not by right. What the left side has more, and what later steps have not lost again, came from nowhere.
 Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
 """
 
@@ -61,11 +63,11 @@ class EnergyBalance:
         springs = slice(lattice.springs_owned)
         self.floor = FLOOR * comm.allreduce(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
-    def energies(self, q: np.ndarray, v: np.ndarray, time: float) -> Energies:
-        """Of positions (l, 3) [m] and velocities (l, 3) [m/s] as things stand at ``time`` (collective)."""
+    def energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray) -> Energies:
+        """Of positions (l, 3) [m] and velocities (l, 3) [m/s] as things stand at ``time``, sides too (collective)."""
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
-        at, contact, v = q[owned], around.push(time), v[owned]
+        at, contact, v = q[owned], around.push(time, sides), v[owned]
         momenta, free = lattice.mass[:, None] * v, ~around.pinned_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
@@ -77,17 +79,21 @@ class EnergyBalance:
         )
         return Energies(*sums[:5], sums[5:])
 
-    def check(self, before: State, result: StepResult, time: float, time_step: float) -> tuple[Energies, Ledger]:
-        """Energies after a step, and the ledger with it (collective).
+    def check(
+        self, before: State, result: StepResult, after: State, time: float, time_step: float
+    ) -> tuple[Energies, Energies, Ledger]:
+        """Energies of a step's result and of the state ``after`` it, and the ledger with that (collective).
 
         Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
         """
         v = (result.position - result.previous) / time_step
-        after = self.energies(result.position, v, time)
-        if not np.isfinite(after.kinetic + after.inner):
+        solved = ended = self.energies(result.position, v, time, after.sides)
+        if not np.isfinite(solved.kinetic + solved.inner):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
-        start, work = self._start(before, result, time, time_step)
-        gained = after.inner - start - work
+        if self._bounced(result, after):
+            ended = self.energies(after.q, after.velocity(time_step), time, after.sides)
+        start, work = self._start(before, result, after, time, time_step)
+        gained = ended.inner - start - work
         ledger = self.ledger
         put_in = max(ledger.put_in, start - ledger.gained + max(work, 0.0), self.floor)
         ledger = Ledger(put_in, max(0.0, ledger.gained + gained), gained)
@@ -98,11 +104,11 @@ class EnergyBalance:
                 'try a smaller solver.error (or more iterations), a smaller time.step, or safety.on_failure = "fallback"',
                 "energy",
             )
-        return after, ledger
+        return solved, ended, ledger
 
-    def keep(self, after: Energies, ledger: Ledger, result: StepResult) -> None:
+    def keep(self, ended: Energies, ledger: Ledger, after: State) -> None:
         """The step is taken."""
-        self.known, self.ledger = (result.position, after.elastic), ledger
+        self.known, self.ledger = (after.q, ended.elastic), ledger
 
     def save(self, saved: Saved) -> None:
         saved.numbers |= vars(self.ledger)
@@ -110,20 +116,31 @@ class EnergyBalance:
     def restore(self, saved: Saved) -> None:
         self.ledger = Ledger(**{name: saved.numbers[name] for name in vars(Ledger()) if name in saved.numbers})
 
-    def _start(self, before: State, result: StepResult, time: float, time_step: float) -> tuple[float, float]:
-        """Right side of the balance, and the work in it: of loads, and of obstacles that drag [J] (collective)."""
+    def _bounced(self, result: StepResult, after: State) -> bool:
+        """Whether any node was struck once the step was solved (collective)."""
+        if not self.around.reflections:
+            return False
+        own = after.q is not result.position or after.q_previous is not result.previous
+        return self.comm.allreduce(own, MPI.LOR)
+
+    def _start(
+        self, before: State, result: StepResult, after: State, time: float, time_step: float
+    ) -> tuple[float, float]:
+        """Right side of the balance, and the work in it: of loads, and of obstacles that drag or strike [J]
+        (collective)."""
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
         led = around.led(before.q, time)
         q, v = before.q if led is None else led, before.velocity(time_step)[owned]
-        contact, free = around.push(time), ~around.pinned_at(time)[owned]
+        contact, free = around.push(time, after.sides), ~around.pinned_at(time)[owned]
         known = self.known is not None and q is self.known[0]
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
-            np.vdot(around.load(time), result.position[owned] - q[owned])
-            + around.dragged(q[owned], result.position[owned], time, time_step),
+            np.vdot(around.load(time), after.q[owned] - q[owned])
+            + around.dragged(q[owned], result.position[owned], time, time_step, after.sides)
+            + result.work,
         )
         kinetic, elastic, contact, work = sums
         return kinetic + (self.known[1] if known else elastic) + contact, work

@@ -75,7 +75,8 @@ class Simulation:
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        self.state, self.effort = State(q.copy(), q - self.time_step * velocity), Effort()
+        sides = self.surroundings.met(q, q, 0.0, 0.0, None, self.surroundings.pinned_at(0.0))
+        self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.step = 0  # steps taken
         self.stored, self.stored_until = scene.stored, scene.stored_until  # numbers of frames
 
@@ -90,7 +91,8 @@ class Simulation:
     def advance(self) -> Iterator[Frame | None]:
         """The same, with None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
-            self.energies = self.balance.energies(self.state.q, self.state.velocity(self.time_step), 0.0)
+            state = self.state
+            self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0, state.sides)
             yield self._frame(0, self.state.q)
         for index in range(self.step + 1, self.steps + 1):
             if index == self.measured.trace:
@@ -110,7 +112,7 @@ class Simulation:
     def saved(self) -> Saved:
         """All that the next step depends on; to be stored or copied before that is taken."""
         saved = Saved(self.step)
-        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back)
+        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back, self.surroundings.has_sides)
         self.integrator.save(saved, self.state)
         for part in (self.balance, self.rescue, self.watch):
             part.save(saved)
@@ -147,8 +149,8 @@ class Simulation:
     def _attempt(self, integrator, state: State, time: float, time_step: float) -> tuple[StepResult, State]:
         """A step that passes its examination (collective). Raises StepFailed."""
         result, after = integrator.advance(state, time)
-        self.energies, ledger = self.balance.check(state, result, time, time_step)
-        self.balance.keep(self.energies, ledger, result)
+        self.energies, ended, ledger = self.balance.check(state, result, after, time, time_step)
+        self.balance.keep(ended, ledger, after)
         self.effort.energy_gained += ledger.last
         return result, after
 

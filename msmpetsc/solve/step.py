@@ -47,13 +47,14 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 class StepResult:
     """position (l, 3) [m], ghosts included; previous (l, 3) [m]: so that the velocity is
     (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
-    the KSP iterations of all of them, and of the estimates."""
+    the KSP iterations of all of them, and of the estimates; work: of obstacles that struck this rank's nodes [J]."""
 
     position: np.ndarray
     previous: np.ndarray
     error: float
     iterations: int
     ksp_its: int
+    work: float = 0.0
 
 
 class Stepper:

@@ -138,17 +138,40 @@ class Surroundings:
                 stiffness += p.stiffness * ((inside > -reach) | (side > 0))
         return stiffness
 
+    def power(self, q: np.ndarray, time: float, begin: float, end: float, sides: np.ndarray) -> float:
+        """Of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m], which move as in the substep from
+        begin to end [W]."""
+        power = 0.0
+        for p, side in self._pressing(time, sides):
+            way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
+            if way.any():
+                inside, face = p.at(time, side).depths(q)
+                along = beside(q, fetch(p.obstacle.normals) @ way)[face]
+                power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
+        return power
+
+    def appearing(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
+        """Energy [J] of the push of penalties that were not there when a substep began, at its end."""
+        new = [p.at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        return Contact(new, self.lattice.owned).energy(q) if new else 0.0
+
     def dragged(
-        self, before: np.ndarray, after: np.ndarray, time: float, time_step: float, sides: np.ndarray
+        self,
+        before: tuple[np.ndarray, np.ndarray],
+        after: tuple[np.ndarray, np.ndarray],
+        time: float,
+        time_step: float,
     ) -> float:
         """No less than the work [J] that the friction of moving obstacles does on this rank's nodes in a step between
-        two positions (owned, 3) [m]: mu N times how far they go."""
+        two positions (owned, 3) [m], with their sides: mu N times how far they go."""
         work = 0.0
-        for p, side in self._pressing(time, sides):
+        for row, p in enumerate(self.penalties):
+            if not p.obstacle.acts_at(time):
+                continue
             way = np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step))
             if p.friction > 0 and way > 0:
-                for q, when in ((before, time - time_step), (after, time)):
-                    inside, _ = p.at(when, side[: len(q)]).depths(q)
+                for (q, sides), when in ((before, time - time_step), (after, time)):
+                    inside, _ = p.at(when, sides[row, : len(q)]).depths(q)
                     work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 

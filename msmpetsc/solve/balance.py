@@ -5,10 +5,13 @@ A step that is solved exactly, of a convex energy, ends with no more than it beg
     T(v_(n+1)) + E(q_(n+1)) + C(q_(n+1))  <=  T(v_n) + E(q'_n) + C(q'_n) + f_ext . (q_(n+1) - q'_n) + W
 
 T of the free nodes; C the push of obstacles, both times as they stand at the end; q'_n is q_n with the nodes that
-anchors lead where they will be; W no less than the work of obstacles that drag. The left side is of the state that the
-next step starts from: where nodes bounce off, W has the obstacle's impulse times its velocity, and what else changes then
-is not by right. What the left side has more, and what later steps have not lost again, came from nowhere.
+anchors lead where they will be; W no less than the work of obstacles that drag, and that of those that strike, the
+impulse times their velocity. What the left side has more, and what later steps have not lost again, came from nowhere.
+What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows it.
 Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
+
+Verlet counts in W what moving obstacles push, so that C(q'_n) is that of where they stand at the start. The energy of its
+steps and of BDF2's swings about what it should be: what they lose, up to a share, they may gain again.
 """
 
 from dataclasses import dataclass
@@ -26,6 +29,8 @@ from msmpetsc.solve.state import State
 from msmpetsc.solve.step import StepResult
 
 MOST = 3.0  # times all that the body ever had: explicit substeps near their limit let energy swing by nearly two
+MUCH = 0.01  # of all energy, from nowhere: worth a word
+CREDIT = 0.1  # of it, that a swing may take and give back: BDF2's impacts took 6%
 FLOOR = 1e-10  # of the energy that presses every spring to a point: what rounding may gain
 
 
@@ -47,17 +52,32 @@ class Energies:
 
 @dataclass(frozen=True)
 class Ledger:
-    """put_in: the most that the body had by right; gained: from nowhere, and not lost since; last: in the last step [J]."""
+    """put_in: the most that the body had by right; gained: from nowhere, and not lost since, negative where a swing may
+    give back; last: in the last step; bounced: what nodes gained that bounced off its end [J]."""
 
     put_in: float = 0.0
     gained: float = 0.0
     last: float = 0.0
+    bounced: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """Of all energy, what came from nowhere."""
+        return self.gained / self.put_in if self.put_in else 0.0
 
 
 class EnergyBalance:
-    """Keeps the ledger of a run."""
+    """Keeps the ledger of a run. swings: whether the integrator's energy does."""
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, surroundings: Surroundings, elasticity: Elasticity):
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        lattice: Lattice,
+        surroundings: Surroundings,
+        elasticity: Elasticity,
+        swings: bool = False,
+    ):
+        self.credit = CREDIT if swings else 0.0
         self.comm, self.lattice, self.around, self.elasticity = comm, lattice, surroundings, elasticity
         self.ledger, self.known = Ledger(), None
         springs = slice(lattice.springs_owned)
@@ -90,13 +110,16 @@ class EnergyBalance:
         solved = ended = self.energies(result.position, v, time, after.sides)
         if not np.isfinite(solved.kinetic + solved.inner):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
-        if self._bounced(result, after):
+        bounces = self._bounces(result, after)
+        if bounces:
             ended = self.energies(after.q, after.velocity(time_step), time, after.sides)
-        start, work = self._start(before, result, after, time, time_step)
-        gained = ended.inner - start - work
+        start, pushed, work, struck = self._start(before, result, after, time, time_step)
         ledger = self.ledger
-        put_in = max(ledger.put_in, start - ledger.gained + max(work, 0.0), self.floor)
-        ledger = Ledger(put_in, max(0.0, ledger.gained + gained), gained)
+        gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
+        bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
+        put_in = max(ledger.put_in, start - pushed - max(ledger.gained, 0.0) + max(work, 0.0), self.floor)
+        put_in = max(put_in, solved.inner - max(ledger.gained + gained, 0.0))
+        ledger = Ledger(put_in, max(-self.credit * put_in, ledger.gained + gained), gained, bounced)
         if ledger.gained > MOST * put_in:
             raise StepFailed(
                 f"gained {ledger.gained:.2e} J from nowhere, of {put_in:.2e} J that were there: "
@@ -116,7 +139,7 @@ class EnergyBalance:
     def restore(self, saved: Saved) -> None:
         self.ledger = Ledger(**{name: saved.numbers[name] for name in vars(Ledger()) if name in saved.numbers})
 
-    def _bounced(self, result: StepResult, after: State) -> bool:
+    def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""
         if not self.around.reflections:
             return False
@@ -125,25 +148,28 @@ class EnergyBalance:
 
     def _start(
         self, before: State, result: StepResult, after: State, time: float, time_step: float
-    ) -> tuple[float, float]:
-        """Right side of the balance, and the work in it: of loads, and of obstacles that drag or strike [J]
-        (collective)."""
+    ) -> tuple[float, float, float, float]:
+        """Of the right side of the balance the energies, and the push in them, the work of loads and of obstacles that
+        drag, and of those that strike [J] (collective)."""
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
         led = around.led(before.q, time)
         q, v = before.q if led is None else led, before.velocity(time_step)[owned]
-        contact, free = around.push(time, after.sides), ~around.pinned_at(time)[owned]
+        free = ~around.pinned_at(time)[owned]
+        when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
+        contact = around.push(when, sides)
+        sides = around.no_sides if sides is None else sides
         known = self.known is not None and q is self.known[0]
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
-            np.vdot(around.load(time), after.q[owned] - q[owned])
-            + around.dragged(q[owned], result.position[owned], time, time_step, after.sides)
-            + result.work,
+            np.vdot(around.load(time), result.position[owned] - q[owned])
+            + around.dragged((q[owned], sides), (result.position[owned], after.sides), time, time_step),
+            result.work,
         )
-        kinetic, elastic, contact, work = sums
-        return kinetic + (self.known[1] if known else elastic) + contact, work
+        kinetic, elastic, contact, work, struck = sums
+        return kinetic + (self.known[1] if known else elastic) + contact, contact, work, struck
 
     def _sums(self, *values: float) -> np.ndarray:
         """Over all ranks; the values may be on a GPU."""

@@ -70,7 +70,8 @@ class Simulation:
         self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
         integrator = INTEGRATORS[scene.time.integrator]
         self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver, measured)
-        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity)
+        swings = scene.time.integrator != "implicit-euler"
+        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity, swings)
         self.rescue = Rescue(comm, model, self.surroundings, scene, self._attempt)
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
@@ -104,6 +105,7 @@ class Simulation:
                 errors, trace = self.integrator.true_errors(index, result)
                 self.effort.measure(errors)
                 self.trace = trace or self.trace
+            self.watch.gain(index, index * self.time_step, self.balance.ledger)
             self.step = index
             yield self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
         self.watch.sum_up()

@@ -59,7 +59,7 @@ class Verlet:
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.sides = surroundings.no_sides[:, :owned]
-        self.work = 0.0  # [J] in a step, of obstacles that struck this rank's nodes
+        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
         self.known = None  # the positions that ``gradient`` and the highest frequency are of
         self.anchors = None  # how many hold
         springs = slice(self.lattice.springs_owned)
@@ -154,6 +154,7 @@ class Verlet:
         for begin, end in zip(times, times[1:], strict=False):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
+            self.work += self.around.appearing(self.q, begin, end, self.sides)
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
@@ -162,7 +163,7 @@ class Verlet:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(self.known, previous, 0.0, count, 0, self.work)
+        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True)
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
@@ -177,6 +178,7 @@ class Verlet:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
         load = self.around.load(time)
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
+        self.work += duration * self.around.power(self.q, time, begin, end, self.sides)
         self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
 
     def _drift(self, begin: float, end: float) -> None:

@@ -21,6 +21,7 @@ class Obstacle:
     points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side
     path            : how it moves
     start, stop     : it is there while start <= time < stop [s]; None: to the end
+    key             : of its table in the scene, for what is told
     """
 
     points: np.ndarray
@@ -28,16 +29,17 @@ class Obstacle:
     path: Path
     start: float = 0.0
     stop: float | None = None
+    key: str = "obstacle"
 
     @classmethod
-    def of(cls, told: scene.Obstacle) -> "Obstacle":
+    def of(cls, told: scene.Obstacle, key: str = "obstacle") -> "Obstacle":
         """The obstacle of a scene."""
         if told.shape == "box":
             points = np.repeat(np.array(told.box), 3, axis=0)  # the faces that meet at each of the two corners
             normals = np.concatenate([-np.eye(3), np.eye(3)])
         else:
             points, normals = np.array([told.point]), np.array([told.normal])
-        return cls(points, normals, Path.through(told.path), told.start, told.stop)
+        return cls(points, normals, Path.through(told.path), told.start, told.stop, key)
 
     def acts_at(self, time: float) -> bool:
         return within(time, self.start, self.stop)

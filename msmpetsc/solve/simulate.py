@@ -93,11 +93,13 @@ class Simulation:
         """The same, with None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
             state = self.state
+            self.watch.overlaps(0, self.surroundings, state.q, 0.0, self.time_step)
             self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0, state.sides)
             yield self._frame(0, self.state.q)
         for index in range(self.step + 1, self.steps + 1):
             if index == self.measured.trace:
                 self.integrator.follow()
+            self.watch.overlaps(index, self.surroundings, self.state.q, index * self.time_step, self.time_step)
             begin = perf_counter()
             result, done = self._step(index)
             self.effort.add(result, done, perf_counter() - begin)

@@ -1,12 +1,14 @@
 """What is looked for in each frame and said once: cells inside out, steps that ended far from their solution, energy
-that came from nowhere."""
+that came from nowhere, nodes inside an obstacle that comes to be there."""
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.overlap import overlap
 from msmpetsc.model.saved import Saved
+from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.model.worst import inverted
 from msmpetsc.solve.balance import MUCH, Ledger
 
@@ -44,6 +46,17 @@ class Watch:
                 )  # fmt: skip
             self.far += 1
             self.worst_error = max(self.worst_error, error)
+
+    def overlaps(self, index: int, around: Surroundings, q: np.ndarray, time: float, time_step: float) -> None:
+        """Where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
+        new = [o for o in around.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
+        for obstacle in new:
+            found = overlap(self.comm, self.lattice, obstacle, q, around.pinned_at(time), time)
+            if found:
+                log.warning(
+                    "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",
+                    index, time, found,
+                )  # fmt: skip
 
     def gain(self, index: int, time: float, ledger: Ledger) -> None:
         """What the body has from nowhere after a step."""

@@ -299,7 +299,7 @@ def test_swings_and_loose_steps_are_no_gain(tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_a_share_is_of_what_was_put_in():
-    assert Ledger().share == 0 and Ledger(put_in=4.0, gained=0.1).share == 0.025
+    assert Ledger().share == 0 and Ledger(put_in=4.0, gained=0.1, steady=0.2).share == 0.025
 
 
 # ---- nodes that begin inside

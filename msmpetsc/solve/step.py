@@ -48,7 +48,8 @@ class StepResult:
     """position (l, 3) [m], ghosts included; previous (l, 3) [m]: so that the velocity is
     (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
     the KSP iterations of all of them, and of the estimates; work: of obstacles that struck this rank's nodes [J];
-    explicit: it was taken in substeps, and ``work`` has that of all that moved, pushed or came to be there."""
+    explicit: it was taken in substeps, and ``work`` has that of all that moved, pushed or came to be there; swing:
+    by how much the energy of this rank's nodes changed that comes back (solve.balance) [J]."""
 
     position: np.ndarray
     previous: np.ndarray
@@ -57,6 +58,7 @@ class StepResult:
     ksp_its: int
     work: float = 0.0
     explicit: bool = False
+    swing: float = 0.0
 
 
 class Stepper:

@@ -98,7 +98,8 @@ class Verlet:
         if saved.numbers["known"]:
             self.known = state.q
             self.position.values[:] = state.q
-            self.sides = state.sides[:, : self.lattice.owned]
+            sides = self.around.no_sides if state.sides is None else state.sides
+            self.sides = sides[:, : self.lattice.owned]
             self._pull(time)
 
     def forget(self) -> None:
@@ -116,12 +117,13 @@ class Verlet:
         squared = pushed + (self.highest.squared or self._elastic_squared())
         for _ in range(1 + RETRIES):
             count = self._count(squared)
+            begun = self._squared_acceleration(start)
             with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
                 self._take(count, start, time)
             energy, dt = self._energy(), self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
             if dt**2 * after <= 4:
-                return self._result(count)
+                return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
             squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
         raise StepFailed(
@@ -159,11 +161,16 @@ class Verlet:
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
-    def _result(self, count: int) -> tuple[StepResult, State]:
+    def _squared_acceleration(self, time: float) -> float:
+        """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
+        force = (self.around.load(time) - self.gradient[: self.lattice.owned])[self.free]
+        return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
+
+    def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True)
+        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True, swing=swing)
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:

@@ -65,7 +65,7 @@ class Watch:
                 log.warning(
                     "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; a smaller time.step "
                     "or a smaller solver.error mends that",
-                    index, time, 100 * ledger.share, ledger.gained, ledger.put_in,
+                    index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in,
                 )  # fmt: skip
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)

@@ -213,6 +213,18 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
     assert [frame.substeps for frame in frames[:3]] == [0, 2, 0] and frames[-1].position[:, 2].min() > -0.12
 
 
+def test_nodes_that_come_in_by_another_face_each_time_a_step_is_solved_settle(tmp_path: Path):
+    """A plate that comes edge first meets a fast body by its corner, out of a larger run of random boxes."""
+    plate = {"shape": "box", "box": [[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]], "response": "penalty"}
+    plate["path"] = [{"time": 0.05, "by": [0.89, -7.54, 0.155]}]
+    around = {"shape": "box", "box": [[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]], "start": 0.01, "stop": 0.03}
+    time = {"step": 0.005, "duration": 0.05, "integrator": "bdf2"}
+    tables = {"material": STIFF | {"young_modulus": 3.5e6}, "solver": {"preset": "newton", "error": 1e-3}}
+    start = {"velocity": [21.37, -5.853, 2.545]}
+    _, frames = play(block_scene(tmp_path, BLOCK, time=time, start=start, obstacle=[plate, around], **tables))
+    assert len(frames) == 11 and max(frame.contact for frame in frames) > 0
+
+
 # ---- energy
 
 

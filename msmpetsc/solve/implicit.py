@@ -79,7 +79,7 @@ class ImplicitEuler:
         """The x that belongs to y, as it will be at ``time``, and the sides that it was found with.
 
         Which face pushes a node out of a box is settled before the step is solved, by the way to y. Where the way to x
-        leads in by another the step is solved again: faces that were met stay, so that this ends.
+        tells otherwise the step is solved again; from then on a node that has a face keeps it, so that this ends.
         """
         around, iterations, ksp_its = self.around, 0, 0
         way = {"time": time, "time_step": time_step, "before": before, "held": self.stepper.lattice.pinned}
@@ -90,10 +90,12 @@ class ImplicitEuler:
             result = self.stepper.step(**vars(self.problem))
             iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
             met = around.met(q, result.position, **way)
-            merged = np.where(met > 0, met, sides)
-            if not self._passes(result.position, time, sides, met):
-                return replace(result, iterations=iterations, ksp_its=ksp_its), merged
-            sides = merged if solves else met
+            settled = np.where(sides > 0, sides, met) if solves else met
+            if not self._passes(result.position, time, sides, settled):
+                if around.penalties:  # what reflects goes by the way to x alone
+                    met[around.pressing] = np.where(settled > 0, settled, sides)[around.pressing]
+                return replace(result, iterations=iterations, ksp_its=ksp_its), met
+            sides = settled
         raise StepFailed(
             f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came in by; "
             'try a smaller time.step, or safety.on_failure = "substep"',

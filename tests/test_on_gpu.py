@@ -44,6 +44,7 @@ PLATE = {
     "shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.5]], "response": "penalty", "friction": 0.3,
     "path": [{"time": 4 * T, "by": [0.01, 0, -0.05]}],
 }  # fmt: skip
+THIN = {"shape": "box", "box": [[-1, -1, -0.0041], [2, 2, -0.004]]}  # passed within a step
 HELD = {"pin": [{"region": {"box": [[0, 0, 0], [0.1, 1, 1]], "relative": True}}]}
 LED = {
     "anchor": [{"region": {"box": [[0.9, 0, 0], [1, 1, 1]], "relative": True}, "stop": 4 * T,
@@ -55,6 +56,14 @@ CASES = {
     "held, led and let go": {**FALL, **HELD, **LED},
     "reflected": {**FALL, "obstacle": [{**FLOOR, "response": "reflect"}]},
     "pressed, rubbed and stiffening": {**FALL, **STIFFENING, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
+    "thin plates": {**FALL, "obstacle": [{**THIN, "response": "penalty", "friction": 0.3}, {**THIN, "start": 5 * T}]},
+    "thin plates, bdf2": {
+        **FALL, "time": {**FALL["time"], "integrator": "bdf2"}, "obstacle": [THIN, {**THIN, "response": "penalty"}],
+    },
+    "thin plates, verlet": {
+        **FALL, "time": {**FALL["time"], "integrator": "verlet"},
+        "obstacle": [{**THIN, "response": "penalty", "path": [{"time": 1.0, "by": [0, 0, 1.0]}]}],
+    },
     "bdf2": {**FALL, **HELD, "time": {**FALL["time"], "integrator": "bdf2"}},
     "verlet": {
         **FALL, **LED, "time": {**FALL["time"], "integrator": "verlet"},

@@ -33,6 +33,7 @@ FAR = {"box": [[0.49, -1, -1], [0.51, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.05, "by": [0.05, 0, 0.05]}], "stop": 0.08}]
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
+THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
 pytestmark = pytest.mark.timeout(100)
 
@@ -71,6 +72,9 @@ CASES = {
     "anchor, verlet": by("verlet", swing(anchor=LED)),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
     "bdf2, reflected": by("bdf2", fall(solver=LOOSE, obstacle=[GROUND])),
+    "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
+    "bdf2, a thin plate": by("bdf2", fall(solver=LOOSE, obstacle=[THIN | {"restitution": 0.5}])),
+    "verlet, a thin plate": by("verlet", fall(obstacle=[THIN | {"response": "penalty"}])),
     "verlet": by("verlet", swing(output={"surface": False, "every": 3})),
     "verlet, pressed": by("verlet", fall(obstacle=PRESSING)),
     "substep, scattered": swing(
@@ -127,6 +131,7 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
     assert rows(by("verlet", swing())) == {"mode"}
     history = {"history_q", "history_v"}
     assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == guesses | history | {"contact_bound"}
+    assert rows(by("verlet", fall(obstacle=[THIN]))) == {"mode", "sides"}
 
 
 @pytest.fixture(scope="module")

@@ -167,15 +167,15 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
 
 def _reflections(scene: Scene) -> list[Reflection]:
     return [
-        Reflection(Obstacle.of(o), 1.0 if o.restitution is None else o.restitution)
-        for o in scene.obstacle
+        Reflection(Obstacle.of(o, f"obstacle.{number}"), 1.0 if o.restitution is None else o.restitution)
+        for number, o in enumerate(scene.obstacle)
         if o.response == "reflect"
     ]
 
 
 def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body) -> list[Penalty]:
-    pressing = [o for o in scene.obstacle if o.response == "penalty"]
+    pressing = [(f"obstacle.{number}", o) for number, o in enumerate(scene.obstacle) if o.response == "penalty"]
     if not pressing:
         return []
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * (body.bounds[1] - body.bounds[0]).max()
-    return [Penalty(Obstacle.of(o), o.stiffness or usual, o.friction or 0.0, stick) for o in pressing]
+    return [Penalty(Obstacle.of(o, key), o.stiffness or usual, o.friction or 0.0, stick) for key, o in pressing]

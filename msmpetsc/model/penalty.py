@@ -5,6 +5,9 @@ A node at depth d > 0 has the energy 1/2 k d^2. Friction opposes the slip u, the
 step, with mu N once |u| passes a small e; N is the push on the node at the step's start, so that friction has a
 potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020,
 Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
+
+A node that came into a box by one of its faces has that for its ``side``, and its depth is the way back through it,
+also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.
 """
 
 import math
@@ -13,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.model.obstacle import Obstacle, depth, depths
+from msmpetsc.model.obstacle import Obstacle, depth, depths, no_sides
 from msmpetsc.place.arrays import beside
 from msmpetsc.place.each import each
 
@@ -27,21 +30,22 @@ class Penalty:
     friction: float
     stick: float
 
-    def at(self, time: float) -> "Press":
-        """The obstacle at a time, without friction."""
-        return Press(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None)
+    def at(self, time: float, sides: np.ndarray | None = None) -> "Press":
+        """The obstacle at a time, without friction; ``sides`` (owned or more,) of the nodes."""
+        return Press(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
 
-    def during(self, q: np.ndarray, time: float, time_step: float) -> "Press":
+    def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "Press":
         """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
         if self.friction == 0:
-            return self.at(time)
+            return self.at(time, sides)
         points, normals = self.obstacle.points_at(time), self.obstacle.normals
         before = self.obstacle.points_at(time - time_step)
-        inside, face = depths(q, before, normals)
+        inside, face = depths(q, before, normals, sides)
         nodes = np.flatnonzero(inside > 0)
         carried = q[nodes] + (points - before)[0]
         limit = self.friction * self.stiffness * inside[nodes]
-        return Press(points, normals, self.stiffness, Rub(nodes, normals[face[nodes]], carried, limit, self.stick * time_step))
+        rub = Rub(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
+        return Press(points, normals, self.stiffness, rub, sides)
 
 
 @dataclass(frozen=True)
@@ -100,12 +104,22 @@ class Rub:
 
 @dataclass(frozen=True)
 class Press:
-    """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], and friction, if any."""
+    """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], friction, if any, and by
+    which face each node came in (obstacle.side_of); None: the nearest."""
 
     points: np.ndarray
     normals: np.ndarray
     stiffness: float
     rub: Rub | None
+    sides: np.ndarray | None = None
+
+    def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of positions (n, 3), and the faces that push, (n,) each."""
+        return depths(q, self.points, self.normals, self.sides)
+
+    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What kernels take: points, normals and the sides of positions (n, 3)."""
+        return self.points, self.normals, no_sides(q) if self.sides is None else self.sides
 
 
 class Contact:
@@ -121,7 +135,7 @@ class Contact:
         """Of the push alone, [J]: friction stores none."""
         energy = 0.0
         for press in self.presses:
-            inside = np.maximum(depths(q[: self.owned], press.points, press.normals)[0], 0)
+            inside = np.maximum(press.depths(q[: self.owned])[0], 0)
             energy += 0.5 * press.stiffness * float(inside @ inside)
         return energy
 
@@ -130,7 +144,7 @@ class Contact:
         total = 0.0
         for press in self.presses:
             parts = np.empty(self.owned, like=q)
-            _change_of(self.owned, q, base, press.points, press.normals, press.stiffness, parts)
+            _change_of(self.owned, q, base, *press.faces(q), press.stiffness, parts)
             total += float(parts.sum())
             if press.rub:
                 total += float(press.rub.change(q, base))
@@ -139,7 +153,7 @@ class Contact:
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for press in self.presses:
-            _add_gradient_of(self.owned, q, press.points, press.normals, press.stiffness, gradient)
+            _add_gradient_of(self.owned, q, *press.faces(q), press.stiffness, gradient)
             if press.rub:
                 press.rub.add_gradient(q, gradient)
 
@@ -151,7 +165,7 @@ class Contact:
             Hessian, nothing along a slip, would let nodes run to and fro
         """
         for press in self.presses:
-            inside, face = depths(q[: self.owned], press.points, press.normals)
+            inside, face = press.depths(q[: self.owned])
             pressed = np.flatnonzero(inside > 0)
             yield pressed, press.stiffness * _squares(press.normals[face[pressed]])
             if press.rub:
@@ -161,7 +175,7 @@ class Contact:
         """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
         bound = np.zeros(self.owned, like=q)
         for press in self.presses:
-            bound += press.stiffness * (depths(q[: self.owned], press.points, press.normals)[0] > 0)
+            bound += press.stiffness * (press.depths(q[: self.owned])[0] > 0)
             if press.rub:
                 bound[press.rub.nodes] += 2 * press.rub.limit / press.rub.stick
         return bound
@@ -173,10 +187,10 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
 
 
 @each
-def _change_of(first, count, step, q, base, points, normals, stiffness, parts):
+def _change_of(first, count, step, q, base, points, normals, sides, stiffness, parts):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals)
-        d_base, face_base = depth(base[i], points, normals)
+        d, face = depth(q[i], points, normals, sides[i])
+        d_base, face_base = depth(base[i], points, normals, sides[i])
         parts[i] = 0.0
         if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
             deeper = 0.0
@@ -189,19 +203,19 @@ def _change_of(first, count, step, q, base, points, normals, stiffness, parts):
 
 
 @each
-def _add_gradient_of(first, count, step, q, points, normals, stiffness, gradient):
+def _add_gradient_of(first, count, step, q, points, normals, sides, stiffness, gradient):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals)
+        d, face = depth(q[i], points, normals, sides[i])
         if d > 0.0:
             for c in range(3):
                 gradient[i, c] -= stiffness * d * normals[face, c]
 
 
 @each
-def _rub_of(first, count, step, rows, q, points, normals, carried, impulse, per_mass, v):
+def _rub_of(first, count, step, rows, q, points, normals, sides, carried, impulse, per_mass, v):
     for row in range(first, count, step):
         i = rows[row]
-        d, face = depth(q[i], points, normals)
+        d, face = depth(q[i], points, normals, sides[i])
         if d > 0.0:
             along, speed = 0.0, 0.0
             for c in range(3):
@@ -218,8 +232,7 @@ def _rub_of(first, count, step, rows, q, points, normals, carried, impulse, per_
 def rub(
     rows: np.ndarray,
     q: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
+    press: Press,
     carried: np.ndarray,
     impulse: float,
     per_mass: np.ndarray,
@@ -231,4 +244,4 @@ def rub(
 
     impulse : mu k dt [kg/s], times the depth the impulse
     """
-    _rub_of(len(rows), rows, q, points, normals, carried, impulse, per_mass, v)
+    _rub_of(len(rows), rows, q, *press.faces(q), carried, impulse, per_mass, v)

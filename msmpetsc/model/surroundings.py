@@ -7,21 +7,27 @@ import numpy as np
 
 from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
-from msmpetsc.model.obstacle import depths
-from msmpetsc.model.penalty import Contact, Penalty, rub
-from msmpetsc.place.arrays import beside
+from msmpetsc.model.obstacle import Obstacle, depths
+from msmpetsc.model.penalty import Contact, Penalty, Press, rub
+from msmpetsc.place.arrays import beside, fetch
 
 
 class Surroundings:
     """Of one model. An implicit step asks once for its end, an explicit one in each substep.
 
     Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
-    its length.
+    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (obstacle.side_of): the
+    penalties' first, then the reflections'.
     """
 
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
         self.penalties, self.reflections = model.penalties, model.reflections
+        self.obstacles = [one.obstacle for one in (*self.penalties, *self.reflections)]
+        self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
+        self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
+        nodes = self.lattice.nodes
+        self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
         self._acting = self._load = None
 
     def load(self, time: float) -> np.ndarray:
@@ -51,17 +57,48 @@ class Surroundings:
             q = np.where(anchor.where[:, None], place, q)
         return q
 
-    def contact(self, q: np.ndarray, time: float, time_step: float) -> Contact | None:
+    def met(
+        self,
+        q: np.ndarray,
+        end: np.ndarray,
+        time: float,
+        time_step: float,
+        before: np.ndarray | None,
+        held: np.ndarray,
+    ) -> np.ndarray:
+        """Sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step, which had ``before`` when it began.
+
+        held : (n,) bool, the nodes that do not give way: they have none. A plane has but one, which needs no name.
+        """
+        if not self.has_sides:
+            return self.no_sides[:, : len(q)]
+        sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
+        for row, obstacle in enumerate(self.obstacles):
+            if obstacle.has_sides:
+                had = None if before is None else before[row]
+                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, had))
+        return sides
+
+    def pushes_alike(self, q: np.ndarray, time: float, sides: np.ndarray, others: np.ndarray) -> bool:
+        """Whether penalties press on this rank's nodes at q just the same with other sides."""
+        owned = self.lattice.owned
+        presses = zip(self._presses(time, sides), self._presses(time, others), strict=True)
+        depths = [[np.maximum(press.depths(q[:owned])[0], 0) for press in pair] for pair in presses]
+        return all(bool(np.array_equal(one, other)) for one, other in depths)
+
+    def contact(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray) -> Contact | None:
         """What presses in the step that starts from q."""
         owned = self.lattice.owned
-        q = q[:owned]
-        presses = [penalty.during(q, time, time_step) for penalty in self._pressing(time)]
+        presses = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
         return Contact(presses, owned) if presses else None
 
-    def push(self, time: float) -> Contact | None:
+    def push(self, time: float, sides: np.ndarray) -> Contact | None:
         """What presses at a time, without friction."""
-        presses = [penalty.at(time) for penalty in self._pressing(time)]
+        presses = self._presses(time, sides)
         return Contact(presses, self.lattice.owned) if presses else None
+
+    def _presses(self, time: float, sides: np.ndarray) -> list[Press]:
+        return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def rub(
         self,
@@ -73,60 +110,125 @@ class Surroundings:
         duration: float,
         begin: float,
         end: float,
+        sides: np.ndarray,
     ) -> None:
         """Friction of obstacles as they stand at ``time``, for a ``duration``, on velocities v (owned, 3) [m/s].
 
         q, rows, per_mass : (owned, 3) [m]; the nodes that move; (owned,) [1/kg]
         begin, end        : the substep [s] in which an obstacle carries along what it holds
         """
-        for p in self._pressing(time):
+        for p, side in self._pressing(time, sides):
             if p.friction > 0:
-                path, points = p.obstacle.path, p.obstacle.points_at(time)
+                path = p.obstacle.path
                 carried = beside(q, (path.at(end) - path.at(begin)) / (end - begin))
-                impulse = p.friction * p.stiffness * duration
-                rub(rows, q, points, p.obstacle.normals, carried, impulse, per_mass, v)
+                rub(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
 
-    def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float) -> np.ndarray:
+    def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray) -> np.ndarray:
         """(owned,) [N/m]: no less than what obstacles add to a node's stiffness from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
             makes good is counted as inside already
         """
         stiffness = np.zeros(len(q), like=q)
-        for p in self.penalties:
+        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
                 way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
                 reach = 2 * (speed * (time - start) + np.linalg.norm(way))
                 inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals)
-                stiffness += p.stiffness * (inside > -reach)
+                stiffness += p.stiffness * ((inside > -reach) | (side > 0))
         return stiffness
 
-    def dragged(self, before: np.ndarray, after: np.ndarray, time: float, time_step: float) -> float:
+    def power(self, q: np.ndarray, time: float, begin: float, end: float, sides: np.ndarray) -> float:
+        """Of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m], which move as in the substep from
+        begin to end [W]."""
+        power = 0.0
+        for p, side in self._pressing(time, sides):
+            way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
+            if way.any():
+                inside, face = p.at(time, side).depths(q)
+                along = beside(q, fetch(p.obstacle.normals) @ way)[face]
+                power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
+        return power
+
+    def appearing(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
+        """Energy [J] of the push of penalties that were not there when a substep began, at its end."""
+        new = [p.at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        return Contact(new, self.lattice.owned).energy(q) if new else 0.0
+
+    def dragged(
+        self,
+        before: tuple[np.ndarray, np.ndarray],
+        after: tuple[np.ndarray, np.ndarray],
+        time: float,
+        time_step: float,
+    ) -> float:
         """No less than the work [J] that the friction of moving obstacles does on this rank's nodes in a step between
-        two positions (owned, 3) [m]: mu N times how far they go."""
+        two positions (owned, 3) [m], with their sides: mu N times how far they go."""
         work = 0.0
-        for p in self._pressing(time) if self.penalties else ():
+        for row, p in enumerate(self.penalties):
+            if not p.obstacle.acts_at(time):
+                continue
             way = np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step))
             if p.friction > 0 and way > 0:
-                for q, when in ((before, time - time_step), (after, time)):
-                    inside, _ = depths(q, p.obstacle.points_at(when), p.obstacle.normals)
+                for (q, sides), when in ((before, time - time_step), (after, time)):
+                    inside, _ = p.at(when, sides[row, : len(q)]).depths(q)
                     work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 
-    def _pressing(self, time: float) -> list[Penalty]:
-        return [penalty for penalty in self.penalties if penalty.obstacle.acts_at(time)]
+    def _pressing(self, time: float, sides: np.ndarray | None) -> list[tuple[Penalty, np.ndarray]]:
+        sides = (self.no_sides if sides is None else sides)[self.pressing]
+        return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
 
     def reflect(
-        self, q: np.ndarray, q_previous: np.ndarray, time: float, time_step: float, held: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """q_n and q_(n-1) after the obstacles that nodes bounce off; the very same arrays if nothing is touched.
+        self,
+        q: np.ndarray,
+        q_previous: np.ndarray,
+        time: float,
+        time_step: float,
+        held: np.ndarray,
+        sides: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """q_n and q_(n-1) after the obstacles that nodes bounce off; the very same arrays if nothing is touched. And
+        the work [J] of these obstacles on this rank's nodes.
 
         held : (l,) bool, the nodes that do not give way
         """
-        after, before = q, q_previous
-        for reflection in self.reflections:
-            after, before = reflection.reflect(after, before, time, time_step)
-        if after is q:
-            return q, q_previous
-        free = ~held[:, None]
-        return np.where(free, after, q), np.where(free, before, q_previous)
+        free, work = ~held[:, None], 0.0
+        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
+            after, before = reflection.reflect(q, q_previous, time, time_step, side)
+            if after is not q:
+                after, before = np.where(free, after, q), np.where(free, before, q_previous)
+                work += self._struck(reflection.obstacle, (after - before) - (q - q_previous), time, time_step)
+                q, q_previous = after, before
+        return q, q_previous, work
+
+    def turn(
+        self,
+        q: np.ndarray,
+        q_previous: np.ndarray,
+        a: np.ndarray,
+        time: float,
+        time_step: float,
+        held: np.ndarray,
+        sides: np.ndarray,
+    ) -> tuple[np.ndarray, float]:
+        """The same for an integrator that leaves nodes where they are: q_(n-1) and the work.
+
+        a : (l, 3) [m] acceleration times t^2
+        """
+        free, work = ~held[:, None], 0.0
+        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
+            before = reflection.turn(q, q_previous, a, time, time_step, side)
+            if before is not q_previous:
+                before = np.where(free, before, q_previous)
+                work += self._struck(reflection.obstacle, q_previous - before, time, time_step)
+                q_previous = before
+        return q_previous, work
+
+    def _struck(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
+        """Work [J] of an obstacle that changes velocities by change / t: the impulse times its own velocity."""
+        if not obstacle.path.leads_away:
+            return 0.0
+        way = obstacle.path.at(time) - obstacle.path.at(time - time_step)
+        mass = self.lattice.mass
+        return float(fetch(mass @ change[: len(mass)]) @ way) / time_step**2

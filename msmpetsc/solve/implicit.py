@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc import scene
+from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.saved import Saved
 from msmpetsc.model.surroundings import Surroundings
@@ -19,6 +20,9 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.reference import PREFIX, Problem, Reference
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import Stepper, StepResult
+
+
+MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 
 
 class ImplicitEuler:
@@ -63,20 +67,46 @@ class ImplicitEuler:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed."""
         self._let_go(time)
-        result = self._solve(state.q, 2 * state.q - state.q_previous, time)
-        return result, State(*self._reflected(result, time))
+        result, sides = self._solve(state.q, 2 * state.q - state.q_previous, time, self.time_step, state.sides)
+        after, before, work = self.around.reflect(
+            result.position, result.previous, time, self.time_step, self.stepper.lattice.pinned, sides
+        )
+        return replace(result, work=work), State(after, before, sides=sides)
 
-    def _solve(self, q: np.ndarray, y: np.ndarray, time: float) -> StepResult:
-        """The x that belongs to y, as it will be at ``time``."""
-        around = self.around
-        contact = around.contact(q, time, self.time_step)
-        self.problem = Problem(q, y, around.load(time), contact, around.led(q, time))
-        return self.stepper.step(**vars(self.problem))
+    def _solve(
+        self, q: np.ndarray, y: np.ndarray, time: float, time_step: float, before: np.ndarray | None
+    ) -> tuple[StepResult, np.ndarray]:
+        """The x that belongs to y, as it will be at ``time``, and the sides that it was found with.
 
-    def _reflected(self, result: StepResult, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Its position and previous one after the obstacles that nodes bounce off; the very same if nothing did."""
-        held = self.stepper.lattice.pinned
-        return self.around.reflect(result.position, result.previous, time, self.time_step, held)
+        Which face pushes a node out of a box is settled before the step is solved, by the way to y. Where the way to x
+        tells otherwise the step is solved again; from then on a node that has a face keeps it, so that this ends.
+        """
+        around, iterations, ksp_its = self.around, 0, 0
+        way = {"time": time, "time_step": time_step, "before": before, "held": self.stepper.lattice.pinned}
+        sides = around.met(q, y, **way)
+        for solves in range(MOST_SOLVES):
+            contact = around.contact(q, time, time_step, sides)
+            self.problem = Problem(q, y, around.load(time), contact, around.led(q, time))
+            result = self.stepper.step(**vars(self.problem))
+            iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
+            met = around.met(q, result.position, **way)
+            settled = np.where(sides > 0, sides, met) if solves else met
+            if not self._passes(result.position, time, sides, settled):
+                if around.penalties:  # what reflects goes by the way to x alone
+                    met[around.pressing] = np.where(settled > 0, settled, sides)[around.pressing]
+                return replace(result, iterations=iterations, ksp_its=ksp_its), met
+            sides = settled
+        raise StepFailed(
+            f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came in by; "
+            'try a smaller time.step, or safety.on_failure = "substep"',
+            "contact",
+        )
+
+    def _passes(self, x: np.ndarray, time: float, sides: np.ndarray, met: np.ndarray) -> bool:
+        """Whether any node on its way to x has met what did not push it (collective)."""
+        if not (self.around.has_sides and self.around.penalties):
+            return False
+        return self.comm.allreduce(not self.around.pushes_alike(x, time, sides, met), MPI.LOR)
 
     def follow(self) -> None:
         """Trace the step that comes next."""
@@ -158,27 +188,37 @@ class Bdf2(ImplicitEuler):
     looks_back = True
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """As of implicit Euler. A node that bounces off forgets what was before."""
+        """As of implicit Euler, but a node that bounces off stays where it is, and its history becomes what leads there
+        with its new velocity and the acceleration that it has: set back against its springs, as the paper has it, or
+        without that acceleration, which its neighbours feel the other end of, a ball gained a fifth of its energy.
+        """
         self._let_go(time)
         q, v, began = state.q, state.velocity(self.time_step), 0
         history = state.history
         if history is None:
-            history, began = self._history(q, v, time)
+            history, began = self._history(q, v, time, state.sides)
         q_0, v_0 = history
-        result = self._solve(q, (4 * q - q_0 + self.tau * (4 * v - v_0)) / 3, time)
+        y = (4 * q - q_0 + self.tau * (4 * v - v_0)) / 3
+        result, sides = self._solve(q, y, time, self.time_step, state.sides)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
-        result = replace(result, previous=previous, ksp_its=result.ksp_its + began)
-        after, before = self._reflected(result, time)
-        if after is not result.position:
-            struck = (after != result.position).any(axis=1)[:, None]
-            q, v = np.where(struck, before, q), np.where(struck, (after - before) / self.time_step, v)
-        return result, State(after, before, (q, v))
+        a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
+        before, work = self.around.turn(
+            result.position, previous, a, time, self.time_step, self.stepper.lattice.pinned, sides
+        )
+        result = replace(result, previous=previous, ksp_its=result.ksp_its + began, work=work)
+        if before is not previous:
+            struck = (before != previous).any(axis=1)[:, None]
+            v_after = (result.position - before - a) / self.time_step
+            q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
+        return result, State(result.position, before, (q, v), sides)
 
-    def _history(self, q: np.ndarray, v: np.ndarray, time: float) -> tuple[tuple[np.ndarray, np.ndarray], int]:
+    def _history(
+        self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None
+    ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
         """What would have led to q and v with the acceleration of an implicit Euler step of tau from there, which is
         the true one but for a part of first order; and the KSP iterations that this takes."""
         t, tau = self.time_step, self.tau
-        result = self._solve(q, q + tau * v, time - t + tau)
+        result, _ = self._solve(q, q + tau * v, time - t + tau, tau, sides)
         a = ((result.position - q) / tau - v) / tau
         return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its

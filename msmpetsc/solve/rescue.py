@@ -128,7 +128,7 @@ class Rescue:
         result, after = self.attempt(self.spare[level], state.over(self.time_step, short), time, short)
         done.add(result)
         result = replace(result, previous=State(result.position, result.previous).over(short, self.time_step).q_previous)
-        return result, State(after.q, after.q_previous).over(short, self.time_step)
+        return result, after.over(short, self.time_step)
 
     def _new(self, short: float) -> ImplicitEuler | Verlet:
         time, solver = self.scene.time.model_copy(update={"step": short}), self.scene.solver

@@ -96,12 +96,14 @@ class Simulation:
         self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
         integrator = INTEGRATORS[scene.time.integrator]
         self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver, measured)
-        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity)
+        swings = scene.time.integrator != "implicit-euler"
+        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity, swings)
         self.rescue = Rescue(comm, model, self.surroundings, scene, self._attempt)
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        self.state, self.effort = State(q.copy(), q - self.time_step * velocity), Effort()
+        sides = self.surroundings.met(q, q, 0.0, 0.0, None, self.surroundings.pinned_at(0.0))
+        self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.step = 0  # steps taken
         self.stored, self.stored_until = scene.stored, scene.stored_until  # numbers of frames
 
@@ -116,11 +118,14 @@ class Simulation:
     def advance(self) -> Iterator[Frame | None]:
         """The same, with None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
-            self.energies = self.balance.energies(self.state.q, self.state.velocity(self.time_step), 0.0)
+            state = self.state
+            self.watch.overlaps(0, self.surroundings, state.q, 0.0, self.time_step)
+            self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0, state.sides)
             yield self._frame(0, self.state.q)
         for index in range(self.step + 1, self.steps + 1):
             if index == self.measured.trace:
                 self.integrator.follow()
+            self.watch.overlaps(index, self.surroundings, self.state.q, index * self.time_step, self.time_step)
             begin = perf_counter()
             result, done = self._step(index)
             self.effort.add(result, done, perf_counter() - begin)
@@ -128,6 +133,7 @@ class Simulation:
                 errors, trace = self.integrator.true_errors(index, result)
                 self.effort.measure(errors)
                 self.trace = trace or self.trace
+            self.watch.gain(index, index * self.time_step, self.balance.ledger)
             self.step = index
             yield self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
         self.watch.sum_up()
@@ -136,7 +142,7 @@ class Simulation:
     def saved(self) -> Saved:
         """All that the next step depends on; to be stored or copied before that is taken."""
         saved = Saved(self.step)
-        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back)
+        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back, self.surroundings.has_sides)
         self.integrator.save(saved, self.state)
         for part in (self.balance, self.rescue, self.watch):
             part.save(saved)
@@ -173,8 +179,8 @@ class Simulation:
     def _attempt(self, integrator, state: State, time: float, time_step: float) -> tuple[StepResult, State]:
         """A step that passes its examination (collective). Raises StepFailed."""
         result, after = integrator.advance(state, time)
-        self.energies, ledger = self.balance.check(state, result, time, time_step)
-        self.balance.keep(self.energies, ledger, result)
+        self.energies, ended, ledger = self.balance.check(state, result, after, time, time_step)
+        self.balance.keep(ended, ledger, after)
         self.effort.energy_gained += ledger.last
         return result, after
 

@@ -55,13 +55,18 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 class StepResult:
     """position (l, 3) [m], ghosts included; previous (l, 3) [m]: so that the velocity is
     (position - previous) / t; error: estimate of the relative error of the step; iterations of SNES; ksp_its,
-    the KSP iterations of all of them, and of what examines the result."""
+    the KSP iterations of all of them, and of what examines the result; work: of obstacles that struck this rank's
+    nodes [J]; explicit: it was taken in substeps, and ``work`` has that of all that moved, pushed or came to be there;
+    swing: by how much the energy of this rank's nodes changed that comes back (solve.balance) [J]."""
 
     position: np.ndarray
     previous: np.ndarray
     error: float
     iterations: int
     ksp_its: int
+    work: float = 0.0
+    explicit: bool = False
+    swing: float = 0.0
 
 
 class Stepper:

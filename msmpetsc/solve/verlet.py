@@ -58,6 +58,8 @@ class Verlet:
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
+        self.sides = surroundings.no_sides[:, :owned]
+        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
         self.known = None  # the positions that ``gradient`` and the highest frequency are of
         self.anchors = None  # how many hold
         springs = slice(self.lattice.springs_owned)
@@ -96,6 +98,8 @@ class Verlet:
         if saved.numbers["known"]:
             self.known = state.q
             self.position.values[:] = state.q
+            sides = self.around.no_sides if state.sides is None else state.sides
+            self.sides = sides[:, : self.lattice.owned]
             self._pull(time)
 
     def forget(self) -> None:
@@ -113,12 +117,13 @@ class Verlet:
         squared = pushed + (self.highest.squared or self._elastic_squared())
         for _ in range(1 + RETRIES):
             count = self._count(squared)
+            begun = self._squared_acceleration(start)
             with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
                 self._take(count, start, time)
             energy, dt = self._energy(), self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
             if dt**2 * after <= 4:
-                return self._result(count)
+                return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
             squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
         raise StepFailed(
@@ -131,10 +136,17 @@ class Verlet:
         """q, v and grad E of a state."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
+        self.work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
+            self._meet(state, start)
             self._pull(start)
             self.highest.squared = 0.0
+
+    def _meet(self, state: State, time: float) -> None:
+        """The sides of a state."""
+        before = None if state.sides is None else state.sides[:, : self.lattice.owned]
+        self.sides = self.around.met(self.q, self.q, time, 0.0, before, self.held)
 
     def _take(self, count: int, start: float, time: float) -> None:
         """All substeps of a step."""
@@ -144,21 +156,28 @@ class Verlet:
         for begin, end in zip(times, times[1:], strict=False):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
+            self.work += self.around.appearing(self.q, begin, end, self.sides)
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
-    def _result(self, count: int) -> tuple[StepResult, State]:
+    def _squared_acceleration(self, time: float) -> float:
+        """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
+        force = (self.around.load(time) - self.gradient[: self.lattice.owned])[self.free]
+        return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
+
+    def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        return StepResult(self.known, previous, 0.0, count, 0), State(self.known, previous)
+        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True, swing=swing)
+        return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
         """grad E at q, with what obstacles push."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
-        contact = self.around.push(time)
+        contact = self.around.push(time, self.sides)
         if contact:
             contact.add_gradient(self.q, self.gradient)
 
@@ -166,7 +185,8 @@ class Verlet:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
         load = self.around.load(time)
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
-        self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end)
+        self.work += duration * self.around.power(self.q, time, begin, end, self.sides)
+        self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
 
     def _drift(self, begin: float, end: float) -> None:
         """q to the end of a substep: led nodes along their path, nodes that strike something back."""
@@ -174,8 +194,8 @@ class Verlet:
         drift(len(self.free), self.free, self.v, end - begin, self.q)
         if self.anchors:
             self._lead(begin, end)
-        if self.around.reflections:
-            self._reflect(begin, end)
+        if self.around.reflections or self.around.has_sides:
+            self._strike(begin, end)
         self.position.update()
 
     def _lead(self, begin: float, end: float) -> None:
@@ -184,11 +204,14 @@ class Verlet:
         self.v[where] = (led[where] - self.q[where]) / (end - begin)
         self.q[where] = led[where]
 
-    def _reflect(self, begin: float, end: float) -> None:
-        """A node that strikes is set back, and its velocity is what then led it there."""
+    def _strike(self, begin: float, end: float) -> None:
+        """By which faces nodes come into contact. One that bounces off is set back, and its velocity is what then led it
+        there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
-        after, before = self.around.reflect(self.q, self.before, end, end - begin, self.held)
+        self.sides = self.around.met(self.before, self.q, end, end - begin, self.sides, self.held)
+        after, before, work = self.around.reflect(self.q, self.before, end, end - begin, self.held, self.sides)
+        self.work += work
         if after is not self.q:
             struck = np.flatnonzero((after != self.q).any(axis=1))
             self.v[struck] = (after[struck] - before[struck]) / (end - begin)
@@ -208,7 +231,7 @@ class Verlet:
         fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        pushed = self.around.stiffest_push(self.q, speed, start, time)[self.free] * self.per_mass[self.free]
+        pushed = self.around.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
         return self.comm.allreduce(greatest(pushed), MPI.MAX)
 
     def _count(self, squared: float) -> int:

@@ -1,12 +1,16 @@
-"""What is looked for in each frame and said once: cells inside out, steps that ended far from their solution."""
+"""What is looked for in each frame and said once: cells inside out, steps that ended far from their solution, energy
+that came from nowhere, nodes inside an obstacle that comes to be there."""
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.overlap import overlap
 from msmpetsc.model.saved import Saved
+from msmpetsc.model.surroundings import Surroundings
 from msmpetsc.model.worst import inverted
+from msmpetsc.solve.balance import MUCH, Ledger
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 
@@ -16,8 +20,8 @@ class Watch:
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
-        self.frames = self.most = self.now = self.far = 0
-        self.worst_error = 0.0
+        self.frames = self.most = self.now = self.far = self.gaining = 0
+        self.worst_error = self.worst_gain = 0.0
 
     def inverted(self, index: int, time: float, q: np.ndarray) -> int:
         """The number of cells inside out at q (l, 3) [m] (collective)."""
@@ -43,14 +47,39 @@ class Watch:
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
+    def overlaps(self, index: int, around: Surroundings, q: np.ndarray, time: float, time_step: float) -> None:
+        """Where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
+        new = [o for o in around.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
+        for obstacle in new:
+            found = overlap(self.comm, self.lattice, obstacle, q, around.pinned_at(time), time)
+            if found:
+                log.warning(
+                    "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",
+                    index, time, found,
+                )  # fmt: skip
+
+    def gain(self, index: int, time: float, ledger: Ledger) -> None:
+        """What the body has from nowhere after a step."""
+        if not ledger.share <= MUCH:
+            if not self.gaining:
+                log.warning(
+                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; a smaller time.step "
+                    "or a smaller solver.error mends that",
+                    index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in,
+                )  # fmt: skip
+            self.gaining += 1
+            self.worst_gain = max(self.worst_gain, ledger.share)
+
     def save(self, saved: Saved) -> None:
         saved.numbers |= {"frames_inverted": self.frames, "most_inverted": self.most, "now_inverted": self.now}
         saved.numbers |= {"frames_far": self.far, "worst_error": self.worst_error}
+        saved.numbers |= {"frames_gaining": self.gaining, "worst_gain": self.worst_gain}
 
     def restore(self, saved: Saved) -> None:
-        names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far")
-        self.frames, self.most, self.now, self.far = (int(saved.numbers.get(name, 0)) for name in names)
-        self.worst_error = saved.numbers.get("worst_error", 0.0)
+        names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")
+        counts = (int(saved.numbers.get(name, 0)) for name in names)
+        self.frames, self.most, self.now, self.far, self.gaining = counts
+        self.worst_error, self.worst_gain = (saved.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain"))
 
     def sum_up(self) -> None:
         """At the end of a run: how often it was."""
@@ -59,6 +88,10 @@ class Watch:
             log.warning("cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left)
         if self.far:
             log.warning("steps ended far off their solution in %d frames, by up to %.2g", self.far, self.worst_error)
+        if self.gaining:
+            log.warning(
+                "in %d frames there was energy from nowhere, up to %.2g%% of all", self.gaining, 100 * self.worst_gain
+            )
 
     def _remedy(self) -> str:
         if self.lattice.stiffening > 0:

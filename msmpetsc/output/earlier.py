@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
-from msmpetsc.output.frames import SERIES, pieces
+from msmpetsc.output.frames import pieces
 from msmpetsc.output.result import Result, checked_checkpoint, finished, open_result
 
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
@@ -58,12 +58,6 @@ def read_saved(comm, path: Path, owned: int) -> Saved | None:
         names, numbers = source.names(), source.value("checkpoint/numbers")
         numbers = numbers[slot].tolist() if names else []
         return Saved(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
-
-
-def read_numbers(comm, path: Path, index: int) -> dict[str, float]:
-    """Of a frame, all that the file has (collective)."""
-    with Source(comm, path) as source:
-        return {name: source.value(f"frames/{name}")[index] for name, (_, shape, _) in SERIES.items() if not shape}
 
 
 def refuse_other_lattice(comm, path: Path, found: dict[str, np.ndarray]) -> None:

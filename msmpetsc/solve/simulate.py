@@ -1,7 +1,7 @@
 """The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -159,8 +159,9 @@ class Simulation:
     def _frame(self, index: int, q: np.ndarray) -> Frame:
         """What is stored of positions q (l, 3) and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.energies
-        effort, self.effort = self.effort, Effort()
-        effort.energy_gained = max(effort.energy_gained, 0.0)
+        effort = replace(self.effort, energy_gained=max(self.effort.energy_gained, 0.0))
+        if index % self.every == 0:  # the last frame may come between: of a longer run it is none
+            self.effort = Effort()
         self.watch.error(index, time, effort.step_error)
         position = fetch(q[: self.model.lattice.owned])
         return Frame(

@@ -4,6 +4,7 @@ import copy
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import tomllib
 from pathlib import Path
@@ -334,6 +335,65 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
     done.set()
     other.join()
     assert main(["run", "--resume", str(stopped)]) == 0
+
+
+def take_and_free(path: Path, times: int, twice) -> None:
+    """A lock again and again; a file that the holder alone should make tells of a second one."""
+    from msmpetsc.output.frames import Lock
+
+    for _ in range(times):
+        try:
+            lock = Lock(path)
+        except InputError:
+            continue
+        try:
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+            os.unlink(path)
+        except FileExistsError:
+            twice.value += 1
+        lock.free()
+    os._exit(0)
+
+
+def test_no_two_hold_a_lock(tmp_path):
+    context = multiprocessing.get_context("fork")
+    twice = context.Value("i", 0)
+    four = [context.Process(target=take_and_free, args=(tmp_path / "x", 5000, twice)) for _ in range(4)]
+    for process in four:
+        process.start()
+    for process in four:
+        process.join(60)
+    assert [process.exitcode for process in four] == [0] * 4 and twice.value == 0
+
+
+@pytest.mark.parametrize("with_its_folder", [False, True])
+@pytest.mark.parametrize("another", [False, True])
+def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monkeypatch, capsys, with_its_folder, another):
+    """The run stops at its next checkpoint, and what it had is there to go on from."""
+    folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
+    path, advance = folder / "x.h5", Simulation.advance
+
+    def watched(simulation):
+        for frame in advance(simulation):
+            yield frame
+            if simulation.step == 17:
+                shutil.rmtree(folder) if with_its_folder else path.unlink()
+                folder.mkdir(exist_ok=True)
+                if another:
+                    path.write_text("another")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", watched)
+        assert main(["run", scene, "-o", str(path), "--true-error", "3", "--checkpoint-every", "3"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+    kept = folder / f"x.{os.getpid()}.h5" if another else path
+    assert len(told) == 1 and "was removed while it was written" in told[0] and told[0].endswith(f"--resume {kept}")
+    assert os.listdir(folder) == [kept.name] or another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"])
+    with h5py.File(kept) as file:
+        assert max(file["checkpoint/step"]) == 18 and finished(file) == 7
+    assert main(["run", "--resume", str(kept)]) == 0
+    assert_same(kept, whole)
+    assert not another or path.read_text() == "another"
 
 
 @pytest.mark.parametrize("given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]])

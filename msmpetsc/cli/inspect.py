@@ -4,7 +4,6 @@ import argparse
 import shlex
 import signal
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,7 @@ import petsc4py
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import path_argument, refuse_below_one
 from msmpetsc.cli.cost import peak_memory
 from msmpetsc.cli.study import refuse_ranks, stop
 from msmpetsc.comm import log
@@ -39,7 +38,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Count cells, nodes, springs, ghosts and messages of each rank, and expect memory and time of a "
         "frame from two short runs here, on coarser lattices. PETSc options (one dash) may follow.",
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks (1)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import resume
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import file_argument, path_argument, refuse_below_one
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
@@ -37,8 +37,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="simulate a scene",
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
     )
-    parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="scene file (TOML)")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT.h5", help="default: out/SCENE.h5")
+    parser.add_argument("scene", type=path_argument, nargs="?", metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("-o", "--output", type=file_argument, metavar="OUT.h5", help="default: out/SCENE.h5")
     parser.add_argument("--preset", metavar="NAME", help="solver preset (see --list-presets)")
     parser.add_argument("--error", metavar="E", help="relative error at which a step is done")
     parser.add_argument(
@@ -51,7 +51,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
     parser.add_argument(
-        "--resume", type=Path, metavar="OUT.h5",
+        "--resume", type=file_argument, metavar="OUT.h5",
         help="go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
     )  # fmt: skip
     parser.add_argument("--force", action="store_true", help="resume with another scene or other options than before")
@@ -66,7 +66,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
-    parser.add_argument("--measure", type=Path, metavar="OUT.json", help="write what the run cost: times, memory")
+    parser.add_argument("--measure", type=file_argument, metavar="OUT.json", help="write what the run cost: times, memory")
     parser.add_argument("--list-presets", action=ListPresets, help="say what each preset is for")
 
 

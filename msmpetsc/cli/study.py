@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from msmpetsc.cli.arguments import refuse_below_one
+from msmpetsc.cli.arguments import path_argument, refuse_below_one
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 
@@ -19,8 +19,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Run the cases of a study, each in its own process, into a table and a report. "
         "Stopped, the same command goes on.",
     )
-    parser.add_argument("study", type=Path, metavar="FILE.toml", help="study file")
-    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: out/FILE")
+    parser.add_argument("study", type=path_argument, metavar="FILE.toml", help="study file")
+    parser.add_argument("-o", "--output", type=path_argument, metavar="FOLDER", help="default: out/FILE")
     parser.add_argument("--full", action="store_true", help="also what is marked full = true: the long cases")
     parser.add_argument("--jobs", type=int, metavar="N", help="cases at a time (they slow each other)")
     parser.add_argument("--restart", action="store_true", help="forget the cases that are done")

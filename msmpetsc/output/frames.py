@@ -213,6 +213,8 @@ class ResultFile:
     def _refuse_to_replace(self) -> None:
         if self.path.is_dir():
             raise InputError(f"{self.path} is a folder, not a file")
+        if self.path.exists() and not self.path.is_file():
+            raise InputError(f"{self.path} is a pipe or a device, not a file")
         if self.path.exists() and not self._overwrite:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 

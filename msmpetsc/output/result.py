@@ -158,7 +158,8 @@ def open_result(path: str | Path) -> h5py.File:
     """Open a result file to read it; InputError if it is none."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} is a folder, not a file" if path.is_dir() else f"{path}: no such file")
+        kind = "a folder" if path.is_dir() else "a pipe or a device"
+        raise InputError(f"{path} is {kind}, not a file" if path.exists() else f"{path}: no such file")
     with damage_told(path):
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):

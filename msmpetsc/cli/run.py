@@ -16,6 +16,7 @@ from msmpetsc import __version__
 from msmpetsc.cli import resume
 from msmpetsc.cli.arguments import file_argument, path_argument, refuse_below_one
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
+from msmpetsc.cli.failure import ending_together
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
 from msmpetsc.cli.storing import tell_stop, write_frames, write_model
@@ -118,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
             describe(comm, model)
             if resumed:
                 resumed.refuse_other_lattice(comm, model)
-            with Simulation(comm, scene, model, measured) as simulation:
+            with Simulation(comm, scene, model, measured) as simulation, ending_together(comm):
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - began)
                 write_model(comm, file, model)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import small_result
+from bad_input import limits
 from block_scene import block_scene
 
 from msmpetsc.cli.main import main
@@ -66,3 +67,23 @@ def test_a_device_is_not_replaced(folder, monkeypatch):
     monkeypatch.chdir(folder)
     main(["run", "scene.toml", "-o", "device", "--overwrite"])
     assert not (folder / "device").is_file()
+
+
+TOO_MUCH = {
+    "cells": (["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"], "GB a rank or more"),
+    "tiny cells": (["run", "scene.toml", "--set", "cages={cell_size = 1e-5, max_cells = 1000000000000000}"], "GB a rank or more"),
+    "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),
+    "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
+    "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every takes"),
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("what", TOO_MUCH)
+def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch, capsys, what):
+    monkeypatch.chdir(folder)
+    command, words = TOO_MUCH[what]
+    with limits():
+        assert main(command) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and words in told[0]

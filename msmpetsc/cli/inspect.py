@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from msmpetsc.model.shares import Shares
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
+MOST_RANKS = 10**6
 MOST_CELLS = 1e15  # where limits are looked for
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
@@ -77,6 +78,8 @@ def run(args: argparse.Namespace) -> int:
 
 def refuse_bad_numbers(args: argparse.Namespace) -> None:
     refuse_below_one(args, "ranks", "frames")
+    if args.ranks > MOST_RANKS:
+        raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     if not (args.latency >= 0 and np.isfinite(args.latency)):
         raise InputError(f"--latency must be no less than 0, not {args.latency:g}")
     if not args.bandwidth > 0:

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from msmpetsc.cli.arguments import path_argument, refuse_below_one
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -65,8 +65,9 @@ def part_of(text: str | None):
     if text is None:
         return None
     index, _, count = text.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
-        raise InputError(f"--part must read I/N, 1 <= I <= N, not {text}")
+    numbers = all(part.isdecimal() and len(part) < 10 for part in (index, count))
+    if not (numbers and 1 <= int(index) <= int(count)):
+        raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
     return Part(int(index), int(count))
 
 

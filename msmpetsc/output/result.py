@@ -8,7 +8,6 @@ import math
 import os
 import resource
 import signal
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -111,8 +110,10 @@ class Result:
         text = self.attributes.get("scene")
         if not isinstance(text, str):
             raise InputError(f"{self.path} does not say its scene")
+        from msmpetsc.scene_reading import toml_of  # loads pydantic: who reads frames need not wait
+
         try:
-            return tomllib.loads(text)
+            return toml_of(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{self.path}: its scene is not TOML: {one_line(error)}") from error
 

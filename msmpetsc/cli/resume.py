@@ -128,7 +128,7 @@ class Resumed:
     def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
         """To write into (collective)."""
         earlier = self.earlier
-        if not self.differs and earlier.planned == self.stored and earlier.exact:
+        if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
             return InPlace(earlier.path, comm, attributes)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))

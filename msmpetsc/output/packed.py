@@ -9,8 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, one_line
 from msmpetsc.output.frames import open_new, pieces, plain_errors
+from msmpetsc.output.result import checked_datasets
 
 PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 LEAST = 4096  # [byte]: what is shorter is not worth a filter
@@ -21,12 +22,16 @@ def pack(path: Path) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         with plain_errors(part), h5py.File(path, "r", locking=False) as file, open_new(part) as packed:
+            checked_datasets(file)  # or it may claim what no disk holds
             packed.attrs.update(file.attrs)
             file.visititems(lambda name, found: _copy(name, found, packed))
         os.replace(part, path)
     except InputError:
         part.unlink(missing_ok=True)
         raise
+    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"{path} is damaged: {one_line(error)}") from error
 
 
 def _copy(name: str, found: h5py.Group | h5py.Dataset, packed: h5py.File) -> None:

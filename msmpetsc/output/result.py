@@ -240,6 +240,8 @@ def checked_checkpoint(file: h5py.File) -> list[str] | None:
         group = _held(path, file, "checkpoint")
         if group is None:
             return None
+        if not isinstance(group, h5py.Group):
+            raise InputError(f"{path} is damaged: its checkpoint is no group")
         nodes, names = len(file["lattice/nodes"]), []
         for name in group:
             if not name.isprintable():  # lines that tell of it would not be lines
@@ -276,7 +278,9 @@ def damage_told(path: Path) -> Iterator[None]:
         yield
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except KeyError as error:
+        raise InputError(f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}") from error
+    except (OSError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 
-from msmpetsc.output.frames import finished, open_result
+from msmpetsc.output.result import checked_datasets, damage_told, finished, open_result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 
@@ -19,13 +19,14 @@ def write_xdmf(h5_path: str | Path) -> Path:
     h5_path = Path(h5_path)
     root = ET.Element("Xdmf", Version="3.0")
     domain = ET.SubElement(root, "Domain")
-    with open_result(h5_path) as file:
-        if "frames/surface" in file:
-            _collection(domain, "surface", "Triangle", file["surface/triangles"], file["frames/surface"])
-        lattice = _collection(domain, "lattice", "Hexahedron", file["lattice/cells"], file["frames/position"])
+    with open_result(h5_path) as file, damage_told(h5_path):
+        stored = checked_datasets(file)
+        if "frames/surface" in stored:
+            _collection(domain, "surface", "Triangle", stored["surface/triangles"], stored["frames/surface"])
+        lattice = _collection(domain, "lattice", "Hexahedron", stored["lattice/cells"], stored["frames/position"])
         for grid in lattice:
             kind = ET.SubElement(grid, "Attribute", Name="cell_kind", AttributeType="Scalar", Center="Cell")
-            kind.append(_data_item(file["lattice/cell_kind"]))
+            kind.append(_data_item(stored["lattice/cell_kind"]))
     ET.indent(root)
     path = h5_path.with_suffix(".xdmf")
     part = path.with_name(f"{path.name}.{os.getpid()}.part")

@@ -108,7 +108,8 @@ class EnergyBalance:
         saved.numbers |= vars(self.ledger)
 
     def restore(self, saved: Saved) -> None:
-        self.ledger = Ledger(**{name: saved.numbers[name] for name in vars(Ledger()) if name in saved.numbers})
+        most = np.finfo(float).max
+        self.ledger = Ledger(**{name: saved.number(name, 0.0, -most, most) for name in vars(Ledger())})
 
     def _start(self, before: State, result: StepResult, time: float, time_step: float) -> tuple[float, float]:
         """Right side of the balance, and the work in it: of loads, and of obstacles that drag [J] (collective)."""

@@ -120,13 +120,16 @@ class Simulation:
 
     def restore(self, saved: Saved) -> None:
         """Go on from there (collective)."""
+        saved.refuse_rows_unlike(self.comm, self.saved())
         self.step, time = saved.step, saved.step * self.time_step
         self.state = State.restored(self.comm, self.model.lattice, saved)
         self.integrator.restore(saved, self.state, time)
         for part in (self.balance, self.rescue, self.watch):
             part.restore(saved)
-        fields = {name: type(value) for name, value in vars(Effort()).items() if name in saved.numbers}
-        self.effort = Effort(**{name: kind(saved.numbers[name]) for name, kind in fields.items()})
+        known = {name: value for name, value in vars(Effort()).items() if name in saved.numbers}
+        self.effort = Effort(
+            **{name: saved.count(name) if isinstance(value, int) else saved.numbers[name] for name, value in known.items()}
+        )
 
     def _step(self, index: int) -> tuple[StepResult, Done]:
         """The step that ends at index * t; ``state`` moves on (collective)."""

@@ -49,7 +49,7 @@ class Watch:
 
     def restore(self, saved: Saved) -> None:
         names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far")
-        self.frames, self.most, self.now, self.far = (int(saved.numbers.get(name, 0)) for name in names)
+        self.frames, self.most, self.now, self.far = (saved.count(name) for name in names)
         self.worst_error = saved.numbers.get("worst_error", 0.0)
 
     def sum_up(self) -> None:

@@ -7,6 +7,7 @@ import lzma
 import os
 import struct
 import sys
+import tempfile
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -43,6 +44,36 @@ def exported(**options) -> bytes:
     return content.encode() if isinstance(content, str) else content
 
 
+def by_meshio(kind: str, **options) -> bytes:
+    """As meshio writes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"x.{kind}")
+        meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(path, **options)
+        return path.read_bytes()
+
+
+def mz3() -> bytes:
+    header = struct.pack("<HHIII", 0x5A4D, 3, len(BOX.faces), len(BOX.vertices), 0)
+    return header + BOX.faces.astype("<i4").tobytes() + BOX.vertices.astype("<f4").tobytes()
+
+
+def gltf() -> bytes:
+    """With its buffers as text in it."""
+    binary = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    tree = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
+        "buffers": [{"uri": uri, "byteLength": len(binary)}],
+        "bufferViews": [{"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 8},
+            {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 36},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 4}]}],
+    }  # fmt: skip
+    return json.dumps(tree).encode()
+
+
 SEEDS = [
     ("obj", exported(file_type="obj")),
     ("obj", QUADS),
@@ -51,6 +82,16 @@ SEEDS = [
     ("stl", exported(file_type="stl")),
     ("stl", exported(file_type="stl_ascii")),
     ("off", exported(file_type="off")),
+    ("glb", exported(file_type="glb")),
+    ("gltf", gltf()),
+    ("mz3", mz3()),
+    ("vtk", by_meshio("vtk", binary=False)),
+    ("vtk", by_meshio("vtk")),
+    ("vtu", by_meshio("vtu", binary=False)),
+    ("vtu", by_meshio("vtu", compression=None)),
+    ("vtu", by_meshio("vtu", compression="zlib")),
+    ("vtu", by_meshio("vtu", compression="lzma")),
+    ("stl.gz", gzip.compress(exported(file_type="stl"), mtime=0)),
 ]
 
 
@@ -73,6 +114,11 @@ def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
 def test_a_damaged_mesh_is_a_body_or_one_line(tmp_path, seed, changes, step):
     kind, content = seed
     read(tmp_path, kind, damaged(content, changes), f"mesh.prepare={step}")
+
+
+@pytest.mark.parametrize(("kind", "content"), SEEDS)
+def test_a_whole_mesh_is_read(tmp_path, kind, content):
+    assert not read(tmp_path, kind, content)
 
 
 @settings(TRIALS, max_examples=120)

@@ -89,6 +89,7 @@ class ResultFile:
         self._overwrite = overwrite
         self._file: h5py.File | None = None  # open on rank 0 only
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
+        self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
         self._planned = self.finished = 0
         self._failed = False  # to write
@@ -143,6 +144,7 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._publish()
+                self._same = os.open(self.path, os.O_RDONLY)
         if self._comm.size > 1 and not self.gathers:
             self._direct = reach(self._comm, self.path)
 
@@ -241,21 +243,21 @@ class ResultFile:
 
     def _refuse_removed(self) -> None:
         """Raise InputError where no name leads to the file any more; what it holds gets one again."""
-        here = self._file.id.get_vfd_handle()
-        if os.fstat(here).st_nlink:
+        if self._same is None or os.fstat(self._same).st_nlink:
             return
         copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
         copy.parent.mkdir(parents=True, exist_ok=True)
-        copy_sparse(here, copy)
+        copy_sparse(self._same, copy)
         if not self.path.exists():
             copy = copy.rename(self.path)
         command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
         raise InputError(f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}")
 
     def _finish(self, trim: bool) -> None:
-        if self._direct is not None:
-            os.close(self._direct)
-            self._direct = None
+        for descriptor in (self._direct, self._same):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._direct = self._same = None
         file, self._file = self._file, None
         if file is None:
             return

@@ -29,8 +29,8 @@ COMMANDS = [
     ["plan", "{}", "--error", "0.1"],
     ["fetch", "{}"],
 ]
-PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe", "scene.toml/x.h5", "a\x1b[31m.h5"]
-PATHS += ["loop.h5", "\u2028.h5"]
+PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]
+PATHS += ["scene.toml/x.h5", "a\x1b[31m.h5", "loop.h5", "\u2028.h5"]
 
 
 @pytest.fixture(scope="module")

@@ -285,10 +285,12 @@ def _instanced_rows(kind: str, data: bytes) -> int:
     """Rows of the points and corners of all meshes, wherever nodes put them."""
     tree = _gltf(kind, data)
     counts = [accessor["count"] for accessor in tree.get("accessors", [])]
-    rows = [
-        sum(counts[number] for part in mesh["primitives"] for number in (part["attributes"]["POSITION"], part.get("indices")) if number is not None)
-        for mesh in tree.get("meshes", [])
-    ]
+
+    def rows_of(part: dict) -> int:
+        points, corners = part["attributes"]["POSITION"], part.get("indices")
+        return counts[points] + (0 if corners is None else counts[corners])
+
+    rows = [sum(map(rows_of, mesh["primitives"])) for mesh in tree.get("meshes", [])]
     return sum(rows) + sum(rows[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node)
 
 

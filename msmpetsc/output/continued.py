@@ -62,7 +62,8 @@ class Anew(ResultFile):
     def _start(self, count: int) -> None:
         super()._start(count)
         with open_result(self.path) as earlier:
-            there = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in earlier["frames"] if name in self._file["frames"]}
+            names = earlier["frames"].keys() & self._file["frames"].keys()
+            there = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in sorted(names)}
             for name, dataset in there.items():
                 if dataset.shape[1:] != self._file["frames"][name].shape[1:]:
                     raise InputError(f"{self.path} is damaged: frames/{name} has shape {dataset.shape}")

@@ -11,7 +11,14 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
 from msmpetsc.output.frames import SERIES, pieces
-from msmpetsc.output.result import Result, checked_checkpoint, checked_dataset, damage_told, finished, open_result
+from msmpetsc.output.result import (
+    Result,
+    checked_checkpoint,
+    checked_dataset,
+    damage_told,
+    finished,
+    open_result,
+)
 
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.errors import MsmpetscError
+from msmpetsc.errors import MsmpetscError, as_expected
 
 log = logging.getLogger("msmpetsc")  # the command line lets rank 0 alone speak
 
@@ -17,17 +17,18 @@ T = TypeVar("T")
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on all ranks the first rank's MsmpetscError, if any rank has one (collective).
+    """Raise on all ranks the first rank's MsmpetscError, if any rank has one or lacks memory (collective).
 
     Nothing collective may stand in the block: a rank that fails leaves it early.
     """
     error = None
     try:
         yield
-    except MsmpetscError as raised:
-        error = raised
+    except (MsmpetscError, MemoryError) as raised:
+        error = as_expected(raised)
     for found in comm.allgather(error):
         if found is not None:
+            found.on_all_ranks = True
             raise found
 
 

@@ -8,6 +8,7 @@ class MsmpetscError(Exception):
     """Base of all expected failures; ``exit_status`` is what the command line returns."""
 
     exit_status = 1
+    on_all_ranks = False  # whether every rank raises it, as far as is known
 
 
 class InputError(MsmpetscError):
@@ -29,6 +30,17 @@ class StepFailed(MsmpetscError):
     def __init__(self, message: str, kind: str = "iterations", frame: int | None = None):
         super().__init__(message)
         self.kind, self.frame = kind, frame
+
+
+PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
+
+
+def as_expected(error: Exception) -> MsmpetscError | None:
+    """The error as one of ours, if it is one that a user can meet: memory that is not enough is."""
+    if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
+        reason = one_line(error)
+        return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
+    return error if isinstance(error, MsmpetscError) else None
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:

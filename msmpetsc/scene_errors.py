@@ -14,7 +14,8 @@ from msmpetsc.errors import nearest, printable
 
 KeyPath = tuple[str | int, ...]
 
-SEARCHED_LINES = 300  # finding a line parses every prefix of the file: quadratic, 0.2 s for so many
+SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
+TOLD = 100  # problems of a file
 
 WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "missing": "required, but missing",
@@ -69,7 +70,7 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
     """
     found = error.errors(include_url=False)
     unknown = [e["loc"][0] for e in found if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
-    meant = {_nearest(key, known) for key in unknown}
+    meant = {_nearest(key, known) for key in unknown[:TOLD]}
     problems: dict[Any, InitErrorDetails] = {}
     for number, e in enumerate(found):
         kind, loc, context, identity = e["type"], e["loc"], dict(e.get("ctx", {})), number
@@ -89,12 +90,14 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
     """One line for each problem: file, key, what is wrong, and the line in ``text`` or the override at fault."""
     prefixes = _prefixes(text)
     lines = []
-    for e in error.errors(include_url=False):
+    problems = error.errors(include_url=False)
+    for e in problems[:TOLD]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
         number = _line(e["loc"], prefixes)
         where = f" (--set {as_given(culprit)})" if culprit else f" (line {number})" if number else ""
         lines.append(f"{path}: {_key(e['loc'])}: {_words(e)}{where}")
-    return lines
+    more = len(problems) - TOLD
+    return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 
 
 def as_given(value: Any) -> str:
@@ -158,7 +161,7 @@ def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
     A statement ends where the text up to there parses.
     """
     lines = text.split("\n")
-    if len(lines) > SEARCHED_LINES:
+    if len(lines) > SEARCHED_LINES or len(text) > SEARCHED:
         return []
     found, start = [], 1
     for end in range(1, len(lines) + 1):

@@ -1,5 +1,6 @@
 """Scene file (TOML) and what the command line changes in it -> a checked Scene."""
 
+import re
 import tomllib
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -13,6 +14,9 @@ from msmpetsc.scene import Scene, SceneFile
 from msmpetsc.scene_errors import as_given, problem_lines
 
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
+DEEPEST = 50  # parts of a key: tomllib takes time by their square
+KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE)
 
 
 def load_scene(
@@ -100,9 +104,16 @@ def _read(path: Path, kind: str) -> str:
         raise InputError(f"{as_given(str(path))}: no path has a null character") from None
 
 
+def toml_of(text: str) -> dict[str, Any]:
+    """Its data. Raises ValueError for what is not TOML, RecursionError for what is nested too deeply."""
+    if DEEP_KEY.search(text):
+        raise RecursionError
+    return tomllib.loads(text)
+
+
 def _parse(path: Path, text: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        return toml_of(text)
     except tomllib.TOMLDecodeError as error:
         last = text.rstrip().count("\n") + 1
         problem = str(error).replace("at end of document", f"at the end, line {last}")
@@ -122,6 +133,8 @@ def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
         path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
         if not equals or not raw.strip() or "" in path:
             raise InputError("must read key.path=value")
+        if len(path) > DEEPEST:
+            raise InputError("is nested too deeply")
         value = _override_value(raw.strip())
         holder: Any = data
         for key, following in zip(path, path[1:], strict=False):
@@ -135,7 +148,7 @@ def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
 
 def _override_value(raw: str) -> Any:
     try:
-        parsed = tomllib.loads(f"value = {raw}")
+        parsed = toml_of(f"value = {raw}")
     except (ValueError, RecursionError):
         if raw[0] in "\"'[{" or "\n" in raw:
             raise InputError("the value is not TOML") from None

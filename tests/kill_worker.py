@@ -83,7 +83,7 @@ def chain(scene: str, path: Path, kills: int, chance: random.Random, seen: dict,
         while status is None:
             often = chance.choice([[], ["--checkpoint-every", "1"]])
             enough = seen["kills"] - begun >= kills
-            status = run([*arguments, *often], None if enough else chance.uniform(0, seen["seconds"]))
+            status = run([*arguments, *often], None if enough else chance.uniform(0, 1.5 * seen["seconds"]))
             if status is None:
                 seen["kills"] += 1
                 seen["before the file"] += not path.exists()

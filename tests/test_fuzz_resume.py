@@ -2,12 +2,15 @@
 
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from bad_input import TRIALS, damage, damaged, limits
+from conftest import ENVIRONMENT
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from test_signals import hanging, signal_after
@@ -28,7 +31,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stopped")
     with pytest.MonkeyPatch.context() as patch:
         signal_after(patch, 4, signal.SIGUSR1)
-        assert main(["run", str(hanging(folder, steps=6)), "-o", str(folder / "x.h5"), "--set", "output.surface=false"]) == 0
+        assert main(["run", str(hanging(folder, steps=6)), "-o", str(folder / "x.h5")]) == 0
     return folder / "x.h5"
 
 
@@ -74,3 +77,80 @@ def test_it_goes_on_or_says_in_one_line_why_not(stopped, tmp_path, capsys, edits
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     assert status in (0, 2, 3) and (status == 0) == (not told)
     assert all(line.isprintable() for line in told) and not any(re.search("Error|Traceback", line) for line in told)
+
+
+def without(file: h5py.File, name: str) -> None:
+    del file[name]
+
+
+def a_group(file: h5py.File, name: str) -> None:
+    del file[name]
+    file.create_group(name)
+
+
+def dangling(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = h5py.SoftLink("/nowhere")
+
+
+def a_loop(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = h5py.SoftLink(f"/{name}")
+
+
+def text(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = np.array([b"1", b"2", b"3"])
+
+
+def short(file: h5py.File, name: str) -> None:
+    rows = file[name][...]
+    del file[name]
+    file[name] = rows[:, :1] if rows.ndim > 1 else rows[:1]
+
+
+def number(value: float):
+    def change(file: h5py.File, name: str) -> None:
+        numbers = file["checkpoint/numbers"]
+        at = numbers.attrs["names"].split().index(name)
+        numbers[:, at] = value
+
+    return change
+
+
+DAMAGE = [
+    (a_group, "frames/iterations"), (dangling, "frames/substeps"), (a_loop, "frames/kinetic"), (text, "frames/ksp_its"),
+    (short, "frames/momentum"), (without, "checkpoint/correction"), (a_group, "checkpoint/correction"),
+    (short, "checkpoint/correction_before"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
+    (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"), (short, "lattice/springs"),
+    (without, "lattice/cells"), (dangling, "embedding/weights"), (text, "lattice/cell_kind"), (a_group, "frames/surface"),
+    (number(np.nan), "corrections"), (number(5), "corrections"), (number(np.inf), "iterations"), (number(np.nan), "put_in"), (number(-1), "frames_inverted"), (number(np.nan), "ratio"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("how", "name"), DAMAGE)
+def test_a_damaged_part_is_named_in_one_line(stopped, tmp_path, capsys, how, name):
+    path = tmp_path / "x.h5"
+    path.write_bytes(stopped.read_bytes())
+    with h5py.File(path, "r+") as file:
+        how(file, name)
+    before = path.read_bytes()
+    assert main(["run", "--resume", str(path)]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+    assert len(told) == 1 and name.rpartition("/")[2] in told[0]
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
+def test_whatever_is_damaged_ends_in_a_line(stopped, tmp_path, monkeypatch, integrator):
+    """In forks of a worker: more of it by a larger number."""
+    source = stopped
+    if integrator == "verlet":
+        with monkeypatch.context() as patch:
+            signal_after(patch, 4, signal.SIGUSR1)
+            scene, source = hanging(tmp_path, steps=6), tmp_path / "source.h5"
+            assert main(["run", str(scene), "-o", str(source), "--set", "time.integrator=verlet"]) == 0
+    worker = Path(__file__).with_name("resume_worker.py")
+    command = [sys.executable, str(worker), str(source), str(tmp_path / "x.h5"), "25", "1"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0 and done.stdout.endswith(" faults: 0\n"), done.stdout + done.stderr

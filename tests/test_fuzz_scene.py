@@ -1,6 +1,7 @@
 """Scene files, study files and --set values that are wrong or hostile; under mpiexec too."""
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -123,3 +124,42 @@ def test_all_ranks_say_the_same_once(folder, msmpetsc, name):
     told = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: error")]
     assert done.returncode == 2 and len(told) == 1 and "Traceback" not in done.stderr
     assert not (folder / "x.h5").exists()
+
+
+DEEP = {
+    "a key of many parts": b"a" + b".a" * 20_000 + b" = 1\n",
+    "quoted ones": b'"a"' + b" . 'a b'" * 20_000 + b" = 1\n",
+    "a table of many parts": b"[ a" + b".a" * 20_000 + b"]\n",
+    "in a table that is a value": b"x = [{ y = 1, a" + b".a" * 20_000 + b" = 1 }]\n",
+    "brackets": b"x = " + b"[" * 20_000 + b"\n",
+}
+MANY = {
+    "unknown keys": (b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
+    "unknown keys of a table": (b"[cages]\n" + b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
+    "a long line and many others": (b"x = [" + b"1, " * 100_000 + b"]\n" + b"".join(b"y%d = 1\n" % i for i in range(200)), "unknown key"),
+}
+
+
+@pytest.mark.parametrize("name", DEEP)
+def test_a_key_of_many_parts_takes_no_time(tmp_path, name):
+    path = tmp_path / "x.toml"
+    path.write_bytes(DEEP[name])
+    for load in (load_scene, load_study):
+        begun = time.process_time()
+        assert refusal(lambda load=load: load(path)) == f"{path}: is nested too deeply"
+        assert time.process_time() - begun < 1
+    assert "is nested too deeply" in refusal(lambda: load_scene(block_scene(tmp_path), ["a" + ".a" * 20_000 + "=1"]))
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_many_mistakes_take_no_time(tmp_path, name):
+    path, (content, words) = tmp_path / "x.toml", MANY[name]
+    path.write_bytes(content)
+    begun = time.process_time()
+    said = refusal(lambda: load_scene(path), lines=True)
+    assert words in said and said.count("\n") < 110 and time.process_time() - begun < 5
+
+
+def test_a_key_of_fifty_parts_is_unknown(tmp_path):
+    (tmp_path / "x.toml").write_bytes(b"a" + b".a" * 49 + b" = 1\n")
+    assert "unknown key" in refusal(lambda: load_scene(tmp_path / "x.toml"), lines=True)

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from block_scene import block_scene
 from conftest import ROOT
 from mpi4py import MPI
 
@@ -327,3 +328,14 @@ def test_verlet_gains_energy_where_cells_fold_over_each_other_unless_its_substep
     alone, short = (play("stretched", *OTHERS["verlet"], *more) for more in ([], ["time.substep=1e-3"]))
     assert "from nowhere" in alone.words and len(alone.frames) < len(short.frames)
     assert not short.words and short.energy(short.last) == pytest.approx(short.frames[0].elastic, rel=0.02)
+
+
+def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
+    """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
+    path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]})
+    scene = load_scene(path)
+    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        saved = simulation.saved()
+        saved.numbers |= {"level": 3, "rescued": 2}
+        simulation.restore(saved)
+        assert len(list(simulation.advance())) == 3

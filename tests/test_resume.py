@@ -4,6 +4,7 @@ import copy
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import tomllib
 from pathlib import Path
@@ -240,6 +241,58 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
     assert sorted(path.suffix for path in tmp_path.glob(".*")) == []  # nothing is left beside them
 
 
+def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]) -> None:
+    """The run's file as a kill after that step would leave it."""
+    advance = Simulation.advance
+
+    def watched(simulation):
+        for frame in advance(simulation):
+            yield frame
+            if simulation.step == step:
+                left.append(path.read_bytes())
+
+    left: list[bytes] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", watched)
+        assert main(arguments) == 0
+    path.write_bytes(left[0])
+
+
+@pytest.mark.parametrize("killed", [11, 13, 25])
+def test_a_longer_run_after_a_stop_between_frames_and_a_kill(whole: Path, stopped: Path, tmp_path, monkeypatch, killed):
+    """The effort since the frame before the checkpoint counts, whatever frames came after it."""
+    longer, more = tmp_path / "longer.h5", ["--set", "time.duration=0.56"]
+    left_by_a_kill(monkeypatch, killed, stopped, ["run", "--resume", str(stopped), "--checkpoint-every", "1h"])
+    with h5py.File(stopped) as file:
+        assert max(file["checkpoint/step"]) == 10 and finished(file) == 1 + killed // 3
+    assert main(["run", "--resume", str(stopped), *more, "--force"]) == 0
+    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]) == 0
+    assert_same(stopped, longer)
+
+
+def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
+    before = stopped.read_bytes()
+    for duration, steps in ((0.1, 10), (0.096, 10), (0.094, 9)):
+        status = main(["run", "--resume", str(stopped), "--set", f"time.duration={duration}", "--force"])
+        told = capsys.readouterr().err
+        assert (status, "damaged" in told) == ((2, False) if steps == 10 else (0, False)), told
+        assert "has come to step 10 already: it cannot end at step 10" in told or "nothing left to do" in told
+        assert stopped.read_bytes() == before
+
+
+def test_another_start_takes_no_frame_of_before_the_first_checkpoint(whole: Path, tmp_path, monkeypatch):
+    """Killed between frame 0 and the first checkpoint."""
+    path, other = tmp_path / "x.h5", ["--set", "start.velocity=[1.0, 0.0, 0.0]"]
+    scene = str(whole.parent / "scene.toml")
+    left_by_a_kill(monkeypatch, 0, path, ["run", scene, "-o", str(path), "--frames", "3"])
+    with h5py.File(path, "r+") as file:
+        file["checkpoint/step"][...] = -1
+        assert finished(file) == 1
+    assert main(["run", "--resume", str(path), *other, "--force"]) == 0
+    assert main(["run", scene, "-o", str(tmp_path / "other.h5"), "--frames", "3", *other]) == 0
+    assert_same(path, tmp_path / "other.h5")
+
+
 def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
     block_scene(tmp_path, sides=np.array([0.5, 0.5, 0.375]), name="other")
     with h5py.File(stopped, "r+") as file:
@@ -287,6 +340,65 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
     done.set()
     other.join()
     assert main(["run", "--resume", str(stopped)]) == 0
+
+
+def take_and_free(path: Path, times: int, twice) -> None:
+    """A lock again and again; a file that the holder alone should make tells of a second one."""
+    from msmpetsc.output.frames import Lock
+
+    for _ in range(times):
+        try:
+            lock = Lock(path)
+        except InputError:
+            continue
+        try:
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+            os.unlink(path)
+        except FileExistsError:
+            twice.value += 1
+        lock.free()
+    os._exit(0)
+
+
+def test_no_two_hold_a_lock(tmp_path):
+    context = multiprocessing.get_context("fork")
+    twice = context.Value("i", 0)
+    four = [context.Process(target=take_and_free, args=(tmp_path / "x", 5000, twice)) for _ in range(4)]
+    for process in four:
+        process.start()
+    for process in four:
+        process.join(60)
+    assert [process.exitcode for process in four] == [0] * 4 and twice.value == 0
+
+
+@pytest.mark.parametrize("with_its_folder", [False, True])
+@pytest.mark.parametrize("another", [False, True])
+def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monkeypatch, capsys, with_its_folder, another):
+    """The run stops at its next checkpoint, and what it had is there to go on from."""
+    folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
+    path, advance = folder / "x.h5", Simulation.advance
+
+    def watched(simulation):
+        for frame in advance(simulation):
+            yield frame
+            if simulation.step == 17:
+                shutil.rmtree(folder) if with_its_folder else path.unlink()
+                folder.mkdir(exist_ok=True)
+                if another:
+                    path.write_text("another")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", watched)
+        assert main(["run", scene, "-o", str(path), "--true-error", "3", "--checkpoint-every", "3"]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+    kept = folder / f"x.{os.getpid()}.h5" if another else path
+    assert len(told) == 1 and "was removed while it was written" in told[0] and told[0].endswith(f"--resume {kept}")
+    assert os.listdir(folder) == [kept.name] or another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"])
+    with h5py.File(kept) as file:
+        assert max(file["checkpoint/step"]) == 18 and finished(file) == 7
+    assert main(["run", "--resume", str(kept)]) == 0
+    assert_same(kept, whole)
+    assert not another or path.read_text() == "another"
 
 
 @pytest.mark.parametrize("given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]])

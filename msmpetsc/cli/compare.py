@@ -1,11 +1,10 @@
 """``msmpetsc compare``: do two results agree, and if not, from which frame and node on."""
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.cli.arguments import refuse_ranks
+from msmpetsc.cli.arguments import file_argument, refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.output.comparison import AT_REST, Comparison, Field, compare, place
 from msmpetsc.output.result import Result, refuse_deadly
@@ -22,8 +21,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Compare two results of one lattice at the times that both have. Exit status 0: they agree; "
         "1: they differ; 2: they cannot be compared.",
     )
-    parser.add_argument("one", metavar="A.h5", type=Path)
-    parser.add_argument("other", metavar="B.h5", type=Path)
+    parser.add_argument("one", metavar="A.h5", type=file_argument)
+    parser.add_argument("other", metavar="B.h5", type=file_argument)
     parser.add_argument("--rtol", type=float, default=1e-6, metavar="E", help="relative error that still agrees (1e-6)")
     parser.add_argument(
         "--fields", metavar="NAME,...", help="of /frames; position, surface, the energies and momentum if not given"

@@ -4,14 +4,13 @@ import argparse
 import shlex
 import signal
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
+from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_ranks
 from msmpetsc.cli.cost import peak_memory
 from msmpetsc.cli.study import stop
 from msmpetsc.comm import log
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from msmpetsc.model.shares import Shares
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
+MOST_RANKS = 10**6
 MOST_CELLS = 1e15  # where limits are looked for
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
@@ -39,7 +39,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Count cells, nodes, springs, ghosts and messages of each rank, and expect memory and time of a "
         "frame from two short runs here, on coarser lattices. PETSc options (one dash) may follow.",
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks (1)")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
@@ -80,6 +80,8 @@ def run(args: argparse.Namespace) -> int:
 
 def refuse_bad_numbers(args: argparse.Namespace) -> None:
     refuse_below_one(args, "ranks", "frames")
+    if args.ranks > MOST_RANKS:
+        raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     if not (args.latency >= 0 and np.isfinite(args.latency)):
         raise InputError(f"--latency must be no less than 0, not {args.latency:g}")
     if not args.bandwidth > 0:

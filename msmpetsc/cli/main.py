@@ -10,12 +10,12 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import compare, fetch, inspect, plan, render, run, study
+from msmpetsc.cli.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
 
 COMMANDS = (run, inspect, study, plan, compare, render, fetch)
 OUR_SHORT = ("-o", "-h")
-STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,25 +23,36 @@ def main(arguments: list[str] | None = None) -> int:
     comm = MPI.COMM_WORLD
     _speak_on_root(comm)
     try:
-        ours, petsc = split_petsc_options(sys.argv[1:] if arguments is None else arguments)
-        parser = _parser()
-        _refuse_one_dash(parser, ours, petsc)
-        args = parser.parse_args(ours)
-        args.petsc_options = petsc
-        return args.run(args)
+        with ending_together(comm):
+            args = parsed(sys.argv[1:] if arguments is None else arguments)
+            return args.run(args)
     except MsmpetscError as error:
         if comm.rank == 0:
             print(f"msmpetsc: error: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
-        return _stop_all_ranks(comm, STATUS_INTERRUPTED, "interrupted")
+        print("msmpetsc: rank 0: interrupted", file=sys.stderr, flush=True)
+        return STATUS_INTERRUPTED
     except Exception:
-        return _stop_all_ranks(comm, STATUS_BUG, traceback.format_exc())
+        print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
+        return STATUS_BUG
 
 
 def entry_point() -> None:
     """Entry point of the installed ``msmpetsc``."""
     sys.exit(main())
+
+
+def parsed(arguments: list[str]) -> argparse.Namespace:
+    """All that the command is told. Raises InputError."""
+    ours, petsc = split_petsc_options(arguments)
+    parser = _parser()
+    _refuse_one_dash(parser, ours, petsc)
+    args = parser.parse_args(ours)
+    if petsc and not args.takes_petsc_options:
+        raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
+    args.petsc_options = petsc
+    return args
 
 
 def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
@@ -108,14 +119,6 @@ def _speak_on_root(comm: MPI.Comm) -> None:
     logging.addLevelName(logging.WARNING, "warning")
     logging.addLevelName(logging.INFO, "note")
     log.setLevel(logging.INFO if comm.rank == 0 else logging.CRITICAL)
-
-
-def _stop_all_ranks(comm: MPI.Comm, status: int, message: str) -> int:
-    """What no rank foresaw: the others may wait for this one for ever, so they are aborted."""
-    print(f"msmpetsc: rank {comm.rank}: {message}", file=sys.stderr, flush=True)
-    if comm.size > 1:
-        comm.Abort(status)
-    return status
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
+from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_ranks
 from msmpetsc.cli.study import RUNS_ITSELF, stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -24,7 +24,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Try integrators, time steps and presets on the first frames of a scene, and say which is the "
         "cheapest that meets the error. Exit status 3: none does.",
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
     goal = parser.add_mutually_exclusive_group(required=True)
     goal.add_argument("--error", type=float, metavar="E", help="relative error of the trajectory")
     goal.add_argument("--step-error", type=float, metavar="E", help="true relative error of a step")

@@ -14,7 +14,7 @@ from msmpetsc.cli.arguments import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.output.continued import Anew, InPlace
-from msmpetsc.output.earlier import Earlier, read_numbers, read_saved, refuse_other_lattice
+from msmpetsc.output.earlier import Earlier, read_saved, refuse_other_lattice
 from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.result import refuse_deadly
 from msmpetsc.scene import Scene
@@ -130,7 +130,7 @@ class Resumed:
     def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
         """To write into (collective)."""
         earlier = self.earlier
-        if not self.differs and earlier.planned == self.stored and earlier.exact:
+        if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
             return InPlace(earlier.path, comm, attributes)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
@@ -147,16 +147,16 @@ class Resumed:
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
-        saved = read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
+        path, saved = self.earlier.path, read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
+        if saved is not None and saved.step >= simulation.steps:
+            raise InputError(f"{path} has come to step {saved.step} already: it cannot end at step {simulation.steps}")
+        kept = 0 if saved is None else simulation.stored_until(saved.step)
+        if kept > self.earlier.finished:
+            raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
+        if isinstance(file, Anew) and self.differs:  # later frames are of how it was
+            file.keep(kept)
         if saved is None:
             return
-        if simulation.stored_until(saved.step) > self.earlier.finished:
-            raise InputError(f"{self.earlier.path} is damaged: it lacks frames of before its checkpoint")
-        if isinstance(file, Anew) and self.differs:  # later frames are of how it was
-            kept = simulation.stored_until(saved.step)
-            file.keep(kept)
-            if kept < self.earlier.finished and saved.step % simulation.every:
-                saved.numbers |= read_numbers(comm, self.earlier.path, kept)  # its last frame, which is none now
         simulation.restore(saved)
         time = saved.step * simulation.time_step
         log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, time)

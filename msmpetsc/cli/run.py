@@ -13,9 +13,17 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.cli import resume
-from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.cli.arguments import (
+    MEASURE_NAMES,
+    RESULT_NAMES,
+    file_argument,
+    path_argument,
+    refuse_below_one,
+    refuse_other_format,
+)
 from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.describe import log_end, log_model
+from msmpetsc.cli.failure import ending_together
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
 from msmpetsc.cli.storing import tell_stop, write_frames, write_model
@@ -37,8 +45,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="simulate a scene",
         description="Simulate a scene and write OUT.h5 and OUT.xdmf. PETSc options (one dash) may follow.",
     )
-    parser.add_argument("scene", type=Path, nargs="?", metavar="SCENE", help="scene file (TOML)")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT.h5", help="default: out/SCENE.h5")
+    parser.add_argument("scene", type=path_argument, nargs="?", metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("-o", "--output", type=file_argument, metavar="OUT.h5", help="default: out/SCENE.h5")
     parser.add_argument("--preset", metavar="NAME", help="solver preset (see --list-presets)")
     parser.add_argument("--error", metavar="E", help="relative error at which a step is done")
     parser.add_argument(
@@ -51,7 +59,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
     parser.add_argument(
-        "--resume", type=Path, metavar="OUT.h5",
+        "--resume", type=file_argument, metavar="OUT.h5",
         help="go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
     )  # fmt: skip
     parser.add_argument("--force", action="store_true", help="resume with another scene or other options than before")
@@ -66,7 +74,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
-    parser.add_argument("--measure", type=Path, metavar="OUT.json", help="write what the run cost: times, memory")
+    parser.add_argument("--measure", type=file_argument, metavar="OUT.json", help="write what the run cost: times, memory")
     parser.add_argument(
         "--show-options", action="store_true", help="say which PETSc options a preset sets, as an options file"
     )
@@ -132,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
             log_model(comm, model)
             if resumed:
                 resumed.refuse_other_lattice(comm, model)
-            with Simulation(comm, scene, model, measured) as simulation:
+            with Simulation(comm, scene, model, measured) as simulation, ending_together(comm):
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - began)
                 write_model(comm, file, model)

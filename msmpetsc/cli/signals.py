@@ -21,7 +21,7 @@ class Interval:
 
     def __init__(self, text: str | None):
         """text: "3", "5min", or None. Raises InputError."""
-        found = re.fullmatch(r"(\d+)(s|min|h)?", text or "0s")
+        found = re.fullmatch(r"(\d{1,18})(s|min|h)?", text or "0s", re.ASCII)
         if not found or text and not int(found[1]):
             raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {text}")
         self.frames = None if found[2] else int(found[1])

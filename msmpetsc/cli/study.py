@@ -4,9 +4,9 @@ import argparse
 import signal
 from pathlib import Path
 
-from msmpetsc.cli.arguments import refuse_below_one, refuse_name_of_a_file, refuse_ranks
+from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_name_of_a_file, refuse_ranks
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 
 RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 
@@ -19,8 +19,8 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         description="Run the cases of a study, each in its own process, into a table and a report. "
         "Stopped, the same command goes on.",
     )
-    parser.add_argument("study", type=Path, metavar="FILE.toml", help="study file")
-    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: out/FILE")
+    parser.add_argument("study", type=path_argument, metavar="FILE.toml", help="study file")
+    parser.add_argument("-o", "--output", type=path_argument, metavar="FOLDER", help="default: out/FILE")
     parser.add_argument("--full", action="store_true", help="also what is marked full = true: the long cases")
     parser.add_argument("--jobs", type=int, metavar="N", help="cases at a time (they slow each other)")
     parser.add_argument("--restart", action="store_true", help="forget the cases that are done")
@@ -66,8 +66,9 @@ def part_of(text: str | None):
     if text is None:
         return None
     index, _, count = text.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
-        raise InputError(f"--part must read I/N, 1 <= I <= N, not {text}")
+    numbers = all(part.isdecimal() and len(part) < 10 for part in (index, count))
+    if not (numbers and 1 <= int(index) <= int(count)):
+        raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
     return Part(int(index), int(count))
 
 

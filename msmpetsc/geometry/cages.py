@@ -5,13 +5,14 @@ spread over the ranks in Morton order. The three kinds of cell are external (not
 and interior; the last two are the valid ones.
 """
 
+import os
 from dataclasses import dataclass
 
 import igl
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import Route, SortedKeys
+from msmpetsc.comm import Route, SortedKeys, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import morton
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
@@ -22,6 +23,7 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport
 BOUNDARY, INTERIOR = 1, 2
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
 PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
+LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
 MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
@@ -63,7 +65,9 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
     raises : InputError if there would be more than ``max_cells``
     """
     grid = Grid.covering(body.bounds, cell_size)
+    refuse_beyond_memory(body.comm, _least_cells(body, grid))
     boundary, gaps = slab_cells(body, grid, method, max_cells)
+    refuse_beyond_memory(body.comm, count_cells(body.comm, boundary, gaps))
     interior = cells_of_gaps(gaps)
     ijk = np.concatenate([boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(boundary), len(interior)])
@@ -83,8 +87,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
     """Boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled: the longest comes first."""
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
-    least = max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
-    _refuse_above(max_cells, least, grid)
+    _refuse_above(max_cells, _least_cells(body, grid), grid)
     corners = _slab_triangles(body, grid, axes)
     boundary = _mark(corners, grid.shape[axes], slab, method)
     if body.report.closed:
@@ -93,6 +96,20 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
         gaps = _gaps_by_winding(body, grid, axes, slab, boundary)
     _refuse_above(max_cells, count_cells(body.comm, boundary, gaps), grid)
     return boundary, gaps
+
+
+def _least_cells(body: Body, grid: Grid) -> float:
+    """Fewer than there will be, known before they are made."""
+    return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
+
+
+def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
+    """Raise InputError for a lattice of which no rank's share could be held, whatever the scene asks of it."""
+    memory, needed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), cells * LEAST_OF_A_CELL / comm.size
+    with together(comm):
+        if needed > memory:
+            has = f"this machine has {memory / 1e9:.3g} GB"
+            raise InputError(f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}")
 
 
 def _axes(body: Body) -> np.ndarray:

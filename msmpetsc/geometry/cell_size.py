@@ -4,7 +4,7 @@ import numpy as np
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import Body, count_cells, slab_cells
+from msmpetsc.geometry.cages import Body, count_cells, refuse_beyond_memory, slab_cells
 from msmpetsc.geometry.grid import Grid
 
 TOLERANCE = 0.01
@@ -17,10 +17,11 @@ def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: i
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
     kept inside the bracket found so far: the number is a step function and not quite monotone.
 
-    raises : InputError if ``count`` is more than ``max_cells``
+    raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
     """
     if count > max_cells:
         raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
+    refuse_beyond_memory(body.comm, count)
     excess = {}  # log(size) -> log(cells / count)
     guess = np.log(_first_guess(body, count))
     for _ in range(SEARCH_LIMIT):

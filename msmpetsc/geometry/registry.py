@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pooch
 
-from msmpetsc.errors import InputError, nearest
+from msmpetsc.errors import InputError, nearest, printable
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.surface import Surface, read_surface
 
@@ -103,7 +103,7 @@ def find(name: str) -> Found | None:
     model = MODELS[name]
     if os.environ.get(MESH_DIR):
         copy = Path(os.environ[MESH_DIR]) / model.copy
-        if copy.is_file():
+        if os.path.isfile(copy):  # which a name too long does not raise in
             return Found(_checked(name, copy, model.copy_sha256), (), f"${MESH_DIR}")
     fetched = [_cache(name) / download.file for download in model.downloads]
     if fetched and all(path.is_file() for path in fetched):
@@ -123,7 +123,7 @@ def fetch(name: str, progress: bool = False) -> Path:
     or a file that is not the one the registry knows.
     """
     if name not in MODELS:
-        raise InputError(f"mesh '{name}' is no model{_nearest(name)}: msmpetsc fetch --list")
+        raise InputError(f"mesh {printable(name)!r} is no model{_nearest(name)}: msmpetsc fetch --list")
     downloads = MODELS[name].downloads
     if not downloads:
         return _require(name).path

@@ -2,15 +2,19 @@
 
 import gzip
 import json
+import lzma
 import re
 import struct
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from logging import CRITICAL, getLogger
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import meshio
 import numpy as np
@@ -26,6 +30,8 @@ Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
 # longest side, a body cannot be told from a flat sheet. A plate of 1:1000 lies far above.
 FLAT = 1e-6
 MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
+MOST_INSTANCED, LEAST_ROWS = 10, 2**20  # the rows of a glTF: so many times its bytes, or so many
+GRIDS = re.compile(rb"STRUCTURED_POINTS|(?<!UN)STRUCTURED_GRID|RECTILINEAR_GRID", re.IGNORECASE)  # of VTK: flat, or of hexahedra
 
 
 @dataclass(frozen=True)
@@ -79,8 +85,7 @@ def read_surface(path: str | Path) -> Surface:
     kind, data = _kind(path), _content(path)
     try:
         with _silence():
-            if _claimed_rows(kind, data) > len(data):
-                raise ValueError("its header claims more than the file holds")
+            _refuse_claims(kind, data)
             points, faces = _READERS[kind](path, data)
             if faces.ndim != 2 or faces.shape[1] != 3:
                 faces = trimesh.geometry.triangulate_quads(faces)
@@ -258,6 +263,37 @@ def _silence() -> Iterator[None]:
         log.setLevel(level)
 
 
+def _refuse_claims(kind: str, data: bytes) -> None:
+    """Raise ValueError for a file whose reader would make far more of it than it holds."""
+    if _claimed_rows(kind, data) > len(data):
+        raise ValueError("its header claims more than the file holds")
+    if kind == "vtk" and GRIDS.search(data):
+        raise ValueError("it holds a grid of points, not a surface")
+    if kind == "vtu" and b"\0" in data[:4]:
+        raise ValueError("it is not UTF-8 text")
+    if kind == "vtu" and data.count(b"offset") * len(data) > max(LEAST_LIMIT, MOST_PACKED * len(data)):
+        raise ValueError("too many of its arrays are appended: they may share their bytes")
+    if kind in ("gltf", "glb") and _instanced_rows(kind, data) > max(LEAST_ROWS, MOST_INSTANCED * len(data)):
+        raise ValueError("it repeats its meshes too often")
+
+
+def _gltf(kind: str, data: bytes) -> dict:
+    return json.loads(data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+
+
+def _instanced_rows(kind: str, data: bytes) -> int:
+    """Rows of the points and corners of all meshes, wherever nodes put them."""
+    tree = _gltf(kind, data)
+    counts = [accessor["count"] for accessor in tree.get("accessors", [])]
+
+    def rows_of(part: dict) -> int:
+        points, corners = part["attributes"]["POSITION"], part.get("indices")
+        return counts[points] + (0 if corners is None else counts[corners])
+
+    rows = [sum(map(rows_of, mesh["primitives"])) for mesh in tree.get("meshes", [])]
+    return sum(rows) + sum(rows[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node)
+
+
 def _claimed_rows(kind: str, data: bytes) -> int:
     """How many rows (points, faces) the header claims, each of at least a byte: some readers
     allocate them before they look for them."""
@@ -268,9 +304,8 @@ def _claimed_rows(kind: str, data: bytes) -> int:
         sections = re.findall(rb"^(?:POINTS|CELLS|CELL_TYPES|POLYGONS)\s+(\d+)", data, re.MULTILINE)
         return sum(map(int, sections))
     if kind in ("gltf", "glb"):
-        text = data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
         # an accessor of no buffer view stands for that many zeros
-        accessors = json.loads(text).get("accessors", [])
+        accessors = _gltf(kind, data).get("accessors", [])
         return sum(a["count"] for a in accessors if "bufferView" not in a)
     return 0
 
@@ -300,13 +335,39 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 
 
 class _Beside(FilePathResolver):
-    """Hands out the files that a glTF names: those in its folder or below it, links followed, and no others."""
+    """Hands out the files that a glTF names: those in its folder or below it, links followed, and no others. One that
+    is named again is not read again."""
+
+    def __init__(self, path: Path):
+        super().__init__(path)
+        self._read: dict[str, bytes] = {}
 
     def get(self, name: str) -> bytes:
         path = Path(self.parent, name)
         if not lies_below(Path(self.parent), name) or not path.is_file():
             raise ValueError(f"it names {name}, which is no file in its folder")
-        return path.read_bytes()
+        if name not in self._read:
+            self._read[name] = path.read_bytes()
+        return self._read[name]
+
+
+class _Unpacker:
+    """In place of the modules zlib and lzma, where a reader unpacks blocks by them: all together to ``most`` bytes."""
+
+    def __init__(self, most: int):
+        self.left = most
+
+    def zlib(self, block: bytes) -> bytes:
+        return self._counted(zlib.decompressobj().decompress(block, self.left + 1))
+
+    def lzma(self, block: bytes) -> bytes:
+        return self._counted(lzma.LZMADecompressor(memlimit=LEAST_LIMIT).decompress(block, self.left + 1))
+
+    def _counted(self, found: bytes) -> bytes:
+        self.left -= len(found)
+        if self.left < 0:
+            raise ValueError(f"decompressed it is more than {MOST_PACKED} times as long")
+        return found
 
 
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
@@ -322,7 +383,10 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 def _read_meshio(path: Path, data: bytes) -> Arrays:
     """Outer surface of the tetrahedra, or else triangles and quads, without unused points."""
-    mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
+    unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
+    packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
+    with mock.patch.multiple(meshio.vtu._vtu, **packers):
+        mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
     cells = mesh.cells_dict
     if "tetra" in cells:
         triangles = _outer_triangles(mesh.points, cells["tetra"])

@@ -7,7 +7,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
 from msmpetsc.output.frames import ResultFile, open_again, refuse_small_disk
-from msmpetsc.output.result import finished, open_result
+from msmpetsc.output.result import checked_dataset, damage_told, finished, open_result
 
 
 class InPlace(ResultFile):
@@ -15,7 +15,14 @@ class InPlace(ResultFile):
     safe as it was. Frames that it has already are not written again."""
 
     def write(self, name: str, rows: np.ndarray) -> None:
-        """It is there."""
+        """It is there. Raises InputError where it is not."""
+        rows = np.asarray(rows)
+        count = self._comm.allreduce(len(rows))
+        with self._together():
+            if self._file is not None:
+                shape = checked_dataset(self.path, self._file, name).shape
+                if shape != (count, *rows.shape[1:]):
+                    raise InputError(f"{self.path} is damaged: {name} has shape {shape}")
 
     def _refuse_to_replace(self) -> None:
         pass
@@ -55,10 +62,16 @@ class Anew(ResultFile):
     def _start(self, count: int) -> None:
         super()._start(count)
         with open_result(self.path) as earlier:
+            names = earlier["frames"].keys() & self._file["frames"].keys()
+            there = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in sorted(names)}
+            for name, dataset in there.items():
+                if dataset.shape[1:] != self._file["frames"][name].shape[1:]:
+                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {dataset.shape}")
             for index in range(self._frames):
-                for name, dataset in self._file["frames"].items():
-                    if name in earlier["frames"]:
-                        dataset[index] = earlier["frames"][name][index]
+                for name, dataset in there.items():
+                    with damage_told(self.path):
+                        row = dataset[index]
+                    self._file["frames"][name][index] = row
         self.finished = self._frames
 
     def _take_over(self, saved: Saved | None) -> None:

@@ -11,7 +11,14 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.saved import Saved
 from msmpetsc.output.frames import SERIES, pieces
-from msmpetsc.output.result import Result, checked_checkpoint, finished, open_result
+from msmpetsc.output.result import (
+    Result,
+    checked_checkpoint,
+    checked_dataset,
+    damage_told,
+    finished,
+    open_result,
+)
 
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
 
@@ -38,10 +45,21 @@ class Earlier:
             true_error = result.attributes.get("true_error")
         with open_result(path) as file:
             names = checked_checkpoint(file)
+            refuse_other_series(path, file)
             count, planned = finished(file), len(file["frames/time"])
             step = max(0, int(np.max(file["checkpoint/step"]))) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned, bool(names))
+
+
+def refuse_other_series(path: Path, file: h5py.File) -> None:
+    """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
+    with damage_told(path):
+        for name, (dtype, shape, _) in SERIES.items():
+            if name in list(file["frames"]):
+                dataset = checked_dataset(path, file, f"frames/{name}")
+                if dataset.dtype != dtype or dataset.shape[1:] != shape:
+                    raise InputError(f"{path} is damaged: frames/{name} has shape {dataset.shape}")
 
 
 def read_saved(comm, path: Path, owned: int) -> Saved | None:
@@ -58,12 +76,6 @@ def read_saved(comm, path: Path, owned: int) -> Saved | None:
         names, numbers = source.names(), source.value("checkpoint/numbers")
         numbers = numbers[slot].tolist() if names else []
         return Saved(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
-
-
-def read_numbers(comm, path: Path, index: int) -> dict[str, float]:
-    """Of a frame, all that the file has (collective)."""
-    with Source(comm, path) as source:
-        return {name: source.value(f"frames/{name}")[index] for name, (_, shape, _) in SERIES.items() if not shape}
 
 
 def refuse_other_lattice(comm, path: Path, found: dict[str, np.ndarray]) -> None:
@@ -104,8 +116,7 @@ class Source:
 
     def names(self) -> list[str]:
         """Of the checkpoint's numbers."""
-        numbers = "checkpoint/numbers"
-        return self._asked(lambda file: file[numbers].attrs["names"].split() if numbers in file else [])
+        return self._asked(checked_checkpoint) or []
 
     def row_names(self) -> list[str]:
         """Of what the checkpoint has of each node."""

@@ -20,6 +20,7 @@ import fcntl
 import math
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -88,6 +89,7 @@ class ResultFile:
         self._overwrite = overwrite
         self._file: h5py.File | None = None  # open on rank 0 only
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
+        self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
         self._planned = self.finished = 0
         self._failed = False  # to write
@@ -142,6 +144,7 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._publish()
+                self._same = os.open(self.path, os.O_RDONLY)
         if self._comm.size > 1 and not self.gathers:
             self._direct = reach(self._comm, self.path)
 
@@ -184,6 +187,7 @@ class ResultFile:
                 self._file.flush()
                 self._file["checkpoint/step"][slot] = saved.step
                 self._file.flush()
+                self._refuse_removed()
 
     def close(self, trim: bool = True) -> None:
         """Close, a second call does nothing. Before, trim the frames to the finished ones, but where the run is to go
@@ -211,6 +215,8 @@ class ResultFile:
     def _refuse_to_replace(self) -> None:
         if self.path.is_dir():
             raise InputError(f"{self.path} is a folder, not a file")
+        if self.path.exists() and not self.path.is_file():
+            raise InputError(f"{self.path} is a pipe or a device, not a file")
         if self.path.exists() and not self._overwrite:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
@@ -235,10 +241,23 @@ class ResultFile:
         self._refuse_to_replace()
         os.replace(self._part, self.path)
 
+    def _refuse_removed(self) -> None:
+        """Raise InputError where no name leads to the file any more; what it holds gets one again."""
+        if self._same is None or os.fstat(self._same).st_nlink:
+            return
+        copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy_sparse(self._same, copy)
+        if not self.path.exists():
+            copy = copy.rename(self.path)
+        command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
+        raise InputError(f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}")
+
     def _finish(self, trim: bool) -> None:
-        if self._direct is not None:
-            os.close(self._direct)
-            self._direct = None
+        for descriptor in (self._direct, self._same):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._direct = self._same = None
         file, self._file = self._file, None
         if file is None:
             return
@@ -414,16 +433,28 @@ class Lock:
     def __init__(self, path: Path):
         """Raises InputError where another run has it."""
         self.path = path.with_name(f".{path.name}.lock")
-        self._file = open(self.path, "a")
+        while not self._take(path):
+            pass
+
+    def _take(self, path: Path) -> bool:
+        """False where the run that had it took its name away before it was locked: another may lock a new one by now."""
+        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
         try:
             fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in (EACCES, EAGAIN):  # else it is a file system without locks
+                os.close(self._file)
                 raise InputError(f"{path} is being written by another run") from None
+            return True
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
+                return True
+        os.close(self._file)
+        return False
 
     def free(self) -> None:
-        self.path.unlink(missing_ok=True)
-        self._file.close()
+        self.path.unlink(missing_ok=True)  # while it is locked: the name is still this file's
+        os.close(self._file)
 
 
 def refuse_small_disk(path: Path, planned: int) -> None:
@@ -431,6 +462,15 @@ def refuse_small_disk(path: Path, planned: int) -> None:
     free = shutil.disk_usage(path.parent).free
     if planned > free:
         raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
+
+
+def copy_sparse(source: int, path: Path) -> None:
+    """The file of a descriptor under another name; zeros, which frames to come are, take no room."""
+    with open(path, "xb") as copy:
+        for start in range(0, size := os.fstat(source).st_size, 2**20):
+            if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
+                os.pwrite(copy.fileno(), piece, start)
+        copy.truncate(size)
 
 
 @contextmanager

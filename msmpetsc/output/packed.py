@@ -9,8 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, one_line
 from msmpetsc.output.frames import open_new, pieces, plain_errors
+from msmpetsc.output.result import DEFLATE_MOST
 
 PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 LEAST = 4096  # [byte]: what is shorter is not worth a filter
@@ -27,12 +28,17 @@ def pack(path: Path) -> None:
     except InputError:
         part.unlink(missing_ok=True)
         raise
+    except (RuntimeError, KeyError, ValueError, TypeError) as error:
+        part.unlink(missing_ok=True)
+        raise InputError(f"{path} is damaged: {one_line(error)}") from error
 
 
 def _copy(name: str, found: h5py.Group | h5py.Dataset, packed: h5py.File) -> None:
     if isinstance(found, h5py.Group):
         packed.require_group(name).attrs.update(found.attrs)
         return
+    if found.nbytes > found.file.id.get_filesize() * (DEFLATE_MOST if found.compression else 1):
+        raise ValueError(f"{name} claims more than the file holds")
     filters = PACKED if found.nbytes > LEAST else {}
     copy = packed.create_dataset(name, found.shape, found.dtype, chunks=_chunks(found) if filters else None, **filters)
     copy.attrs.update(found.attrs)

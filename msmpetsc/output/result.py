@@ -8,7 +8,6 @@ import math
 import os
 import resource
 import signal
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -111,8 +110,10 @@ class Result:
         text = self.attributes.get("scene")
         if not isinstance(text, str):
             raise InputError(f"{self.path} does not say its scene")
+        from msmpetsc.scene_reading import toml_of  # loads pydantic: who reads frames need not wait
+
         try:
-            return tomllib.loads(text)
+            return toml_of(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{self.path}: its scene is not TOML: {one_line(error)}") from error
 
@@ -158,7 +159,8 @@ def open_result(path: str | Path) -> h5py.File:
     """Open a result file to read it; InputError if it is none."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} is a folder, not a file" if path.is_dir() else f"{path}: no such file")
+        kind = "a folder" if path.is_dir() else "a pipe or a device"
+        raise InputError(f"{path} is {kind}, not a file" if path.exists() else f"{path}: no such file")
     with damage_told(path):
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):
@@ -238,6 +240,8 @@ def checked_checkpoint(file: h5py.File) -> list[str] | None:
         group = _held(path, file, "checkpoint")
         if group is None:
             return None
+        if not isinstance(group, h5py.Group):
+            raise InputError(f"{path} is damaged: its checkpoint is no group")
         nodes, names = len(file["lattice/nodes"]), []
         for name in group:
             if not name.isprintable():  # lines that tell of it would not be lines
@@ -274,7 +278,9 @@ def damage_told(path: Path) -> Iterator[None]:
         yield
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except KeyError as error:
+        raise InputError(f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}") from error
+    except (OSError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
 
 

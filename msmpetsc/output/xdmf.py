@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 
-from msmpetsc.output.frames import finished, open_result
+from msmpetsc.output.result import checked_dataset, damage_told, finished, open_result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 
@@ -19,13 +19,15 @@ def write_xdmf(h5_path: str | Path) -> Path:
     h5_path = Path(h5_path)
     root = ET.Element("Xdmf", Version="3.0")
     domain = ET.SubElement(root, "Domain")
-    with open_result(h5_path) as file:
-        if "frames/surface" in file:
-            _collection(domain, "surface", "Triangle", file["surface/triangles"], file["frames/surface"])
-        lattice = _collection(domain, "lattice", "Hexahedron", file["lattice/cells"], file["frames/position"])
-        for grid in lattice:
+    with open_result(h5_path) as file, damage_told(h5_path):
+        names = ["lattice/cells", "frames/position", "lattice/cell_kind"]
+        names += ["surface/triangles", "frames/surface"] if "surface" in file["frames"].keys() else []
+        cells, positions, kinds, *surface = (checked_dataset(h5_path, file, name) for name in names)
+        if surface:
+            _collection(domain, "surface", "Triangle", *surface)
+        for grid in _collection(domain, "lattice", "Hexahedron", cells, positions):
             kind = ET.SubElement(grid, "Attribute", Name="cell_kind", AttributeType="Scalar", Center="Cell")
-            kind.append(_data_item(file["lattice/cell_kind"]))
+            kind.append(_data_item(kinds))
     ET.indent(root)
     path = h5_path.with_suffix(".xdmf")
     part = path.with_name(f"{path.name}.{os.getpid()}.part")

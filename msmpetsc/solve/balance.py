@@ -143,7 +143,8 @@ class EnergyBalance:
         saved.numbers |= vars(self.ledger)
 
     def restore(self, saved: Saved) -> None:
-        self.ledger = Ledger(**{name: saved.numbers[name] for name in vars(Ledger()) if name in saved.numbers})
+        most = np.finfo(float).max
+        self.ledger = Ledger(**{name: saved.number(name, 0.0, -most, most) for name in vars(Ledger())})
 
     def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""

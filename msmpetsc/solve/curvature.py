@@ -224,11 +224,10 @@ class LowestCurvature:
 
     def restore(self, saved: Saved) -> None:
         """Go on from there; from nothing saved as if no step had been taken."""
-        numbers = saved.numbers
-        self.searched = Compression(numbers.get("searched_greatest", 0.0), numbers.get("searched_total", 0.0), False)
+        self.searched = Compression(saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False)
         self.mode = None
-        if numbers.get("knows_mode"):
-            rows = beside(self.functional.mass, saved.rows["lowest_mode"])
+        if saved.count("knows_mode", 1):
+            rows = beside(self.functional.mass, saved.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def destroy(self) -> None:

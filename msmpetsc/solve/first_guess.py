@@ -56,9 +56,9 @@ class FirstGuess:
 
     def restore(self, saved: Saved) -> None:
         """Collective."""
-        names = SAVED[: int(saved.numbers.get("corrections", 0))]
+        names = SAVED[: saved.count("corrections", len(SAVED))]
         comm, lattice = self.functional.comm, self.functional.lattice
-        self.corrections = [with_ghosts(comm, lattice, saved.rows[name]) for name in names]
+        self.corrections = [with_ghosts(comm, lattice, saved.row(name)) for name in names]
 
     def _held(self, guess: np.ndarray) -> np.ndarray:
         """The guess, but with the held nodes where they will be."""

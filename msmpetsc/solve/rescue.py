@@ -88,7 +88,10 @@ class Rescue:
         saved.numbers |= {"level": self.level, "rescued": self.rescued}
 
     def restore(self, saved: Saved) -> None:
-        self.level, self.rescued = (int(saved.numbers.get(name, 0)) for name in ("level", "rescued"))
+        if self.on_failure == "substep":
+            self.level = saved.count("level", DEEPEST)
+        if self.on_failure != "stop":  # else it was another scene that asked for it
+            self.rescued = saved.count("rescued")
 
     def sum_up(self) -> None:
         """At the end of a run: how often it was."""

@@ -1,7 +1,7 @@
 """The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -152,13 +152,16 @@ class Simulation:
 
     def restore(self, saved: Saved) -> None:
         """Go on from there (collective)."""
+        saved.refuse_rows_unlike(self.comm, self.saved())
         self.step, time = saved.step, saved.step * self.time_step
         self.state = State.restored(self.comm, self.model.lattice, saved)
         self.integrator.restore(saved, self.state, time)
         for part in (self.balance, self.rescue, self.watch):
             part.restore(saved)
-        fields = {name: type(value) for name, value in vars(Effort()).items() if name in saved.numbers}
-        self.effort = Effort(**{name: kind(saved.numbers[name]) for name, kind in fields.items()})
+        known = {name: value for name, value in vars(Effort()).items() if name in saved.numbers}
+        self.effort = Effort(
+            **{name: saved.count(name) if isinstance(value, int) else saved.numbers[name] for name, value in known.items()}
+        )
 
     def _step(self, index: int) -> tuple[StepResult, Done]:
         """The step that ends at index * t; ``state`` moves on (collective)."""
@@ -191,8 +194,9 @@ class Simulation:
     def _frame(self, index: int, q: np.ndarray) -> Frame:
         """What is stored of positions q (l, 3) and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.energies
-        effort, self.effort = self.effort, Effort()
-        effort.energy_gained = max(effort.energy_gained, 0.0)
+        effort = replace(self.effort, energy_gained=max(self.effort.energy_gained, 0.0))
+        if index % self.every == 0:  # the last frame may come between: of a longer run it is none
+            self.effort = Effort()
         self.watch.error(index, time, effort.step_error)
         position = fetch(q[: self.model.lattice.owned])
         return Frame(

@@ -47,8 +47,8 @@ class State:
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, saved: Saved) -> "State":
         """Collective."""
-        names = ("q", "q_previous", *HISTORY) if saved.numbers.get("history") else ("q", "q_previous")
-        q, q_previous, *history = (with_ghosts(comm, lattice, saved.rows[name]) for name in names)
+        names = ("q", "q_previous", *HISTORY) if saved.count("history", 1) else ("q", "q_previous")
+        q, q_previous, *history = (with_ghosts(comm, lattice, saved.row(name)) for name in names)
         sides = _sides(comm, lattice, saved.rows[SIDES]) if SIDES in saved.rows else None
         return State(q, q_previous, tuple(history) or None, sides)
 

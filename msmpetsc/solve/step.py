@@ -239,7 +239,7 @@ class Stepper:
         """Go on from there; from nothing saved as if no step had been taken (collective)."""
         self.first_guess.restore(saved)
         self.curvature.restore(saved)
-        self.ratio = saved.numbers.get("ratio", FIRST_RATIO)
+        self.ratio = saved.number("ratio", FIRST_RATIO, 0)
         if self.touches:
             bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))
             bound = beside(self.added, bound)[self.unknowns.free]

@@ -89,13 +89,14 @@ class Verlet:
 
     def restore(self, saved: Saved, state: State, time: float) -> None:
         """Go on after a step that ended at ``time`` (collective)."""
-        if saved.numbers.get("squared", -1.0) < 0:
+        squared = saved.number("squared", -1.0, -1.0, np.finfo(float).max)
+        if squared < 0:
             return
         self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = beside(self.v, saved.rows["mode"])
+        self.highest.mode.values[: self.lattice.owned] = beside(self.v, saved.row("mode"))
         self.highest.mode.update()
-        self.highest.squared, self.substep = saved.numbers["squared"], saved.numbers["substep"]
-        if saved.numbers["known"]:
+        self.highest.squared, self.substep = squared, saved.number("substep", self.substep, np.finfo(float).tiny)
+        if saved.count("known", 1):
             self.known = state.q
             self.position.values[:] = state.q
             sides = self.around.no_sides if state.sides is None else state.sides

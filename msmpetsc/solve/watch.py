@@ -77,8 +77,7 @@ class Watch:
 
     def restore(self, saved: Saved) -> None:
         names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")
-        counts = (int(saved.numbers.get(name, 0)) for name in names)
-        self.frames, self.most, self.now, self.far, self.gaining = counts
+        self.frames, self.most, self.now, self.far, self.gaining = (saved.count(name) for name in names)
         self.worst_error, self.worst_gain = (saved.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain"))
 
     def sum_up(self) -> None:

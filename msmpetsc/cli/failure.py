@@ -1,0 +1,64 @@
+"""What becomes of all ranks when some fail: they end together, with one line and one exit status."""
+
+import sys
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mpi4py import MPI
+
+from msmpetsc.errors import MsmpetscError, as_expected
+
+STATUS_BUG, STATUS_INTERRUPTED = 1, 130
+PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other
+
+
+@contextmanager
+def ending_together(comm: MPI.Comm) -> Iterator[None]:
+    """A failure of all ranks in the block passes; one of some ranks, for which the others would wait for ever, ends all
+    of them (collective to enter). To stand within whatever does collective work on leaving."""
+    meeting = comm.Dup() if comm.size > 1 else comm  # whose messages meet no others
+    try:
+        yield
+    except KeyboardInterrupt:
+        _end_all(comm, f"rank {comm.rank}: interrupted", STATUS_INTERRUPTED)
+        raise
+    except Exception as raised:
+        error = as_expected(raised)
+        if error is None:
+            _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG)
+            raise
+        if not error.on_all_ranks:
+            failed = _those_who_fail(meeting)
+            if len(failed) < comm.size:
+                if comm.rank > min(failed):
+                    time.sleep(PATIENCE)  # the lowest of them tells, and ends this one, too
+                _end_all(comm, f"error: {error}", error.exit_status)
+            error.on_all_ranks = True
+        raise error from raised
+    if comm.size > 1:
+        meeting.Free()
+
+
+def _those_who_fail(meeting: MPI.Comm) -> set[int]:
+    """The ranks that come here, this one among them; as soon as all have."""
+    failed, until = {meeting.rank}, time.monotonic() + PATIENCE
+    sent = [meeting.isend(None, rank) for rank in range(meeting.size) if rank != meeting.rank]
+    while len(failed) < meeting.size and time.monotonic() < until:
+        status = MPI.Status()
+        if meeting.iprobe(status=status):
+            meeting.recv(source=status.source)
+            failed.add(status.source)
+        else:
+            time.sleep(0.01)
+    if len(failed) == meeting.size:
+        MPI.Request.waitall(sent)
+    return failed
+
+
+def _end_all(comm: MPI.Comm, line: str, status: int) -> None:
+    """No other rank can be asked any more. One rank alone is left to its own end."""
+    if comm.size > 1:
+        print(f"msmpetsc: {line}", file=sys.stderr, flush=True)
+        comm.Abort(status)

@@ -1,0 +1,40 @@
+"""The command line, some of whose ranks fail: alone_worker.py RANKS WHERE WHAT ARGUMENTS."""
+
+import sys
+
+from mpi4py import MPI
+
+from msmpetsc.cli import failure
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+
+failure.PATIENCE = 1.0
+WHAT = {
+    "input": lambda: InputError("it fails"),
+    "memory": lambda: MemoryError("Unable to allocate it all"),
+    "bug": lambda: ZeroDivisionError("it fails"),
+}
+
+
+def fail_at(where: str, what: str, fails: bool) -> None:
+    import petsc4py
+
+    petsc4py.init(["msmpetsc"])
+    from msmpetsc.model import build
+    from msmpetsc.solve.simulate import Simulation
+
+    owner, name = {"model": (build, "build_lattice"), "step": (Simulation, "_step")}[where]
+    function, calls = getattr(owner, name), []
+
+    def failing(*given, **named):
+        calls.append(1)
+        if fails and len(calls) == (1 if where == "model" else 3):
+            raise WHAT[what]()
+        return function(*given, **named)
+
+    setattr(owner, name, failing)
+
+
+if __name__ == "__main__":
+    fail_at(*sys.argv[2:4], fails=str(MPI.COMM_WORLD.rank) in sys.argv[1].split(","))
+    sys.exit(main(sys.argv[4:]))

@@ -1,0 +1,89 @@
+"""Paths on the command line that lead nowhere, or to what is no file: one line, and status 2."""
+
+import os
+from pathlib import Path
+
+import pytest
+import small_result
+from bad_input import limits
+from block_scene import block_scene
+
+from msmpetsc.cli.main import main
+
+ONCE = {"step": 0.01, "duration": 0.01}
+COMMANDS = [
+    ["run", "scene.toml", "-o", "{}"],
+    ["run", "scene.toml", "-o", "{}", "--overwrite"],
+    ["run", "scene.toml", "--resume", "{}"],
+    ["run", "--resume", "{}"],
+    ["run", "{}"],
+    ["run", "scene.toml", "--measure", "{}"],
+    ["run", "scene.toml", "--set", "mesh.source={}"],
+    ["inspect", "{}"],
+    ["compare", "{}", "good.h5"],
+    ["compare", "good.h5", "{}"],
+    ["render", "{}"],
+    ["render", "good.h5", "-o", "{}"],
+    ["study", "{}"],
+    ["study", "study.toml", "-o", "{}"],
+    ["plan", "{}", "--error", "0.1"],
+    ["fetch", "{}"],
+]
+PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]
+PATHS += ["scene.toml/x.h5", "a\x1b[31m.h5", "loop.h5", "\u2028.h5"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paths")
+    block_scene(folder, time=ONCE)
+    small_result.write(folder / "good.h5")
+    (folder / "study.toml").write_text('[[scene]]\nname = "a"\nfile = "nowhere.toml"\n[[sweep]]\npreset = ["newton"]\n')
+    (folder / "folder").mkdir()
+    (folder / "loop.h5").symlink_to("loop.h5")
+    os.mkfifo(folder / "pipe")
+    try:
+        os.mknod(folder / "device", 0o20666, os.makedev(1, 3))  # another /dev/null
+    except PermissionError:
+        os.mkfifo(folder / "device")
+    return folder
+
+
+@pytest.mark.timeout(100)
+@pytest.mark.parametrize("path", PATHS)
+def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, capsys, path):
+    monkeypatch.chdir(folder)
+    before = {name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"}
+    for command in COMMANDS:
+        if command[0] == "study" and "-o" in command and path in (".", "..", "/", "folder", "folder/"):
+            continue  # a study has a folder
+        status = main([word.format(path) for word in command])
+        told = capsys.readouterr().err.splitlines()
+        assert status == 2 and len(told) == 1 and told[0].startswith("msmpetsc: error: "), (command, told)
+    assert {name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"} == before
+
+
+def test_a_device_is_not_replaced(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    main(["run", "scene.toml", "-o", "device", "--overwrite"])
+    assert not (folder / "device").is_file()
+
+
+TOO_MUCH = {
+    "cells": (["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"], "GB a rank or more"),
+    "tiny cells": (["run", "scene.toml", "--set", "cages={cell_size = 1e-5, max_cells = 1000000000000000}"], "GB a rank or more"),
+    "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),
+    "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
+    "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every takes"),
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("what", TOO_MUCH)
+def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch, capsys, what):
+    monkeypatch.chdir(folder)
+    command, words = TOO_MUCH[what]
+    with limits():
+        assert main(command) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and words in told[0]

@@ -122,6 +122,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path, msmpetsc):
     scene = hanging(tmp_path, 10**5, cages={"cell_size": 1 / 48}, material={"young_modulus": 1e5, "density": 1000.0})
     process = start(scene, "-o", path)
     with process:
+        time.sleep(0.3)  # of the first step; before it begins, the first interrupt alone ends the run
         for _ in range(20):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
@@ -130,6 +131,21 @@ def test_a_second_interrupt_stops_at_once(tmp_path, msmpetsc):
     assert process.returncode == 130 and "stopped at once" in told
     with h5py.File(path) as file:
         assert finished(file) >= 1
+
+
+INTERRUPTED_AT_THE_END = """
+import atexit, os, signal
+from msmpetsc.cli import main
+main.main = lambda: 143
+atexit.register(os.kill, os.getpid(), signal.SIGINT)
+main.entry_point()
+"""
+
+
+def test_an_interrupt_after_the_end_changes_nothing():
+    command = [sys.executable, "-c", INTERRUPTED_AT_THE_END]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 143 and done.stderr == ""
 
 
 def test_a_signal_to_one_rank_stops_all_together(tmp_path):

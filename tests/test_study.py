@@ -383,6 +383,21 @@ def test_a_number_shows_no_type_in_a_table(tmp_path: Path):
     assert ",0.001," in (tmp_path / "table.csv").read_text()
 
 
+RUNS_WITHIN_A_RUN = """
+import subprocess, sys
+from mpi4py import MPI
+from msmpetsc.study.process import environment
+for alone, launcher in ((True, []), (False, ["mpiexec", "-n", "2"])):
+    command = [*launcher, sys.executable, "-c", "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"]
+    subprocess.run(command, env=environment(alone), check=True)
+"""
+
+
+def test_a_study_may_be_one_rank_of_mpiexec(on_ranks):
+    done = on_ranks(1, "-c", RUNS_WITHIN_A_RUN, timeout=60)
+    assert done.returncode == 0 and done.stdout.split() == ["1", "2", "2"], done.stderr
+
+
 def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)

@@ -158,7 +158,8 @@ def test_a_signal_to_one_rank_stops_all_together(tmp_path):
     assert process.returncode == 143
     step = int(told.partition("after step ")[2].split()[0])
     with h5py.File(path) as file:
-        assert step > 0 and max(file["checkpoint/step"]) == step and finished(file) == 1 + step
+        # step may be 0: on busy cores the signal comes before the first
+        assert max(file["checkpoint/step"]) == step and finished(file) == 1 + step
 
 
 def test_mpiexec_hands_on_what_it_is_sent(tmp_path):

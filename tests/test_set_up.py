@@ -73,7 +73,7 @@ def test_slow_tests_are_run_where_they_are_chosen(tmp_path: Path, words: tuple, 
     assert [n for n in "12" if f"test_{n} PASSED" in done.stdout] == list(run), done.stdout
 
 
-@pytest.mark.parametrize("words", [(), ("trixie",), ("--meshes", "/nowhere", "trixie", "x")])
+@pytest.mark.parametrize("words", [(), ("trixie",), ("--meshes", "/nowhere", "trixie", "x"), ("trixie", ROOT / "x")])
 def test_a_bare_system_needs_its_words(words: tuple):
     done = subprocess.run([ROOT / "scripts" / "bare", *words], capture_output=True, text=True, timeout=30)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "scripts/bare: " in done.stderr

@@ -105,7 +105,7 @@ def as_given(value: Any) -> str:
     if isinstance(value, str):
         shown = " ".join(value.split())
     elif isinstance(value, float):
-        shown = repr(value)
+        shown = repr(float(value))  # a number of NumPy 2 shows its type
     else:
         try:
             shown = json.dumps(value, ensure_ascii=False, default=str)

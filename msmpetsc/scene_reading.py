@@ -3,6 +3,7 @@
 import re
 import tomllib
 from collections.abc import Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -77,8 +78,11 @@ def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | 
 
 def lies_below(folder: Path, name: str) -> bool:
     """Whether a path from ``folder`` leads to what lies in it, links followed."""
+    path = folder / name
     try:
-        return (folder / name).resolve().is_relative_to(folder.resolve())
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
+            path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
+        return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a name too long
         return False
 

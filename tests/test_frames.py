@@ -16,6 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from conftest import ENVIRONMENT
 from frames_worker import NODES, POINTS, STEPS, frame, positions
 from mpi4py import MPI
 
@@ -27,10 +28,6 @@ from msmpetsc.output.packed import pack
 from msmpetsc.output.xdmf import write_xdmf
 
 WORKER = Path(__file__).with_name("frames_worker.py")
-ROOT = WORKER.parent.parent
-# As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
-AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": str(ROOT)}
 pytestmark = pytest.mark.timeout(60)
 
 

@@ -54,7 +54,7 @@ def naming(folder: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["../out.ply", "link.ply", "loop.ply", "below/../../out.ply", "/etc/hostname"])
+@pytest.mark.parametrize("name", ["../out.ply", "link.ply", "loop.ply", "loop.ply/in.ply", "below/../../out.ply", "/etc/hostname"])
 def test_a_scene_names_no_file_outside_its_folder(folder, name):
     path = naming(folder, name)
     said = refusal(lambda: load_scene(path))

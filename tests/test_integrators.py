@@ -60,7 +60,7 @@ def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
     model, frames = play(scene, "time={step=1e-6, duration=1e-6}")
     moved = model.start[0] - model.lattice.nodes
     w = np.sqrt(2 * frames[0].elastic / (model.lattice.mass @ (moved**2).sum(axis=1)))
-    t = 2 * np.pi / w / 32
+    t = float(2 * np.pi / w / 32)
     _, frames = play(scene, f"time={{step={t!r}, duration={steps * t!r}, integrator='{integrator}'}}")
     left = (frames[-1].elastic + frames[-1].kinetic) / frames[0].elastic
     assert left == pytest.approx(energy_left(integrator, w * t, steps), rel=1e-4)

@@ -26,6 +26,7 @@ from msmpetsc.scene_reading import load_scene
 from msmpetsc.study import case, measure
 from msmpetsc.study.figures import of_frames, together
 from msmpetsc.study.plan import Method, Trial, cheapest, plan_step, plan_trajectory
+from msmpetsc.study.process import environment
 from msmpetsc.study.reading import load_study
 from msmpetsc.study.scene_lines import overrides, put_into
 from msmpetsc.study.study import Part, list_study, run_study
@@ -371,6 +372,40 @@ def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path)
     assert [row["status"] for row in read_table(tmp_path / "out")] == ["ok"]
     assert not alive(int(child.read_text()))
     assert len(calls(tmp_path)) == 2
+
+
+class NumberOfNumPy2(float):
+    def __repr__(self) -> str:
+        return f"np.float64({float(self)!r})"
+
+
+def test_a_number_shows_no_type_in_a_table(tmp_path: Path):
+    row = {"case": "1", "time_step": NumberOfNumPy2(1e-3)}
+    write_table(tmp_path, [row | {name: 1 for name, column in COLUMNS.items() if column.kind is int}])
+    assert ",0.001," in (tmp_path / "table.csv").read_text()
+
+
+RUNS_WITHIN_A_RUN = """
+import subprocess, sys
+from mpi4py import MPI
+from msmpetsc.study.process import environment
+for alone, launcher in ((True, []), (False, ["mpiexec", "-n", "2"])):
+    command = [*launcher, sys.executable, "-c", "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"]
+    subprocess.run(command, env=environment(alone), check=True)
+"""
+
+
+def test_a_study_may_be_one_rank_of_mpiexec(on_ranks):
+    done = on_ranks(1, "-c", RUNS_WITHIN_A_RUN, timeout=60)
+    assert done.returncode == 0 and done.stdout.split() == ["1", "2", "2"], done.stderr
+
+
+def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+    command = ["mpiexec", "-n", str(os.cpu_count() + 1), "true"]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):

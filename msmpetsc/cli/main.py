@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import signal
 import sys
 import traceback
 from itertools import pairwise
@@ -40,7 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def entry_point() -> None:
     """Entry point of the installed ``msmpetsc``."""
-    sys.exit(main())
+    status = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: one more could only spoil the status
+    sys.exit(status)
 
 
 def parsed(arguments: list[str]) -> argparse.Namespace:

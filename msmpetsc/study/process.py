@@ -13,9 +13,14 @@ from time import perf_counter
 from msmpetsc.study.warm import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
-MARKS_OF_MPI = ("PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_")  # of a launcher around us: not for our children
+MARKS_OF_MPI = (  # of a launcher around us: not for our children
+    "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_", "OMPI_MCA_orte_hnp_uri",
+    "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
+)  # fmt: skip
 # a process alone needs neither Open MPI's daemon nor its search for a network: a third of a second at its start
 ALONE = {"OMPI_MCA_ess_singleton_isolated": "1", "OMPI_MCA_pml": "ob1"}
+# more ranks than cores are the user's to ask for: as Open MPI 4 calls it, and as 5 does
+OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
 
 
 @dataclass(frozen=True)
@@ -84,8 +89,8 @@ class Processes:
 def environment(alone: bool = False) -> dict[str, str]:
     """As this process was started: an MPI that has since woken up in it leaves marks that confuse a child's."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith(MARKS_OF_MPI)}
-    # one thread a rank, or ranks and threads would fight for the cores; more ranks than cores are the user's to ask for
-    return {"OMP_NUM_THREADS": "1", "OMPI_MCA_rmaps_base_oversubscribe": "1"} | (ALONE if alone else {}) | ours
+    # one thread a rank, or ranks and threads would fight for the cores
+    return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours
 
 
 def too_long(timeout: float) -> str:

@@ -126,7 +126,7 @@ def _text(value: Any) -> str:
     if value is None or isinstance(value, float) and math.isnan(value):
         return ""
     if isinstance(value, float):
-        return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
+        return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))
     return " ".join(str(value).split())
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from mpi4py import MPI
 
-from msmpetsc.errors import MsmpetscError, as_expected
+from msmpetsc.errors import as_expected
 
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other

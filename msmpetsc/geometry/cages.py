@@ -65,7 +65,6 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
     raises : InputError if there would be more than ``max_cells``
     """
     grid = Grid.covering(body.bounds, cell_size)
-    refuse_beyond_memory(body.comm, _least_cells(body, grid))
     boundary, gaps = slab_cells(body, grid, method, max_cells)
     refuse_beyond_memory(body.comm, count_cells(body.comm, boundary, gaps))
     interior = cells_of_gaps(gaps)
@@ -88,6 +87,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     _refuse_above(max_cells, _least_cells(body, grid), grid)
+    refuse_beyond_memory(body.comm, _least_cells(body, grid))
     corners = _slab_triangles(body, grid, axes)
     boundary = _mark(corners, grid.shape[axes], slab, method)
     if body.report.closed:

@@ -46,7 +46,13 @@ STATIC_UNITS = {
     "lattice/mass": "kg",
     "surface/points": "m",
 }
-CHECKPOINT_UNITS = {"checkpoint/contact_bound": "N/m", "checkpoint/history_v": "m/s", "checkpoint/mode": "1"}
+CHECKPOINT_UNITS = {
+    "checkpoint/contact_bound": "N/m",
+    "checkpoint/history_v": "m/s",
+    "checkpoint/mode": "1",
+    "checkpoint/lowest_mode": "kg^-1/2",
+    "checkpoint/sides": "1",
+}
 # The numbers of a frame, named as in Frame and in /frames: dtype, shape, unit.
 SERIES = {
     "time": ("f8", (), "s"),

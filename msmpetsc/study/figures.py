@@ -78,9 +78,9 @@ def _errors(series: dict[str, np.ndarray]) -> Row:
     nothing = np.full(len(estimated), np.nan)
     true = series["true_error"][1:] if "true_error" in series else nothing
     energy = series["energy_error"][1:] if "energy_error" in series else nothing
-    where = np.isfinite(true) if np.isfinite(true).any() else np.isfinite(estimated)
-    return {
-        "estimated_error": _rms(estimated[where]),
+    where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
+    return {  # of a step with no minimum near the estimate is infinite: then there is none of the run
+        "estimated_error": None if np.isinf(estimated[where]).any() else _rms(estimated[where]),
         "true_error": _rms(true[where]),
         "energy_error": _rms(energy[where]),
     }

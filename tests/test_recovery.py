@@ -201,17 +201,17 @@ def test_a_column_bows_aside(name: str):
 # ---- what springs cannot see
 
 
-def test_a_point_stays_a_point():
-    """Zero lengths have no direction, in step with all the others: nothing pulls, so it is an equilibrium."""
+def test_a_point_swells():
+    """Zero lengths have no direction, in step with all the others: nothing pulls, but any way leads down."""
     played = play("point")
-    np.testing.assert_array_equal(played.last.position, played.frames[0].position)
-    assert played.last.elastic == played.frames[0].elastic > 0
+    assert played.last.elastic < 0.05 * played.frames[0].elastic
+    assert max(frame.step_error for frame in played.frames) < 1e-2  # the first comes down to rounding before 1e-3
 
 
-def test_a_flat_body_stays_flat():
-    """It swells within its plane to a minimum there: no spring pulls out of it."""
+def test_a_flat_body_leaves_its_plane():
+    """No spring pulls out of it, but in it a step is at a saddle."""
     played = play("flat")
-    assert np.ptp(played.last.position[:, 2]) < 1e-9
+    assert np.ptp(played.last.position[:, 2]) > 0.1 * np.ptp(played.lattice.nodes[:, 2])
     assert played.last.elastic < 0.6 * played.frames[0].elastic
     assert played.last.kinetic < 1e-9 * played.last.elastic
 
@@ -266,7 +266,7 @@ OTHERS = {
 }
 COMES_BACK = [
     ("newton-multigrid", "stretched"), ("newton-multigrid", "squeezed"), ("newton-multigrid", "flat, stiffening"),
-    ("anderson", "stretched"), ("anderson", "squeezed"), ("anderson", "pressed, stiffening"),
+    ("anderson", "stretched"), ("anderson", "squeezed"),
     ("fast-msm", "stretched"), ("fast-msm", "squeezed"), ("fast-msm", "one cell, free"),
 ]  # fmt: skip
 NOT_FINITE = REASON[-4]  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
@@ -276,6 +276,7 @@ DIVERGES = [
     ("anderson", "cloud", "DIVERGED_MAX_IT after 300 iterations"),
     ("anderson", "through", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
+    ("anderson", "pressed, stiffening", "DIVERGED_MAX_IT after 300 iterations"),  # once it has left the saddle: it buckles
     # A knows nothing of cells that resist or of stiffening springs, and no line search holds the steps back
     ("anderson", "flat, stiffening", "DIVERGED_"),  # numbers that are not finite, or in PETSc 3.26 too many iterations
     ("anderson", "mirrored, stiffening", "DIVERGED_"),

@@ -94,9 +94,12 @@ class LowestCurvature:
             values, modes = self._search_at_length(hint)
         else:
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
-        self.mode = modes[0]
+        if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
+            self.mode = None
+            return -np.inf, self._random(1)[0]
+        self.mode = modes[0].copy()
         if values[0] < 0:
-            return values[0], self._way_down(modes[values <= ALIKE * values[0]])
+            return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
         return values[0], self.mode
 
     def _way_down(self, modes: np.ndarray) -> np.ndarray:
@@ -131,7 +134,7 @@ class LowestCurvature:
         values, (x, last) = self._ritz((start, self._product(start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
-            residuals = self._without_rigid(self._preconditioned(x[1] - values[:, None] * mass * x[0]))
+            residuals = self._without_rigid(self._preconditioned(x[1] - beside(mass, values)[:, None] * mass * x[0]))
             w = self._unit(residuals)
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
             values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)

@@ -18,17 +18,18 @@ from msmpetsc.solve.functional import StepFunctional
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there, and that the error
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 DOUBTFUL = 30.0  # may be so many times what they say: it was seen 10 times as large in a valley
-SLOPE = 1e-6  # of the direction over |F|_(M^-1): a symmetric body's is rounding
+SLOPE = 0.25  # over what the curvature makes of it on the first move: a less one, as of a symmetric body, may be rounding
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
 @dataclass(frozen=True)
 class Finding:
     """error: relative, of x, infinite where no estimate can be had; direction (n,): of negative curvature, None if none
-    was found."""
+    was found; curvature: of it, an eigenvalue of M^(-1) H."""
 
     error: float
-    direction: np.ndarray | None
+    direction: np.ndarray | None = None
+    curvature: float = 1.0
 
 
 class Minimum:
@@ -57,11 +58,11 @@ class Minimum:
         bent = self._bent()
         value, direction = self.curvature.lowest(compression, alarmed, estimate.correction if alarmed else None)
         if value < 0:
-            return Finding(np.inf, direction)
+            return Finding(np.inf, direction, value)
         value = min(value, 1.0)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Finding(estimate.length / functional.away(), None)
-        return Finding(self._second_estimate(functional.dual_norm(self.f) / value, enough, value), None)
+            return Finding(estimate.length / functional.away())
+        return Finding(self._second_estimate(functional.dual_norm(self.f) / value, enough, value))
 
     def _bent(self) -> float:
         """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
@@ -80,7 +81,7 @@ class Minimum:
         self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
         return functional.norm(self.first) / functional.away(correction)
 
-    def go_on(self, x: PETSc.Vec, direction: np.ndarray | None) -> bool:
+    def go_on(self, x: PETSc.Vec, finding: Finding) -> bool:
         """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
         way that g falls, as far as doubling the move lets it fall; whether it has moved."""
         functional = self.functional
@@ -89,6 +90,7 @@ class Minimum:
         falls = functional.change(self.nearer, base)[0] < 0
         if falls:
             self.nearer.copy(x)
+        direction = finding.direction
         if direction is None:
             return falls
         functional.gradient_at(x, self.f)
@@ -96,7 +98,7 @@ class Minimum:
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
         longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        if slope > SLOPE * functional.dual_norm(self.f):  # else both ways lead down alike, and ranks must not differ
+        if slope > SLOPE * abs(finding.curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move
         best = lowest = 0.0
         for _ in range(MOVES):

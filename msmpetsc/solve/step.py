@@ -37,7 +37,7 @@ FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was esti
 EARLY = 2.0  # a step is first looked at closely when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
-DOUBTS = 20  # about where a step has come to: saddles, and errors larger than they had seemed
+DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
 CLOSER = 0.1  # of the error that was enough to doubt
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
@@ -265,12 +265,10 @@ class Stepper:
             self.x, self.corrected, compression, self.alarmed, enough * away if enough else np.inf
         )
         self.last_error = finding.error
-        if self.budget or self.at_rounding or finding.error <= enough:
+        if self.budget or finding.error <= enough or self.at_rounding and np.isfinite(finding.error):
             return True
         self.doubts += 1
-        if not self.minimum.go_on(self.x, finding.direction):
-            if np.isfinite(finding.error):
-                return True  # g has no digits left to tell the two points apart
+        if not self.minimum.go_on(self.x, finding):
             self.goal *= CLOSER
         if self.doubts > DOUBTS:
             raise self._no_minimum(finding.error)

@@ -19,7 +19,7 @@ from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene import Scene
 from msmpetsc.scene_reading import load_scene
 from msmpetsc.solve.simulate import Simulation
-from msmpetsc.solve.step import REASON
+from msmpetsc.solve.step_failure import REASON
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]

@@ -50,4 +50,6 @@ class Rounding:
                 "ones, or a smaller time.step",
                 "rounding",
             )
-        return max(error, moved / (away if away > moved else max(size, np.finfo(float).tiny)))
+        if not away > moved:
+            return moved / max(size, np.finfo(float).tiny)
+        return max(error, moved / away)

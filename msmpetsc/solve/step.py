@@ -8,12 +8,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.penalty import Contact
 from msmpetsc.model.saved import Saved
-from msmpetsc.model.worst import inside_out, place_of_greatest
 from msmpetsc.place.arrays import beside
 from msmpetsc.solve.curvature import LowestCurvature
 from msmpetsc.solve.estimate import ErrorEstimate
@@ -27,6 +26,7 @@ from msmpetsc.solve.operators import (
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
 from msmpetsc.solve.rounding import Rounding
+from msmpetsc.solve.step_failure import no_minimum, not_converged
 from msmpetsc.solve.system import ViewOfA, assemble
 from msmpetsc.solve.unknowns import Unknowns
 
@@ -39,16 +39,8 @@ LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
 CLOSER = 0.1  # of the error that was enough to doubt
-KINDS = {
-    PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
-    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
-    -4: "not finite",  # DIVERGED_FNORM_NAN; from PETSc 3.25 on DIVERGED_FUNCTION_NANORINF
-    -14: "not finite",  # there too: DIVERGED_OBJECTIVE_NANORINF
-}
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
-REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
-KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
 @dataclass(frozen=True)
@@ -271,7 +263,8 @@ class Stepper:
         if not self.minimum.go_on(self.x, finding):
             self.goal *= CLOSER
         if self.doubts > DOUBTS:
-            raise self._no_minimum(finding.error)
+            self._residual(self.snes, self.x, self.work)
+            raise no_minimum(self, finding.error)
         self.bound, self.corrected = np.inf, False
         return False
 
@@ -307,7 +300,8 @@ class Stepper:
                 break
         self.projected = False
         if self.snes.reason < 0:
-            raise self._failure(iterations)
+            self._residual(self.snes, self.snes.getSolution(), self.work)
+            raise not_converged(self, iterations)
         return iterations
 
     def _begin_afresh(self) -> None:
@@ -463,36 +457,6 @@ class Stepper:
         rtol = SHARE * self.goal / missing
         self.ksp.setTolerances(rtol=min(max(rtol, self.tightest), LOOSEST))
 
-    def _failure(self, iterations: int) -> StepFailed:
-        """What is known of it, in one line (collective)."""
-        reason, kind = REASON.get(self.snes.reason, str(self.snes.reason)), KINDS.get(self.snes.reason, "iterations")
-        other = "" if self.preset.true_hessian else "another preset (newton), "
-        advice = f'a smaller time.step, {other}a looser solver.error, or safety.on_failure = "substep"'
-        if kind == "linear solve":
-            ksp = KSP_REASON.get(self.ksp.reason, str(self.ksp.reason))
-            reason += f" (KSP {ksp} after {self.ksp.its} its)"
-            advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
-        self._residual(self.snes, self.snes.getSolution(), self.work)
-        return StepFailed(
-            f"did not converge: {reason} after {iterations} iterations, residual |F| = {self.residual:.2e}, "
-            f"relative error {self.last_error:.2e}{self._where_worst()}; try {advice}",
-            kind,
-        )
-
-    def _no_minimum(self, error: float) -> StepFailed:
-        """(collective)"""
-        self._residual(self.snes, self.x, self.work)
-        seen = "a saddle or a fold" if np.isinf(error) else "a point farther from its solution than it seemed"
-        return StepFailed(
-            f"did not come to a minimum: it came to {seen} {self.doubts} times, residual |F| = {self.residual:.2e}"
-            f"{self._where_worst()}; try a smaller time.step, or another preset (newton)",
-            "no minimum",
-        )
-
-    def _where_worst(self) -> str:
-        """Where x, whose F is ``work``, is pulled farthest, and what is inside out (collective)."""
-        worst = place_of_greatest(self.comm, self.lattice, *self.functional.pull(self.work))
-        return f", worst at {worst}{inside_out(self.comm, self.lattice, self.functional.q)}"
     def _abandon(self) -> None:
         """After an error within PETSc its objects may be in the middle of something, and crash when they are destroyed: they
         stay, even when the interpreter ends."""

@@ -85,7 +85,7 @@ def test_what_cannot_be_of_use_is_one_line_that_says_what_is(petsc_options, name
     [
         "ksp_rtol", "ksp_monitor_true_residual", "ksp_view_mat", "mat_view", "mat_mumps_icntl_14", "snes_python_type",
         "pc_hypre_boomeramg_max_iter", "mg_levels_3_ksp_max_it", "mg_coarse_sub_pc_type", "pc_fieldsplit_12_fields",
-        "npc_snes_linesearch_type", "reference_pc_type", "log_view", "malloc_debug", "snes_trtol",
+        "npc_snes_linesearch_type", "reference_pc_type", "log_view", "malloc_debug",
     ],
 )  # fmt: skip
 def test_what_petsc_knows_is_let_through(name: str):

@@ -174,7 +174,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     earlier = resume.look(comm, args) if args.scene or args.resume else None
     initialise(comm, args.petsc_options)
     from msmpetsc.solve.device import choose
-    from msmpetsc.solve.options import refuse_bad_values, refuse_early
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
     from msmpetsc.solve.presets import find_preset, shown_options
     from msmpetsc.solve.simulate import solvers_of
 
@@ -189,6 +189,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     on_root(comm, lambda: refuse_bad_values(solvers))
     if comm.rank == 0:
         print("\n".join(shown_options(solvers)))
+    tell_none_left()
     return 0
 
 

@@ -43,7 +43,9 @@ def open_viewer(option: str) -> None:
     library, viewer, kind, given = petsc_library(), ctypes.c_void_p(), ctypes.c_int(), ctypes.c_int()
     world = ctypes.c_void_p.in_dll(library, "PETSC_COMM_WORLD")
     wanted = (world, None, None, f"-{option}".encode(), *map(ctypes.byref, (viewer, kind, given)))
-    error = library.PetscOptionsGetViewer(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))
+    newer = hasattr(library, "PetscOptionsCreateViewer")  # its name from PETSc 3.22 on
+    create = library.PetscOptionsCreateViewer if newer else library.PetscOptionsGetViewer
+    error = create(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))
     if error:
         raise PETSc.Error(error)
 

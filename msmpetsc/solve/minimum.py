@@ -70,12 +70,13 @@ class Minimum:
         return self.functional.dual_norm(self.estimate.residual)
 
     def _second_estimate(self, bound: float, enough: float, lowest: float) -> float:
-        """The error of x by both corrections; infinite where the second cannot be had."""
+        """The error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of little but
+        rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
         functional, correction = self.functional, self.estimate.correction
         first = functional.norm(self.first)
         second = self.estimate(self.f, bound, enough, lowest)
         if not np.isfinite(second):
-            return np.inf
+            return (first + bound) / functional.away() if lowest > CONVEX else np.inf
         if first > 0 and second > SMALL * first:
             return DOUBTFUL * max(first, second) / functional.away()
         self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)

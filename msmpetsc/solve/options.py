@@ -167,3 +167,10 @@ def _left() -> list[str]:
     left = [names[i].decode() for i in range(count.value)]
     library.PetscOptionsLeftRestore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
     return left
+
+
+def tell_none_left() -> None:
+    """Keep PETSc from telling at its end which options were not used, where none was meant to be: newer ones do so by
+    themselves."""
+    if "options_left" not in PETSc.Options().getAll():
+        PETSc.Options().setValue("options_left", "false")

@@ -38,7 +38,7 @@ EARLY = 2.0  # a step is first looked at closely when its error is thought to be
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
-CLOSER = 0.1  # of the error that was enough to doubt
+CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 
@@ -262,6 +262,8 @@ class Stepper:
         self.doubts += 1
         if not self.minimum.go_on(self.x, finding):
             self.goal *= CLOSER
+            if self.goal < CLOSEST * enough and np.isfinite(finding.error):
+                return True  # g has no digits left to tell the two points apart: the step is as good as it says
         if self.doubts > DOUBTS:
             self._residual(self.snes, self.x, self.work)
             raise no_minimum(self, finding.error)

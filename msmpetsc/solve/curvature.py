@@ -3,8 +3,9 @@
 F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
 positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
 for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
-the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when the body is compressed anew or more than it was, or something showed a
-negative curvature; at all other steps the mode found last is followed in a few iterations.
+the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when
+the body is compressed anew or more than it was, or something showed a negative curvature; at all other steps the mode
+found last is followed in a few iterations.
 """
 
 from collections.abc import Callable

@@ -17,7 +17,7 @@ from msmpetsc.solve.operators import Preconditioner, TrueHessian, python_matrix
 LOOK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
-LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: nowhere convex is the error then more than three times what was found
+LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
 MOST = 512
 
 

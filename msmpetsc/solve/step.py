@@ -257,7 +257,7 @@ class Stepper:
             self.x, self.corrected, compression, self.alarmed, enough * away if enough else np.inf
         )
         self.last_error = finding.error
-        if self.budget or finding.error <= enough or self.at_rounding and np.isfinite(finding.error):
+        if self.budget or finding.error <= enough or self.at_rounding and not np.isinf(finding.error):  # x = y: 0 / 0
             return True
         self.doubts += 1
         if not self.minimum.go_on(self.x, finding):

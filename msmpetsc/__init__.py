@@ -22,7 +22,7 @@ def _kernel_folder() -> Path:
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
 
 
-def open(path: str | Path) -> "Result":  # noqa: A001, F821
+def open(path: str | Path) -> "Result":  # noqa: F821
     """A result file, to be read: frames, lattice, surface, embedding, scene. Needs neither MPI nor PETSc.
 
         with msmpetsc.open("out/bunny_fall.h5") as run:

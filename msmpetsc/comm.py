@@ -70,7 +70,9 @@ class Route:
         result = np.empty((int(in_counts.sum()), *rows.shape[1:]), rows.dtype)
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
         try:
-            self.comm.Alltoallv([rows, out_counts, starts(out_counts), row], [result, in_counts, starts(in_counts), row])
+            self.comm.Alltoallv(
+                [rows, out_counts, starts(out_counts), row], [result, in_counts, starts(in_counts), row]
+            )
         finally:
             row.Free()
         return result

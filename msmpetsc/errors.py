@@ -49,7 +49,7 @@ def nearest(name: str, valid: Iterable[str]) -> str | None:
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """", did you mean 'x'?" with the nearest valid name; empty where none is near."""
+    """ ", did you mean 'x'?" with the nearest valid name; empty where none is near."""
     near = nearest(name, valid)
     return f", did you mean {near!r}?" if near else ""
 

@@ -211,7 +211,8 @@ class Time(Table):
     step: Positive = Field(description="time step [s]")
     duration: Positive = Field(description="simulated time [s]")
     integrator: Integrator = Field(
-        "implicit-euler", description="how a step is taken: solved at once, of first or second order; or in explicit substeps"
+        "implicit-euler",
+        description="how a step is taken: solved at once, of first or second order; or in explicit substeps",
     )
     substep: Positive | None = Field(
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
@@ -288,7 +289,9 @@ class Obstacle(Table):
 
     shape: Literal["plane", "box"] = Field(description="kind of obstacle")
     point: Vector | None = Field(None, description="a point of the plane [m]")
-    normal: UnitVector | None = Field(None, description="of the plane, towards its free side, normalised on reading [-]")
+    normal: UnitVector | None = Field(
+        None, description="of the plane, towards its free side, normalised on reading [-]"
+    )
     box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
     path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
     start: NotNegative = Field(0.0, description="is there from this time [s]")

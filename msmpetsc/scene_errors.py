@@ -184,7 +184,7 @@ def _line(loc: KeyPath, prefixes: list[tuple[int, dict[str, Any]]]) -> int | Non
 def _depth(data: Any, loc: KeyPath) -> int:
     """How many keys of ``loc`` lead somewhere in ``data``."""
     for depth, key in enumerate(loc):
-        inside = isinstance(data, dict) and key in data or isinstance(data, list) and key in range(len(data))
+        inside = (isinstance(data, dict) and key in data) or (isinstance(data, list) and key in range(len(data)))
         if not inside:
             return depth
         data = data[key]

@@ -49,7 +49,9 @@ def write_all(path: str, gathers: bool = False) -> None:
         file.start_frames(STEPS + 1, nodes.stop - nodes.start, points.stop - points.start)
         for index in range(STEPS + 1):
             file.append(frame(index, nodes, points))
-            file.write_checkpoint(Saved(index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]}))
+            file.write_checkpoint(
+                Saved(index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]})
+            )
 
 
 def write_forever(path: str) -> None:
@@ -59,7 +61,9 @@ def write_forever(path: str) -> None:
         for index in range(100_000):
             file.append(frame(index))
             print(index, flush=True)
-            file.write_checkpoint(Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}))
+            file.write_checkpoint(
+                Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+            )
 
 
 def refuse(path: str) -> None:

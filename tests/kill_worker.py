@@ -75,7 +75,9 @@ def fault(path: Path, whole: Path, least: int) -> str | None:
     return None
 
 
-def chain(scene: str, path: Path, kills: int, chance: random.Random, seen: dict, runs: list[tuple[list[str], Path]]) -> int:
+def chain(
+    scene: str, path: Path, kills: int, chance: random.Random, seen: dict, runs: list[tuple[list[str], Path]]
+) -> int:
     """Kill the runs in turn until all are at their end, or so many are killed; returns how many were."""
     stored.value, begun = 0, seen["kills"]
     for extra, whole in runs:

@@ -18,10 +18,7 @@ from petsc4py import PETSc
 from msmpetsc.solve import device, memory
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
-KNOWN = (
-    "array_equal asarray concatenate copyto einsum empty empty_like flatnonzero "
-    "linalg.norm tile vdot where zeros zeros_like"
-).split()  # fmt: skip
+KNOWN = ["array_equal", "asarray", "concatenate", "copyto", "einsum", "empty", "empty_like", "flatnonzero", "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like"]  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
 counted = Counter()
 
@@ -52,7 +49,9 @@ class Array(NDArrayOperatorsMixin):
         assert name in KNOWN, f"has CuPy numpy.{name}?"
         if name in ("asarray", "array"):
             return arguments[0] if isinstance(arguments[0], Array) else send(arguments[0])
-        assert not keywords.keys() & {"device", "copy", "initial", "where"}, f"CuPy's {name} may not take all of {keywords}"
+        assert not keywords.keys() & {"device", "copy", "initial", "where"}, (
+            f"CuPy's {name} may not take all of {keywords}"
+        )
         keywords = {key: bare(value) for key, value in keywords.items() if key != "like"}
         return dressed(function(*map(bare, arguments), **keywords))
 

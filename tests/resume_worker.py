@@ -17,16 +17,47 @@ import petsc4py
 petsc4py.init(["msmpetsc"])
 
 from msmpetsc.cli.main import main  # noqa: E402
-from msmpetsc.model.build import build_model  # noqa: E402, F401: before the forks, or each would import it
 from msmpetsc.output.xdmf import write_xdmf  # noqa: E402, F401
 from msmpetsc.solve.simulate import Simulation  # noqa: E402, F401
 
 KINDS = ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]
-SHAPES = [(), (0,), (1,), (2,), (3,), (2, 3), (75, 3), (2, 75), (2, 75, 3), (2, 75, 4), (1, 75, 3), (10**12,), (2, 10**9, 3)]
+SHAPES = [
+    (),
+    (0,),
+    (1,),
+    (2,),
+    (3,),
+    (2, 3),
+    (75, 3),
+    (2, 75),
+    (2, 75, 3),
+    (2, 75, 4),
+    (1, 75, 3),
+    (10**12,),
+    (2, 10**9, 3),
+]
 VALUES = [np.nan, np.inf, -np.inf, -1.0, -1e9, 0.0, 0.5, 1.0, 3.0, 12.0, 1e9, 1e300]
-TEXTS = ["", "x", "-", "-snes_type", "-ksp_rtol 1e-2", "\x1b[31m\n", "a" * 10**5, "9" * 5000, "é\u2028", "[time]\nstep = nan\n"]
+TEXTS = [
+    "",
+    "x",
+    "-",
+    "-snes_type",
+    "-ksp_rtol 1e-2",
+    "\x1b[31m\n",
+    "a" * 10**5,
+    "9" * 5000,
+    "é\u2028",
+    "[time]\nstep = nan\n",
+]
 ANYTHING = [7, -1, 2.5, np.nan, 2**63, np.arange(3), np.array([b"x"]), h5py.Empty("f8"), "", *TEXTS]
-MORE = [[], [], ["--force"], ["--force", "--set", "time.duration=0.1"], ["--force", "--preset", "lbfgs"], ["--compress"]]
+MORE = [
+    [],
+    [],
+    ["--force"],
+    ["--force", "--set", "time.duration=0.1"],
+    ["--force", "--preset", "lbfgs"],
+    ["--compress"],
+]
 
 
 def damage(file: h5py.File, chance: random.Random) -> str:
@@ -59,7 +90,9 @@ def replace(file: h5py.File, name: str, by) -> None:
 
 
 def dataset(file: h5py.File, name: str, chance: random.Random) -> None:
-    shape = file[name].shape if isinstance(file[name], h5py.Dataset) and chance.random() < 0.5 else chance.choice(SHAPES)
+    shape = (
+        file[name].shape if isinstance(file[name], h5py.Dataset) and chance.random() < 0.5 else chance.choice(SHAPES)
+    )
     del file[name]
     chunks = True if shape and all(shape) and chance.random() < 0.7 else None
     packed = {"compression": "gzip"} if chunks and chance.random() < 0.3 else {}
@@ -79,7 +112,9 @@ def names(file: h5py.File, _: str, chance: random.Random) -> None:
     if "checkpoint/numbers" in file:
         words = str(file["checkpoint/numbers"].attrs.get("names", "")).split()
         chance.shuffle(words)
-        file["checkpoint/numbers"].attrs["names"] = chance.choice([*ANYTHING, " ".join(words), " ".join(words[1:]), "a " * len(words)])
+        file["checkpoint/numbers"].attrs["names"] = chance.choice(
+            [*ANYTHING, " ".join(words), " ".join(words[1:]), "a " * len(words)]
+        )
 
 
 def swap(file: h5py.File, name: str, chance: random.Random) -> None:
@@ -114,7 +149,15 @@ def trial(source: Path, path: Path, chance: random.Random) -> tuple[str, list[st
         for _ in range(chance.choice([1, 1, 1, 2, 3])):
             try:
                 done.append(damage(file, chance))
-            except (KeyError, ValueError, OSError, RuntimeError, IndexError, TypeError, OverflowError):  # a link that leads nowhere by now
+            except (
+                KeyError,
+                ValueError,
+                OSError,
+                RuntimeError,
+                IndexError,
+                TypeError,
+                OverflowError,
+            ):  # a link that leads nowhere by now
                 continue
     given, ends = chance.choice(MORE), os.pipe()
     child = os.fork()

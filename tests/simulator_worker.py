@@ -7,9 +7,12 @@ import os
 import sys
 from unittest.mock import patch
 
-os.environ |= {"NUMBA_ENABLE_CUDASIM": "1", "NUMBA_DISABLE_JIT": "1"}  # the simulator reads Python, not what is compiled
-from block_scene import play  # noqa: E402
-from pretend_gpu import bare, module, pretended  # noqa: E402
+os.environ |= {
+    "NUMBA_ENABLE_CUDASIM": "1",
+    "NUMBA_DISABLE_JIT": "1",
+}  # the simulator reads Python, not what is compiled
+from block_scene import play
+from pretend_gpu import bare, module, pretended
 
 with module("cupy"):
     from msmpetsc.place import threads

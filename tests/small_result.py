@@ -13,7 +13,7 @@ H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
 NODES = H * np.unique(np.concatenate([CORNERS, CORNERS + [1, 0, 0]]), axis=0)  # (12, 3)
 POINTS = np.array([[0.1, 0.2, 0.3], [0.6, 0.2, 0.1], [0.9, 0.4, 0.4], [0.5, 0.5, 0.5]])
-SCENE = '[material]\ndensity = 1000\n\n[time]\nstep = 0.01\n'
+SCENE = "[material]\ndensity = 1000\n\n[time]\nstep = 0.01\n"
 
 
 def cells() -> np.ndarray:

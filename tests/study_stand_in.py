@@ -68,7 +68,10 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
 
 def blank_frame(**given) -> Frame:
     """A frame of zeros but for what is given."""
-    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {"surface": None, "momentum": np.zeros(3)}
+    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {
+        "surface": None,
+        "momentum": np.zeros(3),
+    }
     return Frame(**blank | given)
 
 

@@ -70,8 +70,14 @@ def test_a_device_is_not_replaced(folder, monkeypatch):
 
 
 TOO_MUCH = {
-    "cells": (["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"], "GB a rank or more"),
-    "tiny cells": (["run", "scene.toml", "--set", "cages={cell_size = 1e-5, max_cells = 1000000000000000}"], "GB a rank or more"),
+    "cells": (
+        ["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"],
+        "GB a rank or more",
+    ),
+    "tiny cells": (
+        ["run", "scene.toml", "--set", "cages={cell_size = 1e-5, max_cells = 1000000000000000}"],
+        "GB a rank or more",
+    ),
     "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),
     "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
     "frames": (["run", "scene.toml", "--checkpoint-every", "9" * 5000], "--checkpoint-every takes"),

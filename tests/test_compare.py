@@ -162,7 +162,9 @@ def test_the_order_of_springs_does_not_matter(a: Path, tmp_path: Path, capsys):
     assert told(capsys, a, b)[0] == 0
 
 
-@pytest.mark.parametrize("options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--fields", ""], ["--field"]])
+@pytest.mark.parametrize(
+    "options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--fields", ""], ["--field"]]
+)
 def test_odd_options_are_refused(a: Path, capsys, options: list[str]):
     status, _, said = told(capsys, a, a, *options)
     assert status == 2 and said.startswith("msmpetsc: error: ") and said.count("\n") == 1

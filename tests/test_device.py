@@ -51,7 +51,9 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
 
 
 def test_the_cpu_may_be_named(tmp_path: Path, msmpetsc):
-    done = msmpetsc(1, "run", block_scene(tmp_path, **FALL), "-o", tmp_path / "out.h5", "--device", "cpu", "-mat_type", "aij")
+    done = msmpetsc(
+        1, "run", block_scene(tmp_path, **FALL), "-o", tmp_path / "out.h5", "--device", "cpu", "-mat_type", "aij"
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -76,7 +76,7 @@ def plain_cages(p, mask, h):
     """Eq. 7-9 -> (64,)."""
     valid = {tuple(offset) for offset in BLOCK[mask]}
     corners = [np.array(v) for v in np.ndindex(2, 2, 2)]
-    around = {tuple(v): {c for c in valid if all(0 <= v - c) and all(v - c <= 1)} for v in corners}
+    around = {tuple(v): {c for c in valid if all(v - c >= 0) and all(v - c <= 1)} for v in corners}
     own = plain_mvc(p, {(0, 0, 0)})
     b, step = 1.0, lambda z: z * z * (3 - 2 * z)
     for c in valid - {(0, 0, 0)}:
@@ -126,7 +126,7 @@ def test_mvc_on_a_face_is_barycentric_in_the_triangle_there():
 def test_mvc_interpolates_at_corners():
     corners = np.array(list(np.ndindex(2, 2, 2)))
     found = stencil_weights("mvc", corners + 1e-13, np.ones((8, 27), bool))  # rounding beyond the cell is taken
-    np.testing.assert_allclose(found, (NODES == corners[:, None]).all(-1), atol=1e-12)
+    np.testing.assert_allclose(found, (corners[:, None] == NODES).all(-1), atol=1e-12)
 
 
 # ---- properties of all kinds

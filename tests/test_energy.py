@@ -92,7 +92,9 @@ def test_a_change_of_energy_keeps_its_digits(elastic: tuple):
     v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q  # as it is after rounding
     first, second = (gradient(Q, elastic) * v).sum(), 0.5 * (hessian_times(Q, v, elastic=elastic) * v).sum()
     change = elastic_change(Q + v, Q, *elastic)
-    assert change - first == pytest.approx(second, rel=1e-4, abs=0)  # near a minimum only this is left, without the loads
+    assert change - first == pytest.approx(
+        second, rel=1e-4, abs=0
+    )  # near a minimum only this is left, without the loads
     far = 3 * Q + 1
     plain = elastic_energy(far, *elastic) - elastic_energy(Q, *elastic)
     assert elastic_change(far, Q, *elastic) == pytest.approx(plain, rel=1e-12)

@@ -45,7 +45,9 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_the_estimate_is_within_three_of_the_true_error(tmp_path: Path, name: str, preset: str):
     """Where the bound alone would do, what is said may be further above; it is never far below."""
-    scene = load_scene(block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]), [f"solver={{preset='{preset}', error=1e-3}}"])
+    scene = load_scene(
+        block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]), [f"solver={{preset='{preset}', error=1e-3}}"]
+    )
     model = build_model(MPI.COMM_SELF, scene)
     ratios, estimated = [], []
     with Simulation(MPI.COMM_SELF, scene, model, Measured(true_error=1)) as simulation:
@@ -165,6 +167,7 @@ def test_two_solvers_do_not_take_each_others_options():
 
 def test_linear_solves_are_no_tighter_than_the_step_needs():
     """A step to 1e-1 asks for looser ones than a step to 1e-6 does; a tolerance of the user's is left alone."""
+
     def tolerances(error: float) -> list[float]:
         lattice, seen = beam(), []
         stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=error)
@@ -175,5 +178,3 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
 
     loose, tight = tolerances(1e-1), tolerances(1e-8)
     assert max(loose) > 0.1 and min(tight) == float(PRESETS["newton"].options["ksp_rtol"])
-
-

@@ -26,4 +26,6 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
         assert done.returncode == 1 and "ZeroDivisionError" in done.stderr and not told
     else:
         assert done.returncode == 2 and len(told) == 1 and "Traceback" not in done.stderr, done.stderr
-        assert told[0].startswith("msmpetsc: error: " + {"input": "it fails", "memory": "there is not enough memory (Unable"}[what])
+        assert told[0].startswith(
+            "msmpetsc: error: " + {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
+        )

@@ -110,7 +110,9 @@ def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
 
 
 @settings(TRIALS, max_examples=400)
-@given(seed=st.sampled_from(SEEDS), changes=damage, step=st.sampled_from(["[]", "['merge']", "['orient']", "['union']"]))
+@given(
+    seed=st.sampled_from(SEEDS), changes=damage, step=st.sampled_from(["[]", "['merge']", "['orient']", "['union']"])
+)
 def test_a_damaged_mesh_is_a_body_or_one_line(tmp_path, seed, changes, step):
     kind, content = seed
     read(tmp_path, kind, damaged(content, changes), f"mesh.prepare={step}")
@@ -122,7 +124,10 @@ def test_a_whole_mesh_is_read(tmp_path, kind, content):
 
 
 @settings(TRIALS, max_examples=120)
-@given(kind=st.sampled_from(["obj", "ply", "stl", "off", "glb", "gltf", "mz3", "vtk", "vtu", "ply.gz"]), content=st.binary(max_size=300))
+@given(
+    kind=st.sampled_from(["obj", "ply", "stl", "off", "glb", "gltf", "mz3", "vtk", "vtu", "ply.gz"]),
+    content=st.binary(max_size=300),
+)
 def test_any_bytes_are_refused(tmp_path, kind, content):
     assert read(tmp_path, kind, content)
 
@@ -180,7 +185,9 @@ def opened():
 
 NAMES_OTHERS = {
     "obj": QUADS + b"usemtl x\nmap_Kd ../texture.png\n",
-    "ply": exported(file_type="ply", encoding="ascii").replace(b"element vertex", b"comment TextureFile paint.mtl\nelement vertex"),
+    "ply": exported(file_type="ply", encoding="ascii").replace(
+        b"element vertex", b"comment TextureFile paint.mtl\nelement vertex"
+    ),
 }
 
 
@@ -243,7 +250,9 @@ def glb(instances: int, faces: int, parts: int = 1) -> bytes:
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     header = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(binary))
-    return header + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x4E4942) + binary
+    return (
+        header + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x4E4942) + binary
+    )
 
 
 def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:

@@ -42,16 +42,27 @@ def checkpoint(path: Path) -> None:
 
 
 NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]
-NAMES += ["embedding/indptr", "embedding/indices", "embedding/weights", "frames/time", "frames/position", "frames/kinetic"]
+NAMES += [
+    "embedding/indptr",
+    "embedding/indices",
+    "embedding/weights",
+    "frames/time",
+    "frames/position",
+    "frames/kinetic",
+]
 NAMES += ["frames/iterations", "checkpoint/step", "checkpoint/q", "checkpoint/q_previous", "frames/new\nline"]
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 5, 12, 10**12]), max_size=4).map(tuple)
-TYPES = st.sampled_from(["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype])
+TYPES = st.sampled_from(
+    ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]
+)
 VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
 
 
 @settings(TRIALS, max_examples=25)
 @given(
-    edits=st.lists(st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2)
+    edits=st.lists(
+        st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2
+    )
 )
 def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
     path = tmp_path / "x.h5"
@@ -66,7 +77,9 @@ def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
                 continue
             file.pop(name, None)
             packed = packed and all(shape) and shape
-            file.create_dataset(name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None)
+            file.create_dataset(
+                name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None
+            )
     for call in (lambda: read_all(path), lambda: compared(whole, path), lambda: checkpoint(path)):
         refusal(call)
 
@@ -90,7 +103,9 @@ def virtual(file: h5py.File, name: str, folder: Path) -> None:
 
 
 ELSEWHERE = {
-    "a link to another file": lambda file, name, folder: replaced(file, name, h5py.ExternalLink(str(folder / "secret.h5"), "/rows")),
+    "a link to another file": lambda file, name, folder: replaced(
+        file, name, h5py.ExternalLink(str(folder / "secret.h5"), "/rows")
+    ),
     "a link by way of a link": lambda file, name, folder: (
         file.__setitem__("way", h5py.ExternalLink(str(folder / "secret.h5"), "/rows")),
         replaced(file, name, h5py.SoftLink("/way")),

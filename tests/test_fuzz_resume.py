@@ -22,8 +22,12 @@ NAMES += ["frames/time", "frames/position", "frames/kinetic", "lattice/nodes", "
 VALUES = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 3.0, 12.0, 1e308])
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 75, 10**12]), max_size=4).map(tuple)
 KINDS = st.sampled_from(["f8", "f4", ">f8", "i8", "S3", h5py.string_dtype()])
-ATTRIBUTES = st.sampled_from(["scene", "scene_file", "petsc_options", "true_error", "msmpetsc_version", "format_version"])
-TEXTS = st.sampled_from(["", "x", "-", "-snes_type", "-pc_type 'x", "-ksp_type none", "/etc/passwd", "\x1b[31m\n", "-1"])
+ATTRIBUTES = st.sampled_from(
+    ["scene", "scene_file", "petsc_options", "true_error", "msmpetsc_version", "format_version"]
+)
+TEXTS = st.sampled_from(
+    ["", "x", "-", "-snes_type", "-pc_type 'x", "-ksp_type none", "/etc/passwd", "\x1b[31m\n", "-1"]
+)
 
 
 @pytest.fixture(scope="module")

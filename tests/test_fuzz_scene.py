@@ -54,7 +54,9 @@ def naming(folder: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["../out.ply", "link.ply", "loop.ply", "loop.ply/in.ply", "below/../../out.ply", "/etc/hostname"])
+@pytest.mark.parametrize(
+    "name", ["../out.ply", "link.ply", "loop.ply", "loop.ply/in.ply", "below/../../out.ply", "/etc/hostname"]
+)
 def test_a_scene_names_no_file_outside_its_folder(folder, name):
     path = naming(folder, name)
     said = refusal(lambda: load_scene(path))
@@ -74,7 +76,9 @@ def test_painted_points_come_from_the_folder_too(folder):
     load_scene(path, ["pin.0.region.painted=../numbers.txt"])
 
 
-@pytest.mark.parametrize(("key", "value"), [("mesh.source", '"a\\nb.ply"'), ("mesh.source", '"\\u001b[31m"'), ("title", "\udcff")])
+@pytest.mark.parametrize(
+    ("key", "value"), [("mesh.source", '"a\\nb.ply"'), ("mesh.source", '"\\u001b[31m"'), ("title", "\udcff")]
+)
 def test_names_are_printable_text(folder, key, value):
     assert refusal(lambda: load_scene(folder / "scene.toml", [f"{key}={value}"]))
 
@@ -119,7 +123,9 @@ def test_the_own_scenes_and_studies_name_what_they_may():
 
 @pytest.mark.parametrize("name", ["huge.ply", "../out.ply"])
 def test_all_ranks_say_the_same_once(folder, msmpetsc, name):
-    (folder / "huge.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n")
+    (folder / "huge.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"
+    )
     done = msmpetsc(2, "run", naming(folder, name), "-o", folder / "x.h5", timeout=60)
     told = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: error")]
     assert done.returncode == 2 and len(told) == 1 and "Traceback" not in done.stderr
@@ -136,7 +142,10 @@ DEEP = {
 MANY = {
     "unknown keys": (b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
     "unknown keys of a table": (b"[cages]\n" + b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
-    "a long line and many others": (b"x = [" + b"1, " * 100_000 + b"]\n" + b"".join(b"y%d = 1\n" % i for i in range(200)), "unknown key"),
+    "a long line and many others": (
+        b"x = [" + b"1, " * 100_000 + b"]\n" + b"".join(b"y%d = 1\n" % i for i in range(200)),
+        "unknown key",
+    ),
 }
 
 

@@ -56,7 +56,9 @@ def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
     w^2 from the run's own elastic energy, 1/2 w^2 sum m |u|^2.
     """
     small = 1e-5
-    scene = block_scene(tmp_path, np.full(3, 0.125), start={"scale": [1 + small] * 3}, solver={"preset": "newton", "error": 1e-10})
+    scene = block_scene(
+        tmp_path, np.full(3, 0.125), start={"scale": [1 + small] * 3}, solver={"preset": "newton", "error": 1e-10}
+    )
     model, frames = play(scene, "time={step=1e-6, duration=1e-6}")
     moved = model.start[0] - model.lattice.nodes
     w = np.sqrt(2 * frames[0].elastic / (model.lattice.mass @ (moved**2).sum(axis=1)))
@@ -79,5 +81,3 @@ def energy_left(integrator: str, wt: float, steps: int) -> float:
     for _ in range(steps):
         before, now = now, np.linalg.solve(np.eye(2) - 2 / 3 * matrix, (4 * now - before) / 3)
     return float(now @ now)
-
-

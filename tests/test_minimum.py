@@ -97,7 +97,9 @@ def test_chebyshev_does_not_stay_between_two_ways_to_buckle(tmp_path: Path):
 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
     """One published iteration leaves the crushed beam flat: nothing bounds how far it is from where it will go."""
-    (frame,) = play(write_case(tmp_path, "crushed", preset="newton", max_iterations=1), "solver={preset='newton', max_iterations=1}")
+    (frame,) = play(
+        write_case(tmp_path, "crushed", preset="newton", max_iterations=1), "solver={preset='newton', max_iterations=1}"
+    )
     assert frame.step_error > frame.true_error / 3
 
 
@@ -169,7 +171,7 @@ def test_a_body_at_rest_has_a_small_error(tmp_path: Path):
     assert frames and frames[0].step_error < 1e-6
 
 
-PART = 'part=[{region={half_space={point=[0.0,0.0,0.0], normal=[1,0,0]}}, young_modulus=%g}]'
+PART = "part=[{region={half_space={point=[0.0,0.0,0.0], normal=[1,0,0]}}, young_modulus=%g}]"
 
 
 def test_parts_that_doubles_cannot_tell_apart_are_refused(tmp_path: Path):
@@ -193,7 +195,18 @@ def test_stiff_parts_are_solved_as_well_as_they_say(tmp_path: Path):
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(tmp_path: Path):
     """A sample of what scripts/error_study draws; it takes 500."""
     told = tmp_path / "rows.json"
-    command = [sys.executable, "-W", "ignore", ROOT / "scripts" / "error_study", "--scenes", "12", "--seed", "7", "--json", told]
+    command = [
+        sys.executable,
+        "-W",
+        "ignore",
+        ROOT / "scripts" / "error_study",
+        "--scenes",
+        "12",
+        "--seed",
+        "7",
+        "--json",
+        told,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = json.loads(told.read_text())

@@ -155,7 +155,8 @@ BEFORE_THE_MESH = {
 
 
 @pytest.mark.parametrize(
-    ("ranks", "options"), [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone"), (2, "-ts_monitor")]
+    ("ranks", "options"),
+    [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone"), (2, "-ts_monitor")],
 )
 def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options: str):
     """Which is not there."""
@@ -199,7 +200,9 @@ def test_a_solver_that_is_to_fail_where_it_does_not_converge_fails_the_step():
 
 def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tmp_path: Path):
     """The dense block that was being worked on could not be destroyed."""
-    done = run(1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "o.h5", "-pc_type", "composite", timeout=60)
+    done = run(
+        1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "o.h5", "-pc_type", "composite", timeout=60
+    )
     assert done.returncode == 2 and "composite" in done.stderr, done.stderr
     assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV"))
 
@@ -257,7 +260,7 @@ def read_matrix(path: Path) -> np.ndarray:
     return dense
 
 
-def PETSC_SELF():  # noqa: N802
+def PETSC_SELF():
     from petsc4py import PETSc
 
     return PETSc.COMM_SELF
@@ -349,7 +352,9 @@ def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: 
     assert shown.stdout.splitlines().count("-snes_type anderson") == 1
     assert "-ksp_max_it 77" in shown.stdout and "# -ksp_rtol 1e-1" in shown.stdout
     (tmp_path / "options").write_text(shown.stdout)
-    scene = block_scene(tmp_path, **SCENE, mesh={"source": "gone.ply"}, solver={"preset": "paper", "max_iterations": 2000})
+    scene = block_scene(
+        tmp_path, **SCENE, mesh={"source": "gone.ply"}, solver={"preset": "paper", "max_iterations": 2000}
+    )
     other = ("--show-options", scene, "--true-error", "1", "-pc_type", "sor")
     shown = run(1, *COMMAND, *other, timeout=60)
     assert "-reference_pc_type gamg" in shown.stdout and "-snes_max_it 2000" in shown.stdout, shown.stderr

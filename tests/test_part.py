@@ -165,7 +165,10 @@ def test_a_part_stiffer_by_a_million_stays_as_it_is_where_the_soft_one_hangs_fro
 
 def test_any_number_of_ranks_has_the_same_parts(tmp_path: Path, msmpetsc: Run):
     """Masses and springs to the last bit, ghosts' included; two parts, one of them painted."""
-    parts = [{"region": FAR, "density": 777.7, "young_modulus": 1 / 3 * YOUNG}, {"region": {"painted": [3]}, "density": 9e3}]
+    parts = [
+        {"region": FAR, "density": 777.7, "young_modulus": 1 / 3 * YOUNG},
+        {"region": {"painted": [3]}, "density": 9e3},
+    ]
     pin = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
     gravity = {"acceleration": [0, 0, -9.81]}
     scene = block_scene(tmp_path, part=parts, time={"step": T, "duration": 3 * T}, pin=pin, gravity=gravity)

@@ -14,7 +14,9 @@ from msmpetsc.study.progress import StudyProgress
 
 
 def frame(index: int) -> Frame:
-    numbers = dict(step_error=8.1e-4, iterations=5, ksp_its=45, kinetic=0.0, elastic=0.0, potential=0.0, contact=0.0, wall_time=0.0)
+    numbers = dict(
+        step_error=8.1e-4, iterations=5, ksp_its=45, kinetic=0.0, elastic=0.0, potential=0.0, contact=0.0, wall_time=0.0
+    )
     return Frame(index=index, time=index / 60, position=np.zeros((0, 3)), surface=None, momentum=np.zeros(3), **numbers)
 
 

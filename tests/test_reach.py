@@ -85,7 +85,9 @@ def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
 
 def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path, heard):
     twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
-    with pytest.raises(InputError, match="anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"):
+    with pytest.raises(
+        InputError, match="anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"
+    ):
         build(tmp_path, anchor=twice)
     with pytest.raises(InputError, match="anchor.0: of the 15 nodes in its region 15 are pinned: it leads none"):
         build(tmp_path, anchor=twice[:1], pin=[{"region": LEFT_HALF}])
@@ -137,7 +139,11 @@ def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator,
     times = {"start": start} | ({"stop": stop} if stop else {})
     ground = {"shape": "plane", "point": [0, 0, -1], "normal": [0, 0, 1]}
     build(tmp_path, force=[force(RIGHT, **times)], obstacle=[ground | times], time=TIME | {"integrator": integrator})
-    wanted = [(line[0], f"{key} acts in no step: it is there {line[1]}") for key in ("force.0", "obstacle.0")] if line else []
+    wanted = (
+        [(line[0], f"{key} acts in no step: it is there {line[1]}") for key in ("force.0", "obstacle.0")]
+        if line
+        else []
+    )
     assert heard() == wanted
 
 
@@ -145,7 +151,11 @@ def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator,
     ("side", "mesh", "words"),
     [
         (300.0, {}, "the body is 300 m long, and the scene gives no mesh.size: is the mesh in millimetres?"),
-        (0.0005, {}, "the body is 0.0005 m long, and the scene gives no mesh.size: is the mesh in another unit than metres?"),
+        (
+            0.0005,
+            {},
+            "the body is 0.0005 m long, and the scene gives no mesh.size: is the mesh in another unit than metres?",
+        ),
         (20.0, {}, None),
         (0.001, {}, None),
         (300.0, {"size": 30.0}, None),
@@ -207,7 +217,9 @@ def test_an_open_mesh_has_no_volume_to_say(tmp_path):
 
 
 def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):
-    scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.04}, gravity={"acceleration": [0, 0, -G]}, pin=[{"region": LEFT}])
+    scene = block_scene(
+        tmp_path, time={"step": 0.01, "duration": 0.04}, gravity={"acceleration": [0, 0, -G]}, pin=[{"region": LEFT}]
+    )
     path = tmp_path / "x.h5"
     step = Simulation._step
 

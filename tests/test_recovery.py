@@ -103,7 +103,9 @@ def test_newton_survives(name: str):
     assert all(np.isfinite(frame.position).all() for frame in played.frames)
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if CASES[name]["file"] in ("hard/free.toml", "hard/clamped.toml")])
+@pytest.mark.parametrize(
+    "name", [name for name in CASES if CASES[name]["file"] in ("hard/free.toml", "hard/clamped.toml")]
+)
 def test_no_energy_comes_from_nowhere(name: str):
     """g(x_(n+1)) <= g(q_n) makes E_(n+1) <= E_n + K_n, the loads' potential counted in."""
     frames = first_steps(name).frames
@@ -277,7 +279,11 @@ DIVERGES = [
     ("anderson", "cloud", "DIVERGED_MAX_IT after 300 iterations"),
     ("anderson", "through", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
-    ("anderson", "pressed, stiffening", "DIVERGED_MAX_IT after 300 iterations"),  # once it has left the saddle: it buckles
+    (
+        "anderson",
+        "pressed, stiffening",
+        "DIVERGED_MAX_IT after 300 iterations",
+    ),  # once it has left the saddle: it buckles
     # A knows nothing of cells that resist or of stiffening springs, and no line search holds the steps back
     ("anderson", "flat, stiffening", "DIVERGED_"),  # numbers that are not finite, or in PETSc 3.26 too many iterations
     ("anderson", "mirrored, stiffening", "DIVERGED_"),

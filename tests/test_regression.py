@@ -86,7 +86,9 @@ def test_counts_are_exact(script: ModuleType, stored: dict, instead, capsys, nam
     assert f"{name}: {stored['counts'][name]}, stored {stored['counts'][name] + 1}" in capsys.readouterr().out
 
 
-def test_what_is_nan_missing_or_not_stored_is_noticed(script: ModuleType, stored: dict, instead, tmp_path: Path, capsys):
+def test_what_is_nan_missing_or_not_stored_is_noticed(
+    script: ModuleType, stored: dict, instead, tmp_path: Path, capsys
+):
     instead(stored | {"numbers": stored["numbers"] | {"kinetic": {"unit": "J", "value": float("nan")}}})
     assert script.main([SCENE]) == 1
     instead(stored | {"numbers": {name: x for name, x in stored["numbers"].items() if name != "kinetic"}})

@@ -373,12 +373,17 @@ def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
 
 def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
     panels, triangles, camera = drawing
-    with pytest.raises(InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"):
+    with pytest.raises(
+        InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"
+    ):
         render.draw(100 * panels, triangles, camera, tmp_path / "y.png")
     monkeypatch.setattr(render, "WIDEST", 2000)
     monkeypatch.setattr(render, "surface_points", lambda *_: pytest.fail("a surface was read"))
     for options in ({"count": 10**9}, {"frames": list(range(11))}):
-        with pytest.raises(InputError, match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000"):
+        with pytest.raises(
+            InputError,
+            match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000",
+        ):
             render.contact_sheet(result, tmp_path / "y.png", **options)
     assert not (tmp_path / "y.png").exists()
 

@@ -202,15 +202,28 @@ def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = typed_rows(*NOISY, *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm") for n, t in ((10, 0.1), (99, 1.0))))
+    rows = typed_rows(
+        *NOISY,
+        *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm") for n, t in ((10, 0.1), (99, 1.0))),
+    )
     named = looks(row["label"] for row in rows)
-    (pareto,), (figure6,), (growth,) = pareto_charts(rows, named), figure6_charts(rows, named), growth_charts(rows, named)
+    (pareto,), (figure6,), (growth,) = (
+        pareto_charts(rows, named),
+        figure6_charts(rows, named),
+        growth_charts(rows, named),
+    )
 
     def whiskers(axes) -> set:
         found = [path.vertices for lines in axes.collections for path in lines.get_paths()]
         return {tuple(round(end, 9) for end in sorted(path[:, 1])) for path in found}
 
-    assert whiskers(pareto.figure.axes[0]) == {(0.009, 0.021), (0.009, 0.022), (0.02, 0.037), (0.014, 0.037), (0.022, 0.031)}
+    assert whiskers(pareto.figure.axes[0]) == {
+        (0.009, 0.021),
+        (0.009, 0.022),
+        (0.02, 0.037),
+        (0.014, 0.037),
+        (0.022, 0.031),
+    }
     assert (0.9, 2.1) in whiskers(pareto.figure.axes[1])
     assert whiskers(figure6.figure.axes[0]) == {(round(1 / 0.3, 9), 20.0), (round(1 / 3.0, 9), 2.0)}
     assert whiskers(growth.figure.axes[0]) == {(0.005, 0.03), (round(0.5 / 99, 9), round(3 / 99, 9))}
@@ -218,14 +231,19 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
         for axes in figure.figure.axes:
             low, high = axes.get_ylim()
             assert all(low <= end <= high for ends in whiskers(axes) for end in ends)
-    assert "least of the repeats: 9 ms\ngreatest of the repeats: 21 ms" in spaced(str(next(iter(pareto.points["over the step error, time step 10\N{NO-BREAK SPACE}ms"].values()))[0]))
+    assert "least of the repeats: 9 ms\ngreatest of the repeats: 21 ms" in spaced(
+        str(next(iter(pareto.points["over the step error, time step 10\N{NO-BREAK SPACE}ms"].values()))[0])
+    )
     once = pareto_charts(typed_rows(*ERRORS), looks(row["label"] for row in ERRORS))[0]
     assert not any(whiskers(axes) for axes in once.figure.axes)
 
 
 @pytest.mark.parametrize(
     ("ends", "expected"),
-    [((0.4, 0.6), "cg is faster than cholesky from 100,000 cells on"), ((0.4, 2.5), "cholesky and cg are as fast within their noise")],
+    [
+        ((0.4, 0.6), "cg is faster than cholesky from 100,000 cells on"),
+        ((0.4, 2.5), "cholesky and cg are as fast within their noise"),
+    ],
 )
 def test_within_the_noise_nothing_overtakes(ends: tuple[float, float], expected: str):
     rows = [
@@ -350,7 +368,7 @@ def test_the_whole_table_and_every_command_are_in_it(text: str):
 
 
 def test_labels_are_escaped(tmp_path: Path):
-    label = 'a<b>&"c\''
+    label = "a<b>&\"c'"
     rows = [case(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
     rows.append(case(label, status="failed", reason=label, scene=label))
     text = write_report(write_table(tmp_path, rows)).read_text()

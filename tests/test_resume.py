@@ -374,7 +374,9 @@ def test_no_two_hold_a_lock(tmp_path):
 
 @pytest.mark.parametrize("with_its_folder", [False, True])
 @pytest.mark.parametrize("another", [False, True])
-def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monkeypatch, capsys, with_its_folder, another):
+def test_a_file_that_is_removed_while_it_is_written(
+    whole: Path, tmp_path, monkeypatch, capsys, with_its_folder, another
+):
     """The run stops at its next checkpoint, and what it had is there to go on from."""
     folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
     path, advance = folder / "x.h5", Simulation.advance
@@ -394,7 +396,7 @@ def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monke
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     kept = folder / f"x.{os.getpid()}.h5" if another else path
     assert len(told) == 1 and "was removed while it was written" in told[0] and told[0].endswith(f"--resume {kept}")
-    assert os.listdir(folder) == [kept.name] or another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"])
+    assert os.listdir(folder) == [kept.name] or (another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"]))
     with h5py.File(kept) as file:
         assert max(file["checkpoint/step"]) == 18 and finished(file) == 7
     assert main(["run", "--resume", str(kept)]) == 0

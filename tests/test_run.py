@@ -126,7 +126,7 @@ def test_any_number_of_ranks_gives_the_same_file(msmpetsc, folder: Path, preset:
         moved = np.linalg.norm(one["frames/position"][:] - one["frames/position"][0])
         for name in ("position", "surface"):
             difference = np.linalg.norm(file["frames"][name][:] - one["frames"][name][:])
-            assert difference < 1e-8 * moved or name == "surface" and difference < 1e-6 * moved
+            assert difference < 1e-8 * moved or (name == "surface" and difference < 1e-6 * moved)
 
 
 def test_contact_is_the_same_on_two_ranks(msmpetsc, folder: Path, fall: h5py.File):

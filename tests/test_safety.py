@@ -21,7 +21,9 @@ GRAVITY = {"acceleration": [0, 0, -9.81]}
 
 def beam(folder: Path, **tables) -> Path:
     """A clamped beam of 32 cells that begins to swing under its weight."""
-    return block_scene(folder, np.array([1.0, 0.25, 0.25]), **{"time": TIME, "pin": CLAMPED, "gravity": GRAVITY} | tables)
+    return block_scene(
+        folder, np.array([1.0, 0.25, 0.25]), **{"time": TIME, "pin": CLAMPED, "gravity": GRAVITY} | tables
+    )
 
 
 def of(frames: list[Frame], name: str) -> np.ndarray:
@@ -117,10 +119,15 @@ def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.
     """One corner of a block is led through its cell, to the far side of the opposite corner."""
     corner = {"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}
     corner["path"] = [{"time": STEP, "by": [1.2 * CELL] * 3}]
-    model, frames = play(block_scene(tmp_path, time=TIME, anchor=[corner], material={"young_modulus": 1e5, "density": 1e6}))
+    model, frames = play(
+        block_scene(tmp_path, time=TIME, anchor=[corner], material={"young_modulus": 1e5, "density": 1e6})
+    )
     assert frames[0].inverted == 0 and frames[1].inverted == 1
     place = ", ".join(f"{CELL / 2:.4g}" for _ in range(3))
-    assert any(f"frame 1 (t = 0.0166667 s): 1 cell is inside out, the worst at rest at ({place}) m" in r.getMessage() for r in caplog.records)
+    assert any(
+        f"frame 1 (t = 0.0166667 s): 1 cell is inside out, the worst at rest at ({place}) m" in r.getMessage()
+        for r in caplog.records
+    )
 
 
 # ---- budgets
@@ -130,7 +137,11 @@ def test_a_budget_that_ends_far_off_is_told_once_and_summed_up(tmp_path: Path, c
     scene = beam(tmp_path, material={"young_modulus": 1e8, "density": 1000.0})
     _, frames = play(scene, "solver={preset='fast-msm', max_iterations=1}")
     far = [frame.index for frame in frames if frame.step_error > 0.3]
-    told = [record.getMessage() for record in caplog.records if "off their solution" in record.getMessage() or "off its" in record.getMessage()]
+    told = [
+        record.getMessage()
+        for record in caplog.records
+        if "off their solution" in record.getMessage() or "off its" in record.getMessage()
+    ]
     assert len(far) >= 2 and len(told) == 2
     assert told[0].startswith(f"frame {far[0]} (") and f"in {len(far)} frames" in told[1]
 

@@ -33,9 +33,15 @@ def clone(tmp_path: Path) -> Path:
 
 
 def set_up(clone: Path, *extras: str, **variables: str) -> subprocess.CompletedProcess:
-    environment = {"PATH": f"{clone / 'bin'}:{os.environ['PATH']}", "PYTHON": str(clone / "bin" / "python"), **variables}
+    environment = {
+        "PATH": f"{clone / 'bin'}:{os.environ['PATH']}",
+        "PYTHON": str(clone / "bin" / "python"),
+        **variables,
+    }
     command = [clone / "scripts" / "setup", *extras]
-    return subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30)
+    return subprocess.run(
+        command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30
+    )
 
 
 def test_pip_is_silent_and_not_asked_twice(clone: Path):
@@ -60,7 +66,8 @@ def test_what_pip_says_is_shown_where_it_fails_and_the_next_start_tries_again(cl
 
 
 @pytest.mark.parametrize(
-    ("words", "run"), [((), "1"), (("-x",), "1"), (("-m", "slow"), "2"), (("tests/test_a.py",), "12"), (("-k", "2"), "2")]
+    ("words", "run"),
+    [((), "1"), (("-x",), "1"), (("-m", "slow"), "2"), (("tests/test_a.py",), "12"), (("-k", "2"), "2")],
 )
 def test_slow_tests_are_run_where_they_are_chosen(tmp_path: Path, words: tuple, run: str):
     (tmp_path / "tests").mkdir()

@@ -27,7 +27,9 @@ def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
     material = {"young_modulus": 1e5, "density": 1000.0}
     output = {"surface": True, "every": EVERY}
     gravity = {"acceleration": [0.0, 1.0, -9.81]}
-    scene = dict(gravity=gravity, pin=side, time={"step": 0.01, "duration": 0.01 * steps}, material=material, output=output)
+    scene = dict(
+        gravity=gravity, pin=side, time={"step": 0.01, "duration": 0.01 * steps}, material=material, output=output
+    )
     return block_scene(folder, **scene | {"solver": {"preset": "newton", "error": 1e-3}} | tables)
 
 
@@ -120,7 +122,9 @@ def test_a_second_interrupt_stops_at_once(tmp_path, msmpetsc):
     """Both come within one step, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
     stiff = {"young_modulus": 1e9, "density": 1000.0}
-    scene = hanging(tmp_path, 2, cages={"cell_size": 1 / 48}, material=stiff, solver={"preset": "anderson", "error": 1e-9})
+    scene = hanging(
+        tmp_path, 2, cages={"cell_size": 1 / 48}, material=stiff, solver={"preset": "anderson", "error": 1e-9}
+    )
     process = start(scene, "-o", path, "-snes_max_it", "100000")
     with process:
         time.sleep(0.5)  # before the step begins, the first interrupt alone would end the run

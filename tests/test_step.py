@@ -166,6 +166,7 @@ def test_a_budget_is_kept_and_the_error_reported():
 
 def test_a_budget_may_be_more_than_a_preset_allows_itself(petsc_options):
     """A -snes_max_it of the user's stays what it is."""
+
     def most(budget: int) -> int:
         stepper = Stepper(COMM, beam(), T, find_preset("anderson"), max_iterations=budget)
         found = stepper.snes.getTolerances()[3]

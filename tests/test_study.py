@@ -95,7 +95,7 @@ def calls(folder: Path) -> list[str]:
         (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "'newton'"]),
         (ONE_SCENE + '[[sweep]]\nscenes = ["b"]', ["sweep", "'b'"]),
         (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be < 1"]),
-        (ONE_SCENE + "[[sweep]]\noptions = [\"-pc_type 'icc\"]", ["sweep.0.options.0", "no closing quotation"]),
+        (ONE_SCENE + '[[sweep]]\noptions = ["-pc_type \'icc"]', ["sweep.0.options.0", "no closing quotation"]),
         (ONE_SCENE + '[[sweep]]\nintegrators = ["verlett"]', ["sweep.0.integrators.0", "'verlet'"]),
         (ONE_SCENE + 'reference = { integrator = "implicit-euler" }\n[[sweep]]', ["scene.0.reference", "needs step"]),
         (ONE_SCENE + "steps = 3\nduration = 0.5\n[[sweep]]", ["scene.0.duration", "beside steps"]),
@@ -625,7 +625,9 @@ BEFORE = {
 }
 
 
-@pytest.mark.parametrize("method", [Method("verlet", 0.02), Method("implicit-euler", 0.005, "lbfgs", "", 1e-5)], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    "method", [Method("verlet", 0.02), Method("implicit-euler", 0.005, "lbfgs", "", 1e-5)], ids=["explicit", "implicit"]
+)
 @pytest.mark.parametrize("given", BEFORE)
 def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Method):
     """Run with these changes the scene is the same as with the answer written into it."""

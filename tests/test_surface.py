@@ -131,9 +131,7 @@ def test_polygons_are_cut_into_triangles(tmp_path):
     packed = b"".join(struct.pack(f"<B{len(f)}i", len(f), *f) for f in faces)
     contents = {
         "ascii.ply": (header.format("ascii") + "\n".join(text_points + rows)).encode(),
-        "binary.ply": header.format("binary_little_endian").encode()
-        + struct.pack("<18f", *sum(points, ()))
-        + packed,
+        "binary.ply": header.format("binary_little_endian").encode() + struct.pack("<18f", *sum(points, ())) + packed,
         "prism.obj": "\n".join(obj).encode(),
         "prism.off": "\n".join(["OFF", "6 5 0", *text_points, *rows]).encode(),
     }
@@ -241,8 +239,7 @@ def test_a_small_file_that_claims_much_allocates_little(tmp_path):
     hollow = {
         "ascii.ply": PLY_HEADER.format("ascii", rows, rows),
         "binary.ply": PLY_HEADER.format("binary_little_endian", rows, rows),
-        "big.vtk": "# vtk DataFile Version 3.0\nx\nBINARY\nDATASET UNSTRUCTURED_GRID\n"
-        f"POINTS {rows} double\n",
+        "big.vtk": f"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET UNSTRUCTURED_GRID\nPOINTS {rows} double\n",
         "big.off": f"OFF\n{rows} {rows} 0\n",
         "big.gltf": json.dumps(gltf),
     }
@@ -256,9 +253,7 @@ def test_a_small_file_that_claims_much_allocates_little(tmp_path):
         assert peak < 1e8, name
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     kind=st.sampled_from(["ply", "obj", "stl", "off", "glb", "mz3", "vtu", "vtk"]),
     damage=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=8),
@@ -314,9 +309,7 @@ def test_volume_does_not_depend_on_place_or_numbering(shift, seed, sides):
     rng = np.random.default_rng(seed)
     surface = box(sides)
     order = rng.permutation(8)
-    moved = Surface(
-        (surface.points + shift)[order], np.argsort(order)[surface.triangles][rng.permutation(12)]
-    )
+    moved = Surface((surface.points + shift)[order], np.argsort(order)[surface.triangles][rng.permutation(12)])
     assert examine(moved).volume == pytest.approx(np.prod(sides), rel=1e-6)
     inwards = Surface(moved.points, moved.triangles[:, ::-1])
     assert examine(inwards).volume == pytest.approx(-np.prod(sides), rel=1e-6)

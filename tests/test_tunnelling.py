@@ -100,7 +100,7 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
     deeper = q - [0, 0, 0.01]
     assert contact.change(deeper, q) == pytest.approx(contact.energy(deeper) - contact.energy(q))
     assert contact.bound(q).tolist() == [50, 50, 50, 0]
-    (nodes, blocks), = contact.hessian(q, true=True)
+    ((nodes, blocks),) = contact.hessian(q, true=True)
     assert nodes.tolist() == [0, 1, 2] and (blocks == 50 * np.diag([0, 0, 1])).all()
 
 
@@ -199,7 +199,11 @@ def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path, integrator: str):
 
 def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_path: Path, monkeypatch):
     """As the test has it: the first step never is, its halves are."""
-    path, alike, asked = against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False), Surroundings.pushes_alike, []
+    path, alike, asked = (
+        against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False),
+        Surroundings.pushes_alike,
+        [],
+    )
 
     def stuck(around: Surroundings, *given) -> bool:
         asked.append(0)
@@ -253,7 +257,13 @@ def test_bdf2_gains_nothing_where_it_reflects(tmp_path: Path, restitution: float
         floor = {"shape": "box", "box": [[-9, -9, -0.602], [9, 9, -0.6]]}
     time = {"step": 0.001, "duration": 0.1, "integrator": "bdf2"}
     gravity = {"acceleration": [0, 0, -9.81]}
-    path = ball(tmp_path, time=time, gravity=gravity, start={"velocity": [0, 0, -10.0]}, obstacle=[floor | {"restitution": restitution}])
+    path = ball(
+        tmp_path,
+        time=time,
+        gravity=gravity,
+        start={"velocity": [0, 0, -10.0]},
+        obstacle=[floor | {"restitution": restitution}],
+    )
     model, frames = play(path)
     total = totals(frames)
     assert total.max() <= total[0] * (1 + 1e-6)

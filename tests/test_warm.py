@@ -60,4 +60,3 @@ def test_it_is_ended_when_it_takes_too_long(tmp_path: Path, processes: Processes
     ended, _ = carry_out(processes, path, timeout=3)
     assert ended.status is None and "longer than 3 s" in ended.reason
     assert began and not any(map(alive, began))
-

@@ -12,7 +12,9 @@ def add_parser(subparsers) -> None:
     """Add the command to argparse's `subparsers`."""
     parser = subparsers.add_parser("render", help="draw some moments of a result side by side")
     parser.add_argument("result", metavar="OUT.h5", type=file_argument)
-    parser.add_argument("-o", "--output", metavar="PNG", type=file_argument, help="default: beside the result, ending in .png")
+    parser.add_argument(
+        "-o", "--output", metavar="PNG", type=file_argument, help="default: beside the result, ending in .png"
+    )
     parser.add_argument("--frames", metavar="0,10,20", help="these frames, in this order")
     parser.add_argument(
         "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"

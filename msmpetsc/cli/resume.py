@@ -72,7 +72,9 @@ def _stored_options(earlier: Earlier, given: Collection[str]) -> Iterator[str]:
         if name in given or OF_NO_EFFECT.search(name):
             continue
         if beside_solving(words):
-            raise InputError(f"{earlier.path} was run with {' '.join(words)}, which is not taken from a file: give it again")
+            raise InputError(
+                f"{earlier.path} was run with {' '.join(words)}, which is not taken from a file: give it again"
+            )
         yield from words
 
 
@@ -107,7 +109,9 @@ class Resumed:
         if fixed:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
         if (version := earlier.texts.get("msmpetsc_version")) != __version__:
-            log.warning("%s was begun by msmpetsc %s, this is %s", earlier.path, printable(str(version), 20), __version__)
+            log.warning(
+                "%s was begun by msmpetsc %s, this is %s", earlier.path, printable(str(version), 20), __version__
+            )
 
     @property
     def is_done(self) -> bool:

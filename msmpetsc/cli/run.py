@@ -67,14 +67,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--checkpoint-every", metavar="N", help="frames, or 30s, 5min, 2h; default: as takes 1%% of the time at most"
     )
     parser.add_argument(
-        "--gather", action="store_true", help="let rank 0 write for all: where nodes of a cluster do not see one file alike"
+        "--gather",
+        action="store_true",
+        help="let rank 0 write for all: where nodes of a cluster do not see one file alike",
     )
     parser.add_argument("--compress", action="store_true", help="pack the finished OUT.h5: smaller, slower to read")
     parser.add_argument(
         "--true-error", type=int, metavar="N", help="also solve every N-th step to rounding, and store its true error"
     )
     parser.add_argument("--trace", type=int, metavar="K", help="follow the iterates of step K (needs --measure)")
-    parser.add_argument("--measure", type=file_argument, metavar="OUT.json", help="write what the run cost: times, memory")
+    parser.add_argument(
+        "--measure", type=file_argument, metavar="OUT.json", help="write what the run cost: times, memory"
+    )
     parser.add_argument(
         "--show-options", action="store_true", help="say which PETSc options a preset sets, as an options file"
     )
@@ -112,7 +116,10 @@ def run(args: argparse.Namespace) -> int:
     from msmpetsc.model.build import build_model
     from msmpetsc.solve.device import choose
     from msmpetsc.solve.options import refuse_early
-    from msmpetsc.solve.simulate import Simulation, refuse_bad_options  # imports PETSc, which reads its options only once
+    from msmpetsc.solve.simulate import (
+        Simulation,
+        refuse_bad_options,
+    )  # imports PETSc, which reads its options only once
 
     refuse_early(comm, args.parser._option_string_actions)
     choose(comm, args.device)

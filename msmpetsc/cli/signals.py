@@ -22,7 +22,7 @@ class Interval:
     def __init__(self, text: str | None):
         """text: "3", "5min", or None. Raises InputError."""
         found = re.fullmatch(r"(\d{1,18})(s|min|h)?", text or "0s", re.ASCII)
-        if not found or text and not int(found[1]):
+        if not found or (text and not int(found[1])):
             raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {text}")
         self.frames = None if found[2] else int(found[1])
         self.seconds = 0.0 if found[2] is None else float(found[1]) * SECONDS[found[2]]

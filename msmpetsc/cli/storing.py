@@ -65,7 +65,7 @@ def write_frames(
                     file.append(frame)
                 count += 1
                 progress.update(frame)
-            due = comm.rank == 0 and interval.due(frame is not None) or simulation.step in (0, simulation.steps)
+            due = (comm.rank == 0 and interval.due(frame is not None)) or simulation.step in (0, simulation.steps)
             due, signal = signals.agree(due)
             if due:
                 began = perf_counter()

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def part_of(text: str | None):
-    """"3/16" as the third of 16 parts. Raises InputError."""
+    """ "3/16" as the third of 16 parts. Raises InputError."""
     from msmpetsc.study.study import Part
 
     if text is None:

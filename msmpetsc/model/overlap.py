@@ -28,4 +28,6 @@ def overlap(
     deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
     nodes = f"{count} node{'s' if count > 1 else ''}"
     place = place_of_greatest(comm, lattice, rows, inside[rows])
-    return f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {place}"
+    return (
+        f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {place}"
+    )

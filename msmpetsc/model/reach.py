@@ -104,9 +104,7 @@ def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.n
     return reduce(np.logical_or, lasting, pinned)
 
 
-def _warn_of_idle_parts(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder
-) -> None:
+def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder) -> None:
     """Of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
     if not scene.part:
         return

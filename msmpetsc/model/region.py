@@ -55,7 +55,9 @@ class Finder:
         def cells() -> np.ndarray:
             points, numbers = self.body.surface.points, np.array(self._numbers(key, painted))
             if numbers.max() >= len(points):
-                raise InputError(f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}")
+                raise InputError(
+                    f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}"
+                )
             return np.unique(self.cages.grid.to_cells(points[numbers]).astype(np.int64), axis=0)
 
         return self.body.comm.bcast(on_root(self.body.comm, cells))

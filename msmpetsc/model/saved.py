@@ -49,4 +49,6 @@ class Saved:
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():
                 if self.rows[name].shape != like.rows[name].shape or not np.isfinite(self.rows[name]).all():
-                    raise InputError(f"the checkpoint is damaged: {name} is not of finite numbers, {like.rows[name].shape}")
+                    raise InputError(
+                        f"the checkpoint is damaged: {name} is not of finite numbers, {like.rows[name].shape}"
+                    )

@@ -31,7 +31,7 @@ def inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int, str]
 
 
 def inside_out(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> str:
-    """", 3 cells are inside out", and what to do about it; "" if none is (collective)."""
+    """ ", 3 cells are inside out", and what to do about it; "" if none is (collective)."""
     count, _ = inverted(comm, lattice, q)
     if not count:
         return ""

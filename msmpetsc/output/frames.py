@@ -257,7 +257,9 @@ class ResultFile:
         if not self.path.exists():
             copy = copy.rename(self.path)
         command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
-        raise InputError(f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}")
+        raise InputError(
+            f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}"
+        )
 
     def _finish(self, trim: bool) -> None:
         for descriptor in (self._direct, self._same):
@@ -324,7 +326,6 @@ class ResultFile:
                     self._comm.Send(rows[part], dest=0)
             else:
                 _receive(self._comm, rows, counts, store)
-
 
     def _write_directly(self, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
         chunk, places = 0, []

@@ -109,7 +109,12 @@ def read_scene(file: h5py.File) -> SceneFile:
     """The scene of a result, as run."""
     try:
         return SceneFile.model_validate(tomllib.loads(file.attrs.get("scene", "")))
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:  # pydantic's, tomllib's, of what is no text
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:  # pydantic's, tomllib's, of what is no text
         raise InputError(f"{file.filename} was run by another version, with a scene unknown to this one") from error
 
 

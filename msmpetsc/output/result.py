@@ -189,7 +189,7 @@ def refuse_deadly(path: Path) -> None:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             signal.alarm(PATIENCE)
             _look_at_all(path)
-        except BaseException:  # noqa: S110 - what can be told is told by who reads it
+        except BaseException:
             pass
         finally:
             os._exit(0)
@@ -222,9 +222,13 @@ def read_checkpoint(file: h5py.File, rows: slice = slice(None)) -> tuple[int, np
     with damage_told(path):
         if _held(path, file, "checkpoint") is None:
             return None
-        steps, q, q_previous = (checked_dataset(path, file, f"checkpoint/{name}") for name in ("step", "q", "q_previous"))
+        steps, q, q_previous = (
+            checked_dataset(path, file, f"checkpoint/{name}") for name in ("step", "q", "q_previous")
+        )
         if steps.shape != (2,) or not q.shape == q_previous.shape == (2, q.shape[1], 3):
-            raise InputError(f"{path} is damaged: its checkpoint has shapes {steps.shape}, {q.shape}, {q_previous.shape}")
+            raise InputError(
+                f"{path} is damaged: its checkpoint has shapes {steps.shape}, {q.shape}, {q_previous.shape}"
+            )
         slot = int(np.argmax(steps))
         step = int(steps[slot])
         return None if step < 0 else (step, q[slot, rows], q_previous[slot, rows])
@@ -252,7 +256,7 @@ def checked_checkpoint(file: h5py.File) -> list[str] | None:
             else:
                 shape = (2,) if name == "step" else (2, nodes, *dataset.shape[2:])
             kind = "i8" if name == "step" else "f8"
-            if dataset.shape != shape or dataset.dtype != kind or name == "numbers" and len(names) != shape[1]:
+            if dataset.shape != shape or dataset.dtype != kind or (name == "numbers" and len(names) != shape[1]):
                 raise InputError(f"{path} is damaged: checkpoint/{name} has shape {dataset.shape}")
         if not {"step", "q", "q_previous"} <= set(group):
             raise InputError(f"{path} is damaged: its checkpoint is not whole")

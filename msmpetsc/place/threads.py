@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Hashable
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import cupy
 import numba
@@ -17,7 +17,7 @@ THREADS = 128  # of a block: registers, not their number, bound the kernels that
 KEPT = 4096  # arrays that numba has seen
 
 
-@lru_cache(maxsize=None)
+@cache
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
     """What place.each calls: one thread for each index below a count, in CuPy's current stream."""
     kernel, known = kernel_of(body), {}
@@ -52,7 +52,9 @@ def as_argument(value: np.ndarray | float) -> tuple[Hashable, np.ndarray | float
 
 
 @lru_cache(maxsize=KEPT)
-def _seen_by_numba(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str) -> tuple[Hashable, object]:
+def _seen_by_numba(
+    pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str
+) -> tuple[Hashable, object]:
     """It owns nothing; made once, for that takes longer than a launch."""
     told = {"data": (pointer, False), "shape": shape, "strides": strides, "typestr": kind, "version": 3}
     array = cuda.from_cuda_array_interface(told, sync=False)

@@ -153,9 +153,7 @@ class EnergyBalance:
         own = after.q is not result.position or after.q_previous is not result.previous
         return self.comm.allreduce(own, MPI.LOR)
 
-    def _start(
-        self, before: State, result: StepResult, after: State, time: float, time_step: float
-    ) -> np.ndarray:
+    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> np.ndarray:
         """Of the right side of the balance the energies, and the push in them, the work of loads and of obstacles that
         drag, and that which the step counted itself; and its swing [J] (collective)."""
         lattice, around = self.lattice, self.around

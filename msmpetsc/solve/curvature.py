@@ -228,7 +228,9 @@ class LowestCurvature:
 
     def restore(self, saved: Saved) -> None:
         """Go on from there; from nothing saved as if no step had been taken."""
-        self.searched = Compression(saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False)
+        self.searched = Compression(
+            saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False
+        )
         self.mode = None
         if saved.count("knows_mode", 1):
             rows = beside(self.functional.mass, saved.row("lowest_mode"))

@@ -24,9 +24,7 @@ MOST = 512
 class ErrorEstimate:
     """Estimates |x - x*|_M of a step; ``correction`` is the e it found, ``residual`` what F - H e is left."""
 
-    def __init__(
-        self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str
-    ):
+    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str):
         self.functional, self.hessian = functional, hessian
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
         self.correction, self.residual = self.operator.createVecs()

@@ -21,7 +21,6 @@ from msmpetsc.solve.reference import PREFIX, Problem, Reference
 from msmpetsc.solve.state import State
 from msmpetsc.solve.step import Stepper, StepResult
 
-
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 
 

@@ -78,7 +78,7 @@ def _check_file(name: str, option: str, depth: int) -> None:
 
 def _is_an_option(tokens: list[str]) -> bool:
     """Whether PETSc takes the tokens of a line: an option, with or without a value; an alias; nothing."""
-    if not tokens or tokens[0] == "alias" and len(tokens) == 3:
+    if not tokens or (tokens[0] == "alias" and len(tokens) == 3):
         return True
     value = tokens[1] if len(tokens) > 1 else ""
     return bool(OPTION.match(tokens[0])) and len(tokens) <= 2 and not re.match("-[A-Za-z]", value)

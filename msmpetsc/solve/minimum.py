@@ -18,7 +18,9 @@ from msmpetsc.solve.functional import StepFunctional
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
 DOUBTFUL = 30.0  # times what both say may then be the error: it was seen 10 times as large in a valley
-SLOPE = 0.25  # over what the curvature makes of it on the first move: a less one, as of a symmetric body, may be rounding
+SLOPE = (
+    0.25  # over what the curvature makes of it on the first move: a less one, as of a symmetric body, may be rounding
+)
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 

@@ -139,10 +139,10 @@ class Preconditioner:
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
 
-    def setFromOptions(self, _: PETSc.PC) -> None:  # noqa: N802 (PETSc's name)
+    def setFromOptions(self, _: PETSc.PC) -> None:
         self.pc.setFromOptions()
 
-    def setUp(self, _: PETSc.PC) -> None:  # noqa: N802
+    def setUp(self, _: PETSc.PC) -> None:
         self.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:

@@ -17,7 +17,9 @@ from msmpetsc.solve.library import Integer, library_file, open_viewer, petsc_lib
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
 
-READ_AT_THE_END = re.compile(r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$")
+READ_AT_THE_END = re.compile(
+    r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
+)
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
 SWITCHES_READ_AT_THE_END = ("options_left", "get_total_flops", "mpidump")
 VIEWERS_READ_AT_THE_END = ("log_view", "options_view", "memory_view")

@@ -212,7 +212,9 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
         line = f"-{name} {_quoted(value)}".rstrip()
-        lines.append(f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line)
+        lines.append(
+            f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line
+        )
     for names in ours.values():
         forget_defaults(names)
     return lines

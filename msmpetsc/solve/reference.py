@@ -36,9 +36,7 @@ class Reference:
     def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool):
         self.stage = PETSc.Log.Stage(STAGE)
         self.stage.push()
-        self.stepper = Stepper(
-            comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX
-        )
+        self.stepper = Stepper(comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX)
         self.stepper.set_up()
         self.stage.pop()
 

@@ -46,9 +46,7 @@ class Rescue:
     attempt : (integrator, state, time, time step) -> result and state of a step that ends at ``time``, or StepFailed
     """
 
-    def __init__(
-        self, comm: MPI.Comm, model: Model, surroundings: Surroundings, wanted: scene.Scene, attempt: Attempt
-    ):
+    def __init__(self, comm: MPI.Comm, model: Model, surroundings: Surroundings, wanted: scene.Scene, attempt: Attempt):
         self.comm, self.model, self.around, self.scene, self.attempt = comm, model, surroundings, wanted, attempt
         self.on_failure, self.time_step = wanted.safety.on_failure, wanted.time.step
         self.spare: dict[int, ImplicitEuler | Verlet] = {}  # by how often the step is halved
@@ -130,7 +128,9 @@ class Rescue:
             self.spare[level].set_up()
         result, after = self.attempt(self.spare[level], state.over(self.time_step, short), time, short)
         done.add(result)
-        result = replace(result, previous=State(result.position, result.previous).over(short, self.time_step).q_previous)
+        result = replace(
+            result, previous=State(result.position, result.previous).over(short, self.time_step).q_previous
+        )
         return result, after.over(short, self.time_step)
 
     def _new(self, short: float) -> ImplicitEuler | Verlet:

@@ -160,7 +160,10 @@ class Simulation:
             part.restore(saved)
         known = {name: value for name, value in vars(Effort()).items() if name in saved.numbers}
         self.effort = Effort(
-            **{name: saved.count(name) if isinstance(value, int) else saved.numbers[name] for name, value in known.items()}
+            **{
+                name: saved.count(name) if isinstance(value, int) else saved.numbers[name]
+                for name, value in known.items()
+            }
         )
 
     def _step(self, index: int) -> tuple[StepResult, Done]:

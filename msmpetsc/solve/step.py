@@ -21,7 +21,12 @@ from msmpetsc.solve.functional import StepFunctional
 from msmpetsc.solve.library import total_iterations
 from msmpetsc.solve.minimum import Minimum
 from msmpetsc.solve.operators import (
-    ContactBlocks, Preconditioned, Preconditioner, ThreeColumns, TrueHessian, python_matrix,
+    ContactBlocks,
+    Preconditioned,
+    Preconditioner,
+    ThreeColumns,
+    TrueHessian,
+    python_matrix,
 )  # fmt: skip
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.refusal import refusal
@@ -257,7 +262,7 @@ class Stepper:
             self.x, self.corrected, compression, self.alarmed, enough * away if enough else np.inf
         )
         self.last_error = finding.error
-        if self.budget or finding.error <= enough or self.at_rounding and not np.isinf(finding.error):  # x = y: 0 / 0
+        if self.budget or finding.error <= enough or (self.at_rounding and not np.isinf(finding.error)):  # x = y: 0 / 0
             return True
         self.doubts += 1
         if not self.minimum.go_on(self.x, finding):

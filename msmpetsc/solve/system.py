@@ -14,9 +14,7 @@ from msmpetsc.solve.limits import refuse_nonzeros
 from msmpetsc.solve.unknowns import Unknowns
 
 
-def assemble(
-    comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int = 1, prefix: str = ""
-) -> PETSc.Mat:
+def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int = 1, prefix: str = "") -> PETSc.Mat:
     """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
 
     columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A

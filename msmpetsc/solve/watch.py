@@ -39,7 +39,11 @@ class Watch:
         """The estimated error of a frame's steps."""
         if not error <= FAR:
             if not self.far:
-                off = f"{error:.2g} off its solution, relative to what forces moved" if np.isfinite(error) else "with no minimum near"
+                off = (
+                    f"{error:.2g} off its solution, relative to what forces moved"
+                    if np.isfinite(error)
+                    else "with no minimum near"
+                )
                 log.warning(
                     "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their place, "
                     "or a smaller time.step mend that",

@@ -225,9 +225,7 @@ def _run(bench: Bench, case: Case) -> Row:
     return row
 
 
-def _case(
-    file: Path, changes: Sequence[str], options: str, scene: Scene, mesh: Path, cells: int, frames: int
-) -> Case:
+def _case(file: Path, changes: Sequence[str], options: str, scene: Scene, mesh: Path, cells: int, frames: int) -> Case:
     """The scene's first frames on so many cells, its surface as it was prepared."""
     cages = scene.cages.model_dump(exclude_unset=True, exclude={"cell_size", "max_cells"}) | {"count": cells}
     time = scene.time

@@ -24,7 +24,17 @@ from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.charts.svg import save_png, svg_text
 from msmpetsc.study.outcome import counted
 from msmpetsc.study.rows import (
-    NUMBERS, TEXT, Row, failed, grouped, mapped, read_rows, read_traces, stepping, swept, timed,
+    NUMBERS,
+    TEXT,
+    Row,
+    failed,
+    grouped,
+    mapped,
+    read_rows,
+    read_traces,
+    stepping,
+    swept,
+    timed,
 )  # fmt: skip
 from msmpetsc.study.spread import UNKNOWN, is_known
 
@@ -71,7 +81,11 @@ def study_file(folder: Path) -> dict:
 
 def title(folder: Path, rows: list[Row]) -> str:
     """The title in study.toml, else the name in the table, else that of the folder."""
-    return str(study_file(folder).get("title") or next((row["study"] for row in rows if row["study"]), "") or folder.resolve().name)
+    return str(
+        study_file(folder).get("title")
+        or next((row["study"] for row in rows if row["study"]), "")
+        or folder.resolve().name
+    )
 
 
 def measured_on(folder: Path) -> str:

@@ -123,7 +123,7 @@ def _fill(file: h5py.File, rows: Sequence[Row]) -> None:
 
 def _text(value: Any) -> str:
     """The same for a value as it came and as it was read again: a count comes back as a float."""
-    if value is None or isinstance(value, float) and math.isnan(value):
+    if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     if isinstance(value, float):
         return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))

@@ -30,6 +30,6 @@ def open(path: str | Path) -> "Result":  # noqa: F821
 
     Raises InputError, one line, if the file is no result, or damaged.
     """
-    from msmpetsc.output.result import Result  # here: the package itself stays quick to import
+    from msmpetsc.output.reader import Result  # here: the package itself stays quick to import
 
     return Result(path)

@@ -10,12 +10,15 @@ import pytest
 import trimesh
 
 ROOT = Path(__file__).parent.parent
+WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
 SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}  # more ranks than cores: who waits makes room
 # Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with IPv6; ranks of one machine need none
 ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}
 # As this process was started: its own MPI, once awake, leaves marks that would confuse a child's.
-PATHS = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))  # petsc4py may be found by it
+PATHS = os.pathsep.join(
+    filter(None, (str(ROOT), str(ROOT / "tests" / "helpers"), os.environ.get("PYTHONPATH")))
+)  # petsc4py may be found by it
 ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": PATHS, "OMP_NUM_THREADS": "1", **SHARED_CORES, **ONE_MACHINE}
 
 Run = Callable[..., subprocess.CompletedProcess]

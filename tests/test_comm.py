@@ -1,10 +1,9 @@
 """Rows travel, keys are numbered and errors are shared the same on any number of ranks."""
 
-from pathlib import Path
-
 import pytest
+from conftest import WORKERS
 
-WORKER = Path(__file__).parent / "comm_worker.py"
+WORKER = WORKERS / "comm_worker.py"
 
 
 @pytest.mark.parametrize("ranks", [1, 2, 3, 4])

@@ -15,9 +15,9 @@ from conftest import run
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import find
 from msmpetsc.model.inversion import least_volumes
-from msmpetsc.model.motion import Path as Motion
+from msmpetsc.model.paths import Path as Motion
 from msmpetsc.model.region import inside
-from msmpetsc.scene import SceneFile
+from msmpetsc.scene.schema import SceneFile
 
 SCENES = Path(__file__).parents[1] / "scenes"
 PAPER_CELLS = {"armadillo": 8338, "dragon": 11536, "lung": 6499, "heart": 3126, "bunny": 9946, "brain": 13661}

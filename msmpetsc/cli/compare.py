@@ -6,8 +6,8 @@ import numpy as np
 
 from msmpetsc.cli.arguments import file_argument, refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.comparison import AT_REST, Comparison, Field, compare, place
-from msmpetsc.output.result import Result, refuse_deadly
+from msmpetsc.output.compare import AT_REST, Comparison, Field, compare, place
+from msmpetsc.output.reader import Result, refuse_deadly
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"

@@ -11,17 +11,17 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_ranks
-from msmpetsc.cli.cost import peak_memory
+from msmpetsc.cli.profile import peak_memory
 from msmpetsc.cli.study import stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.scene import Scene
-from msmpetsc.scene_reading import load_scene
-from msmpetsc.solve.initialise import initialise
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
+from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:
     from msmpetsc.geometry.surface import Surface
-    from msmpetsc.model.shares import Shares
+    from msmpetsc.model.partition import Shares
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
     refuse_bad_numbers(args)
     initialise(MPI.COMM_WORLD, args.petsc_options)
     from msmpetsc.model.build import read_body
-    from msmpetsc.model.shares import shares_of
-    from msmpetsc.solve.options import refuse_early
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.model.partition import shares_of
+    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.petsc.options import refuse_early
 
     refuse_early(MPI.COMM_WORLD, args.parser._option_string_actions)
     signal.signal(signal.SIGTERM, stop)
@@ -137,7 +137,7 @@ def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", share
 
 def tell_limits(shares: "Shares") -> None:
     """At how many cells of this body, on as many ranks, integers end."""
-    from msmpetsc.solve.limits import BITS, LARGEST, LARGEST_COUNT
+    from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
 
     petsc = f"{BITS}-bit PetscInt"
     ends = {

@@ -25,8 +25,8 @@ def add_parser(subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw and name the picture; returns the exit status."""
+    from msmpetsc.output.reader import refuse_deadly
     from msmpetsc.output.render import contact_sheet  # here: the other commands need no graphics
-    from msmpetsc.output.result import refuse_deadly
 
     refuse_ranks("render", "it draws on one process")
     refuse_below_one(args, "count")

@@ -14,11 +14,11 @@ from msmpetsc.cli.arguments import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.output.continued import Anew, InPlace
-from msmpetsc.output.earlier import Earlier, read_saved, refuse_other_lattice
-from msmpetsc.output.frames import ResultFile
-from msmpetsc.output.result import refuse_deadly
-from msmpetsc.scene import Scene
-from msmpetsc.scene_reading import load_scene, scene_of
+from msmpetsc.output.reader import refuse_deadly
+from msmpetsc.output.restart import Earlier, read_saved, refuse_other_lattice
+from msmpetsc.output.writer import ResultFile
+from msmpetsc.scene.reading import load_scene, scene_of
+from msmpetsc.scene.schema import Scene
 from msmpetsc.study.schema import beside_solving
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options

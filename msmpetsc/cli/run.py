@@ -21,22 +21,22 @@ from msmpetsc.cli.arguments import (
     refuse_below_one,
     refuse_other_format,
 )
-from msmpetsc.cli.cost import Cost, refuse_unwritable, versions
 from msmpetsc.cli.describe import log_end, log_model
 from msmpetsc.cli.failure import ending_together
+from msmpetsc.cli.profile import Cost, refuse_unwritable, versions
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.cli.signals import Interval, Signals
 from msmpetsc.cli.storing import tell_stop, write_frames, write_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.output.earlier import Earlier
-from msmpetsc.output.frames import ResultFile
+from msmpetsc.output.restart import Earlier
+from msmpetsc.output.writer import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
-from msmpetsc.scene import Scene, Solver
-from msmpetsc.solve.initialise import initialise
+from msmpetsc.scene.schema import Scene, Solver
+from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
-    from msmpetsc.solve.measured import Measured
+    from msmpetsc.solve.instrumentation import Measured
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -92,7 +92,7 @@ class ListPresets(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_) -> None:
-        from msmpetsc.solve.presets import PRESETS
+        from msmpetsc.solve.nonlinear.presets import PRESETS
 
         if MPI.COMM_WORLD.rank == 0:
             width = max(map(len, PRESETS))
@@ -110,12 +110,12 @@ def run(args: argparse.Namespace) -> int:
     earlier = resume.look(comm, args)
     initialise(comm, args.petsc_options)
     np.seterr(all="ignore")  # what overflows ends in the residual of a step, which says so in one line
-    from msmpetsc.place.compiling import cache_is_empty, compilation_logged
+    from msmpetsc.backend.compiling import cache_is_empty, compilation_logged
 
     all_are_new = cache_is_empty()
     from msmpetsc.model.build import build_model
-    from msmpetsc.solve.device import choose
-    from msmpetsc.solve.options import refuse_early
+    from msmpetsc.solve.petsc.device import choose
+    from msmpetsc.solve.petsc.options import refuse_early
     from msmpetsc.solve.simulate import (
         Simulation,
         refuse_bad_options,
@@ -180,9 +180,9 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
     earlier = resume.look(comm, args) if args.scene or args.resume else None
     initialise(comm, args.petsc_options)
-    from msmpetsc.solve.device import choose
-    from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
-    from msmpetsc.solve.presets import find_preset, shown_options
+    from msmpetsc.solve.nonlinear.presets import find_preset, shown_options
+    from msmpetsc.solve.petsc.device import choose
+    from msmpetsc.solve.petsc.options import refuse_bad_values, refuse_early, tell_none_left
     from msmpetsc.solve.simulate import solvers_of
 
     refuse_early(comm, args.parser._option_string_actions)
@@ -202,7 +202,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
 
 def what_is_measured(args: argparse.Namespace) -> "Measured":
     """Raises InputError for numbers of steps that are none."""
-    from msmpetsc.solve.measured import Measured, begin_timing
+    from msmpetsc.solve.instrumentation import Measured, begin_timing
 
     refuse_below_one(args, "true_error", "trace")
     if args.trace is not None and args.measure is None:
@@ -233,7 +233,7 @@ def finish(path: Path, args: argparse.Namespace) -> None:
     """The result file packed if that was asked for, and what stands beside it. Raises InputError where that cannot be
     written."""
     if args.compress:
-        from msmpetsc.output.packed import pack
+        from msmpetsc.output.compress import pack
 
         pack(path)
     write_beside(path)
@@ -245,7 +245,7 @@ def finish(path: Path, args: argparse.Namespace) -> None:
 
 def read_scene(args: argparse.Namespace, earlier: Earlier | None) -> Scene:
     """The scene with what the command line changes; --set comes last and wins."""
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.nonlinear.presets import PRESETS
 
     changes = []
     if args.preset is not None:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.cli.cost import Cost
+from msmpetsc.cli.profile import Cost
 from msmpetsc.cli.signals import STATUS, Interval, Signals
 from msmpetsc.comm import log
-from msmpetsc.output.frames import ResultFile
 from msmpetsc.output.progress import Progress
+from msmpetsc.output.writer import ResultFile
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.model.build import Model

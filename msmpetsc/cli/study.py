@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     refuse_below_one(args, "jobs")
     refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
-    from msmpetsc.solve.presets import PRESETS
-    from msmpetsc.study.study import run_study
+    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.study.runner import run_study
 
     signal.signal(signal.SIGTERM, stop)
     folder = args.output or Path("out") / args.study.stem
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 def part_of(text: str | None):
     """ "3/16" as the third of 16 parts. Raises InputError."""
-    from msmpetsc.study.study import Part
+    from msmpetsc.study.runner import Part
 
     if text is None:
         return None
@@ -74,9 +74,9 @@ def part_of(text: str | None):
 
 def tell_cases(args: argparse.Namespace, folder: Path) -> None:
     """A line a case; its number is the I of --part I/N, where N is the number of cases."""
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.nonlinear.presets import PRESETS
     from msmpetsc.study.case import shown_command
-    from msmpetsc.study.study import list_study
+    from msmpetsc.study.runner import list_study
 
     listed = list_study(args.study, folder, PRESETS, args.full)
     for number, (case, done) in enumerate(listed, 1):

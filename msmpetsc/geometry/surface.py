@@ -22,7 +22,7 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from msmpetsc.errors import InputError, one_line
-from msmpetsc.scene_reading import lies_below
+from msmpetsc.scene.reading import lies_below
 
 Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
 

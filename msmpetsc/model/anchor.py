@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.model.motion import Path, within
+from msmpetsc.model.paths import Path, within
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,17 @@ from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.model.anchor import Anchor
+from msmpetsc.model.contact.obstacle import Obstacle
+from msmpetsc.model.contact.penalty import Penalty
+from msmpetsc.model.contact.reflection import Reflection
+from msmpetsc.model.initial_state import State, start_of
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.loads import Load, spread_by_mass
-from msmpetsc.model.motion import Path
-from msmpetsc.model.obstacle import Obstacle
 from msmpetsc.model.part import cell_materials
-from msmpetsc.model.penalty import Penalty
+from msmpetsc.model.paths import Path
 from msmpetsc.model.reach import Reach, Regions, reach_of, regions
-from msmpetsc.model.reflection import Reflection
 from msmpetsc.model.region import Finder
-from msmpetsc.model.start import State, start_of
-from msmpetsc.scene import Scene
+from msmpetsc.scene.schema import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle

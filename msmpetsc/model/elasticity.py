@@ -7,15 +7,8 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.cells_around import CellsAround
-from msmpetsc.model.energy import (
-    add_elastic_gradient,
-    add_elastic_product,
-    add_spring_concavity,
-    elastic_change,
-    elastic_energy,
-    elastic_hessian,
-)
+from msmpetsc.backend.arrays import is_here
+from msmpetsc.model.cell_gather import CellsAround
 from msmpetsc.model.inversion import (
     add_resistance_gradient,
     add_resistance_hessian,
@@ -24,8 +17,15 @@ from msmpetsc.model.inversion import (
     resistance_energy,
 )
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.neighbours import Neighbours
-from msmpetsc.place.arrays import is_here
+from msmpetsc.model.spring_gather import Neighbours
+from msmpetsc.model.springs import (
+    add_elastic_gradient,
+    add_elastic_product,
+    add_spring_concavity,
+    elastic_change,
+    elastic_energy,
+    elastic_hessian,
+)
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
 RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
@@ -34,7 +34,7 @@ Product = Callable[[np.ndarray, np.ndarray], None]  # adds (a Hessian) v [N] to 
 
 
 class Elasticity:
-    """E of this rank's share of a lattice, its gradient and its Hessian: Hooke's springs (model.energy), or, where
+    """E of this rank's share of a lattice, its gradient and its Hessian: Hooke's springs (model.springs), or, where
     the law stiffens, stiffening ones and cells that resist being turned inside out (model.inversion).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the

@@ -5,14 +5,14 @@ Where J < J_0 the corner has the energy  K (1 - J / J_0)^3,  K of its cell's mat
 continuous derivatives and a finite push even where J < 0: so a cell that has been turned is turned back, though its
 neighbours may then hold it creased.
 
-All positions are local, (l, 3), and a gradient is right at the owned nodes, as in model.energy: there, too, is why
-what one corner does is a function of its own (a GPU's loops are in model.cells_around).
+All positions are local, (l, 3), and a gradient is right at the owned nodes, as in model.springs: there, too, is why
+what one corner does is a function of its own (a GPU's loops are in model.cell_gather).
 """
 
 import numba
 import numpy as np
 
-from msmpetsc.place.each import each
+from msmpetsc.backend.kernel import each
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
 FRAMES = np.array(

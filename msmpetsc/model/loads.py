@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.motion import within
+from msmpetsc.model.paths import within
 
 
 @dataclass(frozen=True)

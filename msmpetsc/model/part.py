@@ -6,7 +6,7 @@ import numpy as np
 
 from msmpetsc.model.material import CellMaterial
 from msmpetsc.model.region import Finder
-from msmpetsc.scene import Material, Part
+from msmpetsc.scene.schema import Material, Part
 
 
 def cell_materials(

@@ -17,9 +17,9 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.motion import SAME, within
+from msmpetsc.model.paths import SAME, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene import Force, Obstacle, Scene, Time
+from msmpetsc.scene.schema import Force, Obstacle, Scene, Time
 
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 

@@ -11,7 +11,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.model.lattice import CORNERS, Lattice
-from msmpetsc.scene import Region
+from msmpetsc.scene.schema import Region
 
 EDGE = 1e-9  # of the body's longest side: a node this near to a region counts as on its edge, whatever was rounded
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.saved import Saved
-from msmpetsc.output.frames import ResultFile, open_again, refuse_small_disk
-from msmpetsc.output.result import checked_dataset, damage_told, finished, open_result
+from msmpetsc.model.checkpoint import Saved
+from msmpetsc.output.reader import checked_dataset, damage_told, finished, open_result
+from msmpetsc.output.writer import ResultFile, open_again, refuse_small_disk
 
 
 class InPlace(ResultFile):

@@ -1,7 +1,7 @@
 """Rows written by the ranks that have them, straight to their places in an HDF5 file that one rank has open.
 
 A frame's place is known from the start: its chunks lie where HDF5 put them when the file was laid out, uncompressed,
-and stay there (output.frames). So bytes suffice, whichever h5py there is, and as nothing is collective no rank waits
+and stay there (output.writer). So bytes suffice, whichever h5py there is, and as nothing is collective no rank waits
 for another that has failed.
 """
 

@@ -6,7 +6,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.lazy import LazyArray
 
 if TYPE_CHECKING:
-    from msmpetsc.output.result import Result
+    from msmpetsc.output.reader import Result
 
 DIMENSIONS = {"position": ("time", "node", "axis"), "surface": ("time", "point", "axis"), "momentum": ("time", "axis")}
 LONG_NAMES = {

@@ -20,10 +20,10 @@ from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
 from msmpetsc.output.camera import Camera, place_camera
-from msmpetsc.output.frames import finished, open_result
-from msmpetsc.output.marks import MARGIN, Ground, Marks, Rest, held, marks_at
-from msmpetsc.output.result import checked_datasets, damage_told
-from msmpetsc.scene import SceneFile
+from msmpetsc.output.overlays import MARGIN, Ground, Marks, Rest, held, marks_at
+from msmpetsc.output.reader import checked_datasets, damage_told
+from msmpetsc.output.writer import finished, open_result
+from msmpetsc.scene.schema import SceneFile
 
 BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 
-from msmpetsc.output.result import checked_dataset, damage_told, finished, open_result
+from msmpetsc.output.reader import checked_dataset, damage_told, finished, open_result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 

@@ -7,31 +7,31 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import fetch
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
+from msmpetsc.model.checkpoint import Saved
 from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.environment import Surroundings
 from msmpetsc.model.frame import Frame
-from msmpetsc.model.placed import placed
-from msmpetsc.model.saved import Saved
-from msmpetsc.model.surroundings import Surroundings
-from msmpetsc.place.arrays import fetch
-from msmpetsc.scene import Scene
-from msmpetsc.solve.balance import EnergyBalance
-from msmpetsc.solve.device import sender
-from msmpetsc.solve.implicit import Bdf2, ImplicitEuler
-from msmpetsc.solve.measured import Measured
-from msmpetsc.solve.options import refuse_bad_values, refuse_unused
-from msmpetsc.solve.presets import Preset, find_preset
-from msmpetsc.solve.reference import PREFIX as REFERENCE
-from msmpetsc.solve.reference import PRESET
-from msmpetsc.solve.rescue import PREFIX as FALLBACK
-from msmpetsc.solve.rescue import ROBUST, Done, Rescue
-from msmpetsc.solve.state import State
-from msmpetsc.solve.step import StepResult
-from msmpetsc.solve.surface import SurfaceMotion
-from msmpetsc.solve.verlet import Verlet
-from msmpetsc.solve.watch import Watch
+from msmpetsc.model.to_device import placed
+from msmpetsc.scene.schema import Scene
+from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
+from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.verlet import Verlet
+from msmpetsc.solve.linear.surface import SurfaceMotion
+from msmpetsc.solve.monitors import Watch
+from msmpetsc.solve.nonlinear.presets import Preset, find_preset
+from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
+from msmpetsc.solve.nonlinear.reference import PRESET
+from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.petsc.device import sender
+from msmpetsc.solve.petsc.options import refuse_bad_values, refuse_unused
+from msmpetsc.solve.recovery import PREFIX as FALLBACK
+from msmpetsc.solve.recovery import ROBUST, Done, Rescue
 
 INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
 

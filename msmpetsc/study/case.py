@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from msmpetsc import __version__
-from msmpetsc.study.warm import COLD
+from msmpetsc.study.forkserver import COLD
 
 NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "place")
 

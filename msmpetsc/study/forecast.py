@@ -23,18 +23,18 @@ import trimesh
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.shares import Shares
-from msmpetsc.scene import Scene
+from msmpetsc.model.partition import Shares
+from msmpetsc.scene.schema import Scene
 from msmpetsc.study.case import Case
-from msmpetsc.study.figures import Row
 from msmpetsc.study.measure import Bench
+from msmpetsc.study.metrics import Row
 from msmpetsc.study.overrides import content, inline
 from msmpetsc.study.process import Processes
 
 COARSE, FINE = 1000, 20_000  # cells of the two runs, at most
 LONGEST = 300.0  # [s] a run
 POSITION = 24  # bytes of three doubles
-# Bytes held at once when memory is at its greatest, in solve.system.assemble: the lattice's own arrays (model.lattice),
+# Bytes held at once when memory is at its greatest, in solve.linear.system.assemble: the lattice's own arrays (model.lattice),
 AT_CELL = 8 * 8 + 8 * 8 + 1 + 8  # cells, local_cells, cell_kind, key
 AT_NODE = POSITION + 8 + 8 + 1 + 8 + POSITION + 8  # nodes, key, mass, pinned, numbers, places, row
 AT_SPRING = 16 + 8 + 8 + 8 + 32 + 2  # springs, rest_length, stiffness, weight, both ends, kept
@@ -42,7 +42,7 @@ AT_NONZERO = 5 * 8 + 2 * 4 + 12  # rows, nodes, values, the last two again, COO'
 AT_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
 STEEPEST = 1 / 3  # power of the cells that its may grow with: the cells along a side, as with Jacobi
 OTHER = 5  # w: a gradient, a Hessian, two or more energies, sums over vectors
-# Of one step, counted in solve.step and PETSc's CG: exchanges of ghosts and sums over all ranks
+# Of one step, counted in solve.nonlinear.step and PETSc's CG: exchanges of ghosts and sums over all ranks
 EXCHANGES_OF_ITS, EXCHANGES_OF_ITERATION = 1, 4
 SUMS_OF_ITS, SUMS_OF_ITERATION = 3, 10
 

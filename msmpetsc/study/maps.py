@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from msmpetsc.scene import Scene
-from msmpetsc.scene_reading import load_scene
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
 from msmpetsc.study.case import Case, Place
 from msmpetsc.study.overrides import content, solver_changes, time_changes
 from msmpetsc.study.schema import Axis, Map, Method, Study

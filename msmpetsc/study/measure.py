@@ -7,7 +7,7 @@ from threading import Lock
 
 from msmpetsc.errors import InputError
 from msmpetsc.study.case import Case, command, shown_command
-from msmpetsc.study.figures import Row, failure, measured, of_frames, rates, together, trace
+from msmpetsc.study.metrics import Row, failure, measured, of_frames, rates, together, trace
 from msmpetsc.study.outcome import outcome
 from msmpetsc.study.process import Ended, Processes
 from msmpetsc.study.trajectory import trajectory_error

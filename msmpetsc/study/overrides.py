@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from msmpetsc.scene import Scene
+from msmpetsc.scene.schema import Scene
 from msmpetsc.study.case import Case, digest
 
 

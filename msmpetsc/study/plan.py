@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.frames import finished, open_result
-from msmpetsc.scene_reading import load_scene
+from msmpetsc.output.writer import finished, open_result
+from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.case import Case
-from msmpetsc.study.figures import Row
 from msmpetsc.study.measure import Bench
+from msmpetsc.study.metrics import Row
 from msmpetsc.study.schema import Reference, Study, StudyScene, Sweep
 from msmpetsc.study.sweep import cases
 

@@ -1,4 +1,4 @@
-"""The first that a server of runs imports (study.warm): MPI is not to wake in it, but in each run."""
+"""The first that a server of runs imports (study.forkserver): MPI is not to wake in it, but in each run."""
 
 import mpi4py
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Lock
 from time import perf_counter
 
-from msmpetsc.study.warm import COLD, Forked
+from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
 MARKS_OF_MPI = (  # of a launcher around us: not for our children

@@ -11,7 +11,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from msmpetsc.comm import log
 from msmpetsc.output.progress import duration
-from msmpetsc.study.figures import Row
+from msmpetsc.study.metrics import Row
 
 
 class StudyProgress:

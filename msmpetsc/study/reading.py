@@ -6,8 +6,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene_errors import problem_lines
-from msmpetsc.scene_reading import read_toml
+from msmpetsc.scene.problems import problem_lines
+from msmpetsc.scene.reading import read_toml
 from msmpetsc.study.schema import Study
 
 

@@ -12,15 +12,15 @@ from pathlib import Path
 
 from matplotlib import style
 
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.charts.chart import Chart, Point
 from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.figure6 import figure6_charts
 from msmpetsc.study.charts.growth import growth_charts
-from msmpetsc.study.charts.look import RC, looks
 from msmpetsc.study.charts.order import order_charts
 from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, cost_of, pareto_charts
 from msmpetsc.study.charts.stability import stability_charts
+from msmpetsc.study.charts.style import RC, looks
 from msmpetsc.study.charts.svg import save_png, svg_text
 from msmpetsc.study.outcome import counted
 from msmpetsc.study.rows import (
@@ -133,7 +133,7 @@ def readable(text: str) -> str:
         return text
     if not isinstance(value, dict):
         return text
-    return ", ".join(f"{name} {wording.size(entry) if name == 'memory' else entry}" for name, entry in value.items())
+    return ", ".join(f"{name} {formatting.size(entry) if name == 'memory' else entry}" for name, entry in value.items())
 
 
 def contents(charts: list[Chart]) -> str:
@@ -151,7 +151,7 @@ def overview(charts: list[Chart]) -> str:
     charts = [chart for chart in charts if chart.cheapest]
     if len(charts) < 2:
         return ""
-    head = ["", "error", *(f"{wording.error(level)} or less" for level in LEVELS)]
+    head = ["", "error", *(f"{formatting.error(level)} or less" for level in LEVELS)]
     lines = [
         [chart.title.partition(": ")[2], name, *(winner(name, row) for row in best)]
         for chart in charts for name, best in chart.cheapest.items()
@@ -218,10 +218,10 @@ def name_of(row: Row) -> str:
     """A failed case in words."""
     settings = [
         stepping(row),
-        f"error {wording.error(row['error'])}" if row["error"] else "",
-        f"{wording.count(row['max_iterations'])} iterations" if row["max_iterations"] else "",
-        f"{wording.count(row['cells'])} cells" if row["cells"] else "",
-        f"{wording.count(row['ranks'])} ranks" if (row["ranks"] or 1) > 1 else "",
+        f"error {formatting.error(row['error'])}" if row["error"] else "",
+        f"{formatting.count(row['max_iterations'])} iterations" if row["max_iterations"] else "",
+        f"{formatting.count(row['cells'])} cells" if row["cells"] else "",
+        f"{formatting.count(row['ranks'])} ranks" if (row["ranks"] or 1) > 1 else "",
     ]
     return ", ".join(filter(None, [row["label"] or row["case"], *settings]))
 
@@ -263,7 +263,7 @@ def table(rows: list[Row]) -> str:
     numbers_first = sorted(columns, key=lambda name: name in TEXT and name != "scene")
     shown = [*ALWAYS[:2], *(name for name in numbers_first if name not in (*shared, *ALWAYS)), ALWAYS[2]]
     same = "".join(map(shared_entry, shared, (rows[0][name] for name in shared)))
-    lines = [[(wording.plain(row.get(name)), sort_key(row.get(name))) for name in shown] for row in rows]
+    lines = [[(formatting.plain(row.get(name)), sort_key(row.get(name))) for name in shown] for row in rows]
     above = f"<details><summary>The same in all cases</summary><dl class='facts'>{same}</dl></details>" if same else ""
     note = "<p class='caption'>SI units; a heading sorts. The same numbers to all digits are in table.csv; "
     note += "on paper stand the main columns only.</p>"
@@ -271,7 +271,7 @@ def table(rows: list[Row]) -> str:
 
 
 def shared_entry(name: str, value: float | str | None) -> str:
-    return f"<dt>{escape(name)}</dt><dd>{escape(readable(wording.plain(value)))}</dd>"
+    return f"<dt>{escape(name)}</dt><dd>{escape(readable(formatting.plain(value)))}</dd>"
 
 
 def is_shared(name: str, rows: list[Row]) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.table import COLUMNS
 
 Row = dict[str, str | float | None]  # column -> text, or a finite number, or None where nothing was measured
@@ -82,8 +82,8 @@ def timed(rows: Iterable[Row]) -> list[Row]:
 def stepping(row: Row) -> str:
     """How a case steps, in words; an explicit run has substeps within its time step, the time between its frames."""
     if row["integrator"] == "verlet":
-        return f"substeps of {wording.seconds(row['substep'])}" if row["substep"] else "longest stable substeps"
-    return f"time step {wording.seconds(row['time_step'])}" if row["time_step"] else ""
+        return f"substeps of {formatting.seconds(row['substep'])}" if row["substep"] else "longest stable substeps"
+    return f"time step {formatting.seconds(row['time_step'])}" if row["time_step"] else ""
 
 
 def grouped(items: Iterable, key: Callable) -> dict[object, list]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tomlkit
 
-from msmpetsc.scene_reading import read_toml
+from msmpetsc.scene.reading import read_toml
 from msmpetsc.study.overrides import inline
 from msmpetsc.study.plan import Method
 

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.errors import did_you_mean
-from msmpetsc.scene import Count, FileName, Integrator, ListOf, Positive, Preset, Table
-from msmpetsc.scene_errors import rule
+from msmpetsc.scene.problems import rule
+from msmpetsc.scene.schema import Count, FileName, Integrator, ListOf, Positive, Preset, Table
 
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]

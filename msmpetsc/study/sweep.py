@@ -7,8 +7,8 @@ from itertools import product
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene import Scene
-from msmpetsc.scene_reading import load_scene
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
 from msmpetsc.study.case import Case
 from msmpetsc.study.maps import map_cases
 from msmpetsc.study.overrides import content, inline, solver_changes, time_changes

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.comparison import common_times
-from msmpetsc.output.frames import finished, open_result
+from msmpetsc.output.compare import common_times
+from msmpetsc.output.writer import finished, open_result
 
 
 def trajectory_error(result: Path, reference: Path) -> float:

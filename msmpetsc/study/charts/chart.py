@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from msmpetsc.study.charts.look import Look
+from msmpetsc.study.charts.style import Look
 from msmpetsc.study.rows import Row
 from msmpetsc.study.spread import Cost, spread
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from matplotlib.axes import Axes
 
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
-from msmpetsc.study.charts.look import COUNT, ERROR, SECONDS, Look, around, log_ticks
+from msmpetsc.study.charts.style import COUNT, ERROR, SECONDS, Look, around, log_ticks
 from msmpetsc.study.rows import grouped
 
 KIND = "Convergence within one step"
@@ -112,10 +112,10 @@ def axis_from_zero(axes: Axes, values: Sequence[float], formatter) -> None:
 def point(curve: Curve, row: Iterate) -> Point:
     """The numbers of one iterate."""
     numbers = {
-        "iteration": (wording.count, row["iteration"]),
-        "computing time": (wording.seconds, row["seconds"]),
-        "step error": (wording.error, row["position_error"]),
-        "energy error": (wording.error, row["energy_error"]),
-        "KSP iterations": (wording.count, row["ksp_its"]),
+        "iteration": (formatting.count, row["iteration"]),
+        "computing time": (formatting.seconds, row["seconds"]),
+        "step error": (formatting.error, row["position_error"]),
+        "energy error": (formatting.error, row["energy_error"]),
+        "KSP iterations": (formatting.count, row["ksp_its"]),
     }
     return Point(curve.label, numbers, curve.command)

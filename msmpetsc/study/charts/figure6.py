@@ -2,10 +2,10 @@
 
 from operator import itemgetter
 
-from msmpetsc.study import wording
-from msmpetsc.study.charts.cell_sweep import curves, file_name, sweeps, titled
+from msmpetsc.study import formatting
+from msmpetsc.study.charts.cells import curves, file_name, sweeps, titled
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
-from msmpetsc.study.charts.look import COUNT, Look, log_axes
+from msmpetsc.study.charts.style import COUNT, Look, log_axes
 from msmpetsc.study.rows import Row, failed, grouped, measured
 from msmpetsc.study.spread import ends, is_below
 
@@ -84,23 +84,23 @@ def errors(rows: list[Row]) -> str:
     reached = [row["true_error"] for row in measured(rows, "true_error")]
     if not reached:
         return "step error not measured"
-    low, high = wording.error(min(reached)), wording.error(max(reached))
+    low, high = formatting.error(min(reached)), formatting.error(max(reached))
     return f"step error {low}" if low == high else f"step error {low} to {high}"
 
 
 def point(row: Row, curve: str) -> Point:
     """The numbers of one point."""
     numbers = {
-        "valid cells": (wording.count, row["cells"]),
-        "frames a second": (wording.plain, row["fps"]),
-        "computing time a frame": (wording.seconds, row["time_frame"]),
-        **repeats(row, itemgetter("time_frame"), wording.seconds),
-        "true step error": (wording.error, row["true_error"]),
-        "iterations a step": (wording.count, row["iterations"]),
-        "KSP iterations a step": (wording.count, row["ksp_its"]),
-        "factorisation": (wording.seconds, row["time_factor"]),
-        "memory": (wording.size, row["memory"]),
-        "ranks": (wording.count, row["ranks"]),
+        "valid cells": (formatting.count, row["cells"]),
+        "frames a second": (formatting.plain, row["fps"]),
+        "computing time a frame": (formatting.seconds, row["time_frame"]),
+        **repeats(row, itemgetter("time_frame"), formatting.seconds),
+        "true step error": (formatting.error, row["true_error"]),
+        "iterations a step": (formatting.count, row["iterations"]),
+        "KSP iterations a step": (formatting.count, row["ksp_its"]),
+        "factorisation": (formatting.seconds, row["time_factor"]),
+        "memory": (formatting.size, row["memory"]),
+        "ranks": (formatting.count, row["ranks"]),
     }
     return Point(curve, numbers, row["command"])
 
@@ -124,13 +124,13 @@ def overtaken(curve: str, group: list[Row], iterative: list[Row]) -> str:
     won = [(row, rival) for row, rival in pairs if row["cells"] > max(slower, default=0)]
     if not won:
         row, rival = pairs[-1]
-        cells = wording.count(row["cells"])
+        cells = formatting.count(row["cells"])
         if not is_below(rival, row, FPS):
             both = f"{curve} and {rival['curve']} are as fast within their noise"
             return f"{both} at {cells} cells, the most measured ({duel(row, rival)})."
         return f"{curve} is still faster at {cells} cells, the most measured ({duel(row, rival)})."
     row, rival = won[0]
-    start = f"{'' if slower else 'at every cell count measured, '}from {wording.count(row['cells'])} cells on"
+    start = f"{'' if slower else 'at every cell count measured, '}from {formatting.count(row['cells'])} cells on"
     return f"{rival['curve']} is faster than {curve} {start} ({duel(row, rival)})."
 
 
@@ -145,4 +145,4 @@ def duel(row: Row, rival: Row) -> str:
 
 
 def error_of(row: Row) -> str:
-    return f"a step error of {wording.error(row['true_error'])}" if row["true_error"] else "an unmeasured step error"
+    return f"a step error of {formatting.error(row['true_error'])}" if row["true_error"] else "an unmeasured step error"

@@ -7,11 +7,11 @@ from operator import itemgetter
 from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter
 
-from msmpetsc.study import wording
-from msmpetsc.study.charts.cell_sweep import curves, file_name, sweeps, titled
+from msmpetsc.study import formatting
+from msmpetsc.study.charts.cells import curves, file_name, sweeps, titled
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
 from msmpetsc.study.charts.figure6 import line_styles
-from msmpetsc.study.charts.look import BYTES, COUNT, SECONDS, Look, log_axes
+from msmpetsc.study.charts.style import BYTES, COUNT, SECONDS, Look, log_axes
 from msmpetsc.study.rows import Row, failed, measured
 from msmpetsc.study.spread import ends
 
@@ -39,9 +39,9 @@ def a_cell(column: str) -> Callable[[Row], float]:
 
 
 QUANTITIES = (
-    Quantity("time a frame and cell", "time_frame", a_cell("time_frame"), SECONDS, wording.seconds),
-    Quantity("memory a cell", "memory", a_cell("memory"), BYTES, wording.size),
-    Quantity("KSP iterations a step", "ksp_its", itemgetter("ksp_its"), COUNT, wording.count),
+    Quantity("time a frame and cell", "time_frame", a_cell("time_frame"), SECONDS, formatting.seconds),
+    Quantity("memory a cell", "memory", a_cell("memory"), BYTES, formatting.size),
+    Quantity("KSP iterations a step", "ksp_its", itemgetter("ksp_its"), COUNT, formatting.count),
 )
 
 
@@ -96,15 +96,15 @@ def draw_curve(
 def point(row: Row, curve: str, quantity: Quantity, value: float) -> Point:
     """The numbers of one point."""
     numbers = {
-        "valid cells": (wording.count, row["cells"]),
+        "valid cells": (formatting.count, row["cells"]),
         quantity.title: (quantity.word, value),
-        "computing time a frame": (wording.seconds, row["time_frame"]),
-        **repeats(row, itemgetter("time_frame"), wording.seconds),
-        "memory": (wording.size, row["memory"]),
-        "KSP iterations a step": (wording.count, row["ksp_its"]),
-        "true step error": (wording.error, row["true_error"]),
-        "set-up": (wording.seconds, row["time_setup"]),
-        "factorisation": (wording.seconds, row["time_factor"]),
-        "ranks": (wording.count, row["ranks"]),
+        "computing time a frame": (formatting.seconds, row["time_frame"]),
+        **repeats(row, itemgetter("time_frame"), formatting.seconds),
+        "memory": (formatting.size, row["memory"]),
+        "KSP iterations a step": (formatting.count, row["ksp_its"]),
+        "true step error": (formatting.error, row["true_error"]),
+        "set-up": (formatting.seconds, row["time_setup"]),
+        "factorisation": (formatting.seconds, row["time_factor"]),
+        "ranks": (formatting.count, row["ranks"]),
     }
     return Point(curve, numbers, row["command"])

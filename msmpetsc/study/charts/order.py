@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure
-from msmpetsc.study.charts.look import ERROR, FAINT, SECONDS, Look, around, log_axes, log_ticks
+from msmpetsc.study.charts.style import ERROR, FAINT, SECONDS, Look, around, log_axes, log_ticks
 from msmpetsc.study.rows import Row, grouped, measured, succeeded
 
 KIND = "Convergence in time"
@@ -117,10 +117,10 @@ def draw_curve(chart: Chart, axes: Axes, rows: list[Row], column: str, look: Loo
 
 def point(row: Row) -> Point:
     numbers = {
-        "time step": (wording.seconds, step_of(row)),
-        "steps": (wording.count, row["steps"]),
-        "trajectory error": (wording.error, row["trajectory_error"]),
-        "energy left": (wording.plain, row["energy_left"]),
-        "iterations a step": (wording.count, row["iterations"]),
+        "time step": (formatting.seconds, step_of(row)),
+        "steps": (formatting.count, row["steps"]),
+        "trajectory error": (formatting.error, row["trajectory_error"]),
+        "energy left": (formatting.plain, row["energy_left"]),
+        "iterations a step": (formatting.count, row["iterations"]),
     }
     return Point(row["label"], numbers, row["command"])

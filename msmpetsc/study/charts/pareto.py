@@ -13,9 +13,9 @@ from operator import itemgetter
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
-from msmpetsc.study.charts.look import ERROR, FAINT, INK, SECONDS, Look, log_axes
+from msmpetsc.study.charts.style import ERROR, FAINT, INK, SECONDS, Look, log_axes
 from msmpetsc.study.rows import Row, failed, grouped, measured, stepping, succeeded
 from msmpetsc.study.spread import UNKNOWN, ends, is_known, spread, within_noise
 
@@ -95,7 +95,7 @@ def pareto_charts(rows: list[Row], looks: dict[str, Look]) -> list[Chart]:
         sizes = grouped(succeeded(here), lambda row: row["cells"])
         swept = {cells: group for cells, group in sizes.items() if len(sizes) == 1 or is_swept(group)}
         for cells, group in swept.items():
-            name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{wording.plain(cells)}"
+            name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{formatting.plain(cells)}"
             chart = pareto_chart(name, scene, cells, group, looks)
             if chart:
                 chart.failed = failed(here)
@@ -119,7 +119,7 @@ def pareto_chart(name: str, scene: str, cells: float | None, rows: list[Row], lo
     handles = {label: handle(looks[label]) for label in labels}
     handles[FRONT] = Line2D([], [], color=FAINT, marker="o", markersize=10, markerfacecolor="none", markeredgecolor=INK)
     figure, axes = new_figure(len(panels), list(handles))
-    where = f"{scene}, {wording.count(cells)} cells" if cells else scene
+    where = f"{scene}, {formatting.count(cells)} cells" if cells else scene
     chart = Chart(name, "Speed against accuracy", f"Speed against accuracy: {where}", CAPTION, figure)
     for ax, (measure, shown) in zip(axes, panels):
         draw(chart, ax, measure, shown, looks)
@@ -138,7 +138,7 @@ def common_time_step(rows: list[Row]) -> list[Row]:
 
 def draw(chart: Chart, axes: Axes, measure: Measure, rows: list[Row], looks: dict[str, Look]) -> None:
     """One panel: the front first, the methods over it."""
-    step = wording.seconds(rows[0]["time_step"])
+    step = formatting.seconds(rows[0]["time_step"])
     where = f", time step {step}" if measure is STEP and step else ""
     axes.set_title(f"over the {measure.name}{where}", loc="left")
     axes.set_xlabel(measure.x_label)
@@ -174,28 +174,28 @@ def draw_front(axes: Axes, rows: list[Row], measure: Measure) -> None:
 def point(row: Row, measure: Measure) -> Point:
     """The numbers of one point."""
     numbers = {
-        measure.name: (wording.error, row[measure.error]),
-        measure.y_label: (wording.seconds, row[measure.cost]),
-        **repeats(row, itemgetter(measure.cost), wording.seconds),
-        "time step": (wording.seconds, row["time_step"]),
-        "substep": (wording.seconds, row["substep"]),
-        "error asked for": (wording.error, row["error"]),
-        "most iterations": (wording.count, row["max_iterations"]),
-        "iterations a step": (wording.count, row["iterations"]),
-        "ranks": (wording.count, row["ranks"]),
+        measure.name: (formatting.error, row[measure.error]),
+        measure.y_label: (formatting.seconds, row[measure.cost]),
+        **repeats(row, itemgetter(measure.cost), formatting.seconds),
+        "time step": (formatting.seconds, row["time_step"]),
+        "substep": (formatting.seconds, row["substep"]),
+        "error asked for": (formatting.error, row["error"]),
+        "most iterations": (formatting.count, row["max_iterations"]),
+        "iterations a step": (formatting.count, row["iterations"]),
+        "ranks": (formatting.count, row["ranks"]),
     }
     return Point(row["label"], numbers, row["command"])
 
 
 def finding(measure: Measure, level: float, best: list[Row]) -> str:
     """Which method is the cheapest that reached this level, and which may be just as cheap, in plain words."""
-    start = f"{wording.error(level)} or less:"
+    start = f"{formatting.error(level)} or less:"
     if not best:
         return f"{start} nothing measured reaches it."
     row, *others = best
-    reached = wording.error(row[measure.error])
+    reached = formatting.error(row[measure.error])
     step = f", {stepping(row)}" if measure is TRAJECTORY else ""
-    asked = f"asked for {wording.error(row['error'])}, " if row["error"] else ""
+    asked = f"asked for {formatting.error(row['error'])}, " if row["error"] else ""
     sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
     if not others:
         return f"{sentence}."
@@ -205,5 +205,5 @@ def finding(measure: Measure, level: float, best: list[Row]) -> str:
 
 def cost_of(row: Row, measure: Measure) -> str:
     """34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
-    cost, repeats_range = wording.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
-    return f"{cost} [{' to '.join(map(wording.seconds, repeats_range))}]" if repeats_range else cost
+    cost, repeats_range = formatting.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
+    return f"{cost} [{' to '.join(map(formatting.seconds, repeats_range))}]" if repeats_range else cost

@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
-from msmpetsc.study import wording
+from msmpetsc.study import formatting
 from msmpetsc.study.charts.chart import WIDTH, Chart, Point
-from msmpetsc.study.charts.look import INK, Look
+from msmpetsc.study.charts.style import INK, Look
 from msmpetsc.study.outcome import MEANING, OUTCOMES
 from msmpetsc.study.rows import Row, grouped, mapped
 
@@ -63,7 +63,7 @@ def worded(value: float, unit: str) -> str:
     """A number of an axis: 10 ms, 20%, 100 kPa."""
     if unit == "%":
         return f"{100 * value:.3g}%"
-    return wording.seconds(value) if unit == "s" else EngFormatter(unit, sep=wording.GAP if unit else "")(value)
+    return formatting.seconds(value) if unit == "s" else EngFormatter(unit, sep=formatting.GAP if unit else "")(value)
 
 
 def scale(rows: list[Row], column: str, told: dict) -> Scale:
@@ -163,15 +163,15 @@ def point(row: Row, x: Scale, y: Scale) -> Point:
     numbers = places | {
         y.name if y.name != "y" else "case": (lambda place: y.texts[y.places.index(place)], row["y"]),
         "outcome": (text, row["outcome"]),
-        "steps done": (wording.count, row["steps"]),
-        "iterations a step": (wording.count, row["iterations"]),
-        "the most of a step": (wording.count, row["most_iterations"]),
-        "cells inverted": (wording.count, row["inverted"]),
-        "shape error": (wording.error, row["shape_error"]),
-        "energy gained [J]": (wording.plain, row["energy_gained"]),
-        "shorter steps": (wording.count, row["substeps"]),
-        "robust steps": (wording.count, row["fallbacks"]),
-        "explicit limit": (wording.seconds, row["explicit_limit"]),
+        "steps done": (formatting.count, row["steps"]),
+        "iterations a step": (formatting.count, row["iterations"]),
+        "the most of a step": (formatting.count, row["most_iterations"]),
+        "cells inverted": (formatting.count, row["inverted"]),
+        "shape error": (formatting.error, row["shape_error"]),
+        "energy gained [J]": (formatting.plain, row["energy_gained"]),
+        "shorter steps": (formatting.count, row["substeps"]),
+        "robust steps": (formatting.count, row["fallbacks"]),
+        "explicit limit": (formatting.seconds, row["explicit_limit"]),
         "reason": (text, row["reason"]),
     }
     return Point(row["label"], numbers, row["command"])

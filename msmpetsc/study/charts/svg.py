@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib import style
 
 from msmpetsc.study.charts.chart import Chart
-from msmpetsc.study.charts.look import RC
+from msmpetsc.study.charts.style import RC
 
 SVG = "http://www.w3.org/2000/svg"
 ElementTree.register_namespace("", SVG)

@@ -1,0 +1,56 @@
+"""A CUDA GPU: what is missing for one, arrays in its memory. (Threads on it: backend.launcher.)
+
+CuPy and numba's CUDA target are imported by those alone who ask for a GPU: a CPU's run needs neither.
+"""
+
+import numpy as np
+
+
+def missing() -> str | None:
+    """Why there is no GPU here, in words, None if there is one: the runtime is asked, for PETSc would crash at exit."""
+    try:
+        import cupy
+        from numba import cuda  # noqa: F401
+    except ImportError as error:
+        return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
+    try:
+        return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
+    except Exception as error:  # of CuPy, of the runtime or of what loads it: no driver, one too old, no library
+        return f"no GPU is seen: {str(error).splitlines()[0]}"
+
+
+def take_one(rank: int) -> None:
+    """Of several GPUs the one that PETSc takes too: r modulo their number for rank r."""
+    import cupy
+
+    cupy.cuda.Device(rank % cupy.cuda.runtime.getDeviceCount()).use()
+
+
+def send(array: np.ndarray) -> np.ndarray:
+    """The same on the GPU."""
+    import cupy
+
+    return cupy.asarray(array)
+
+
+def view(pointer: int, size: int) -> np.ndarray:
+    """Memory of someone else, (size,) numbers, as an array; valid while that is there."""
+    import cupy
+
+    if not size:
+        return cupy.empty(0)
+    memory = cupy.cuda.UnownedMemory(pointer, 8 * size, None, cupy.cuda.Device().id)
+    return cupy.ndarray((size,), np.float64, cupy.cuda.MemoryPointer(memory, 0))
+
+
+def wait() -> None:
+    """Until the GPU has done all that it was given."""
+    import cupy
+
+    cupy.cuda.Device().synchronize()
+
+
+def name() -> str:
+    import cupy
+
+    return cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()

@@ -1,0 +1,31 @@
+"""One body for every index, where the arrays are: a compiled loop on the CPU, one thread an index on a GPU."""
+
+from collections.abc import Callable
+from functools import wraps
+
+import numba
+
+from msmpetsc.backend.arrays import is_here
+
+
+def each(body: Callable[..., None]) -> Callable[..., None]:
+    """``body(first, count, step, *arguments)``, which does something for every i in range(first, count, step), as
+    ``each(body)(count, *arguments)``, which does it for all i below a count, in any order.
+
+    The first argument is an array, whose type tells where. What the body calls is compiled by numba.njit and takes
+    its roots from ``math``; no two indices write to the same place. The loop stands in the body, and not here, so
+    that numba finds what it has compiled before.
+    """
+    compiled = numba.njit(cache=True)(body)
+
+    @wraps(body)
+    def everywhere(count, *arguments):
+        if is_here(arguments[0]):
+            compiled(0, count, 1, *arguments)
+        else:
+            from msmpetsc.backend.launcher import launcher  # and CuPy: a CPU's run needs neither
+
+            launcher(body)(count, *arguments)
+
+    everywhere.compiled = compiled
+    return everywhere

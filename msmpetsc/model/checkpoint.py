@@ -1,0 +1,54 @@
+"""All that the next step depends on beside the scene: saved and restored, a run goes on as if it had never stopped.
+
+Each part of a run that remembers something has ``save`` and ``restore``. What PETSc's solvers remember is not
+among it: they begin each step anew (solve.nonlinear.step).
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import together
+from msmpetsc.errors import InputError
+
+
+@dataclass
+class Saved:
+    """After ``step`` steps. Empty, it is what a run begins with.
+
+    rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
+        [m] among them
+    numbers : by name, of the whole run
+    """
+
+    step: int = 0
+    rows: dict[str, np.ndarray] = field(default_factory=dict)
+    numbers: dict[str, float] = field(default_factory=dict)
+
+    def row(self, name: str) -> np.ndarray:
+        """Raises InputError where there is none."""
+        if name not in self.rows:
+            raise InputError(f"the checkpoint is damaged: it lacks {name}")
+        return self.rows[name]
+
+    def number(self, name: str, default: float, least: float = -math.inf, most: float = math.inf) -> float:
+        """Raises InputError for one that no run can have had."""
+        value = self.numbers.get(name, default)
+        if not least <= value <= most:
+            raise InputError(f"the checkpoint is damaged: {name} is {value:g}")
+        return value
+
+    def count(self, name: str, most: int = 2**53) -> int:
+        """A whole number, 0 if there is none. Raises InputError likewise."""
+        return int(self.number(name, 0, 0, most))
+
+    def refuse_rows_unlike(self, comm: MPI.Comm, like: "Saved") -> None:
+        """Raise InputError for rows that are not of the shape of those in ``like``, or not finite (collective)."""
+        with together(comm):
+            for name in self.rows.keys() & like.rows.keys():
+                if self.rows[name].shape != like.rows[name].shape or not np.isfinite(self.rows[name]).all():
+                    raise InputError(
+                        f"the checkpoint is damaged: {name} is not of finite numbers, {like.rows[name].shape}"
+                    )

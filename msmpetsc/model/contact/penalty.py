@@ -1,0 +1,247 @@
+"""Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
+and Coulomb friction on those that were.
+
+A node at depth d > 0 has the energy 1/2 k d^2. Friction opposes the slip u, the way along the surface during the
+step, with mu N once |u| passes a small e; N is the push on the node at the step's start, so that friction has a
+potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020,
+Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
+
+A node that came into a box by one of its faces has that for its ``side``, and its depth is the way back through it,
+also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.backend.arrays import beside
+from msmpetsc.backend.kernel import each
+from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """stiffness [N/m] on each node; friction mu; below the slip speed ``stick`` [m/s] friction fades to nothing."""
+
+    obstacle: Obstacle
+    stiffness: float
+    friction: float
+    stick: float
+
+    def at(self, time: float, sides: np.ndarray | None = None) -> "Press":
+        """The obstacle at a time, without friction; ``sides`` (owned or more,) of the nodes."""
+        return Press(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
+
+    def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "Press":
+        """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
+        if self.friction == 0:
+            return self.at(time, sides)
+        points, normals = self.obstacle.points_at(time), self.obstacle.normals
+        before = self.obstacle.points_at(time - time_step)
+        inside, face = depths(q, before, normals, sides)
+        nodes = np.flatnonzero(inside > 0)
+        carried = q[nodes] + (points - before)[0]
+        limit = self.friction * self.stiffness * inside[nodes]
+        rub = Rub(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
+        return Press(points, normals, self.stiffness, rub, sides)
+
+
+@dataclass(frozen=True)
+class Rub:
+    """Friction of one step.
+
+    nodes (a,), normal (a, 3); carried (a, 3): where they are if they do not slip [m]; limit (a,): mu N [N];
+    stick: e [m]
+    """
+
+    nodes: np.ndarray
+    normal: np.ndarray
+    carried: np.ndarray
+    limit: np.ndarray
+    stick: float
+
+    def slip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """u (a, 3) and its length (a,) [m]."""
+        moved = q[self.nodes] - self.carried
+        u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
+        return u, np.linalg.norm(u, axis=1)
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
+        (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
+        moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
+        longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
+        low, low_0 = np.minimum(length, e), np.minimum(length_0, e)
+        beyond = np.maximum(length, e) - np.maximum(length_0, e)
+        within = np.where(np.maximum(length, length_0) < e, longer, low - low_0)
+        beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
+        return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """f'(u) / u, (a,) [1/m]."""
+        return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        u, length = self.slip(q)
+        gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
+
+    def blocks(self, q: np.ndarray, true: bool) -> np.ndarray:
+        """mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
+
+        The second part is not positive; unless ``true`` it is left out, which is no less than the Hessian.
+        """
+        u, length = self.slip(q)
+        slope = self.slope(length)
+        blocks = slope[:, None, None] * (beside(q, np.eye(3)) - _squares(self.normal))
+        if true:
+            direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
+            curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
+            blocks += (curvature - slope)[:, None, None] * _squares(direction)
+        return self.limit[:, None, None] * blocks
+
+
+@dataclass(frozen=True)
+class Press:
+    """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], friction, if any, and by
+    which face each node came in (obstacle.side_of); None: the nearest."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    stiffness: float
+    rub: Rub | None
+    sides: np.ndarray | None = None
+
+    def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of positions (n, 3), and the faces that push, (n,) each."""
+        return depths(q, self.points, self.normals, self.sides)
+
+    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What kernels take: points, normals and the sides of positions (n, 3)."""
+        return self.points, self.normals, no_sides(q) if self.sides is None else self.sides
+
+
+class Contact:
+    """What all obstacles add to E in one step. Positions q are (owned or more, 3) [m].
+
+    Gradient and Hessian act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
+    """
+
+    def __init__(self, presses: list[Press], owned: int):
+        self.presses, self.owned = presses, owned
+
+    def energy(self, q: np.ndarray) -> float:
+        """Of the push alone, [J]: friction stores none."""
+        energy = 0.0
+        for press in self.presses:
+            inside = np.maximum(press.depths(q[: self.owned])[0], 0)
+            energy += 0.5 * press.stiffness * float(inside @ inside)
+        return energy
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """Energy at q less energy at base, friction included [J]."""
+        total = 0.0
+        for press in self.presses:
+            parts = np.empty(self.owned, like=q)
+            _change_of(self.owned, q, base, *press.faces(q), press.stiffness, parts)
+            total += float(parts.sum())
+            if press.rub:
+                total += float(press.rub.change(q, base))
+        return total
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        for press in self.presses:
+            _add_gradient_of(self.owned, q, *press.faces(q), press.stiffness, gradient)
+            if press.rub:
+                press.rub.add_gradient(q, gradient)
+
+    def hessian(self, q: np.ndarray, true: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Nodes in contact (a,), each once, and their blocks (a, 3, 3) [N/m], positive semidefinite: of each push and
+        each friction, the sum of which it is.
+
+        true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
+            Hessian, nothing along a slip, would let nodes run to and fro
+        """
+        for press in self.presses:
+            inside, face = press.depths(q[: self.owned])
+            pressed = np.flatnonzero(inside > 0)
+            yield pressed, press.stiffness * _squares(press.normals[face[pressed]])
+            if press.rub:
+                yield press.rub.nodes, press.rub.blocks(q, true)
+
+    def bound(self, q: np.ndarray) -> np.ndarray:
+        """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
+        bound = np.zeros(self.owned, like=q)
+        for press in self.presses:
+            bound += press.stiffness * (press.depths(q[: self.owned])[0] > 0)
+            if press.rub:
+                bound[press.rub.nodes] += 2 * press.rub.limit / press.rub.stick
+        return bound
+
+
+def _squares(vectors: np.ndarray) -> np.ndarray:
+    """v v^T of each (a, 3), (a, 3, 3)."""
+    return vectors[:, :, None] * vectors[:, None, :]
+
+
+@each
+def _change_of(first, count, step, q, base, points, normals, sides, stiffness, parts):
+    for i in range(first, count, step):
+        d, face = depth(q[i], points, normals, sides[i])
+        d_base, face_base = depth(base[i], points, normals, sides[i])
+        parts[i] = 0.0
+        if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
+            deeper = 0.0
+            for c in range(3):
+                deeper -= normals[face, c] * (q[i, c] - base[i, c])
+            parts[i] = 0.5 * stiffness * deeper * (d + d_base)
+        elif d > 0.0 or d_base > 0.0:
+            d, d_base = max(d, 0.0), max(d_base, 0.0)
+            parts[i] = 0.5 * stiffness * (d - d_base) * (d + d_base)
+
+
+@each
+def _add_gradient_of(first, count, step, q, points, normals, sides, stiffness, gradient):
+    for i in range(first, count, step):
+        d, face = depth(q[i], points, normals, sides[i])
+        if d > 0.0:
+            for c in range(3):
+                gradient[i, c] -= stiffness * d * normals[face, c]
+
+
+@each
+def _rub_of(first, count, step, rows, q, points, normals, sides, carried, impulse, per_mass, v):
+    for row in range(first, count, step):
+        i = rows[row]
+        d, face = depth(q[i], points, normals, sides[i])
+        if d > 0.0:
+            along, speed = 0.0, 0.0
+            for c in range(3):
+                along += (v[i, c] - carried[c]) * normals[face, c]
+            for c in range(3):
+                speed += (v[i, c] - carried[c] - along * normals[face, c]) ** 2
+            speed = math.sqrt(speed)
+            if speed > 0.0:
+                lost = min(1.0, impulse * d * per_mass[i] / speed)
+                for c in range(3):
+                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])
+
+
+def rub(
+    rows: np.ndarray,
+    q: np.ndarray,
+    press: Press,
+    carried: np.ndarray,
+    impulse: float,
+    per_mass: np.ndarray,
+    v: np.ndarray,
+) -> None:
+    """Coulomb friction as a change of velocity: at the rows that are inside, v along the face, as seen from an obstacle
+    that moves at ``carried`` (3,) [m/s], falls by no more than the friction's impulse a mass, mu N dt / m, and not
+    below nothing: so what holds does not creep, however long the substep.
+
+    impulse : mu k dt [kg/s], times the depth the impulse
+    """
+    _rub_of(len(rows), rows, q, *press.faces(q), carried, impulse, per_mass, v)

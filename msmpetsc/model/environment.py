@@ -1,0 +1,234 @@
+"""What acts on a body from outside at a time: loads, what leads its nodes, obstacles."""
+
+from functools import reduce
+from itertools import compress
+
+import numpy as np
+
+from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.model.anchor import Anchor
+from msmpetsc.model.build import Model
+from msmpetsc.model.contact.obstacle import Obstacle, depths
+from msmpetsc.model.contact.penalty import Contact, Penalty, Press, rub
+
+
+class Surroundings:
+    """Of one model. An implicit step asks once for its end, an explicit one in each substep.
+
+    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
+    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (obstacle.side_of): the
+    penalties' first, then the reflections'.
+    """
+
+    def __init__(self, model: Model):
+        self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
+        self.penalties, self.reflections = model.penalties, model.reflections
+        self.obstacles = [one.obstacle for one in (*self.penalties, *self.reflections)]
+        self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
+        self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
+        nodes = self.lattice.nodes
+        self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
+        self._acting = self._load = None
+
+    def load(self, time: float) -> np.ndarray:
+        """External force f_ext (owned, 3) [N], not to be written to."""
+        acting = [load.acts_at(time) for load in self.loads]
+        if acting != self._acting:
+            self._acting, self._load = acting, np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
+            for load in compress(self.loads, acting):
+                self._load += load.force
+        return self._load
+
+    def held_at(self, time: float) -> list[Anchor]:
+        """The anchors that have not let go."""
+        return [anchor for anchor in self.anchors if anchor.holds_at(time)]
+
+    def pinned_at(self, time: float) -> np.ndarray:
+        """(l,) bool: the nodes that are no unknowns, pinned or held by an anchor."""
+        return reduce(np.logical_or, (anchor.where for anchor in self.held_at(time)), self.lattice.pinned)
+
+    def led(self, q: np.ndarray, time: float) -> np.ndarray | None:
+        """q with the anchored nodes where they will be; None if there are none."""
+        held = self.held_at(time)
+        if not held:
+            return None
+        for anchor in held:
+            place = self.lattice.nodes + beside(q, anchor.path.at(time))
+            q = np.where(anchor.where[:, None], place, q)
+        return q
+
+    def met(
+        self,
+        q: np.ndarray,
+        end: np.ndarray,
+        time: float,
+        time_step: float,
+        before: np.ndarray | None,
+        held: np.ndarray,
+    ) -> np.ndarray:
+        """Sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step, which had ``before`` when it began.
+
+        held : (n,) bool, the nodes that do not give way: they have none. A plane has but one, which needs no name.
+        """
+        if not self.has_sides:
+            return self.no_sides[:, : len(q)]
+        sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
+        for row, obstacle in enumerate(self.obstacles):
+            if obstacle.has_sides:
+                had = None if before is None else before[row]
+                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, had))
+        return sides
+
+    def pushes_alike(self, q: np.ndarray, time: float, sides: np.ndarray, others: np.ndarray) -> bool:
+        """Whether penalties press on this rank's nodes at q just the same with other sides."""
+        owned = self.lattice.owned
+        presses = zip(self._presses(time, sides), self._presses(time, others), strict=True)
+        depths = [[np.maximum(press.depths(q[:owned])[0], 0) for press in pair] for pair in presses]
+        return all(bool(np.array_equal(one, other)) for one, other in depths)
+
+    def contact(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray) -> Contact | None:
+        """What presses in the step that starts from q."""
+        owned = self.lattice.owned
+        presses = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
+        return Contact(presses, owned) if presses else None
+
+    def push(self, time: float, sides: np.ndarray) -> Contact | None:
+        """What presses at a time, without friction."""
+        presses = self._presses(time, sides)
+        return Contact(presses, self.lattice.owned) if presses else None
+
+    def _presses(self, time: float, sides: np.ndarray) -> list[Press]:
+        return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
+
+    def rub(
+        self,
+        q: np.ndarray,
+        v: np.ndarray,
+        rows: np.ndarray,
+        per_mass: np.ndarray,
+        time: float,
+        duration: float,
+        begin: float,
+        end: float,
+        sides: np.ndarray,
+    ) -> None:
+        """Friction of obstacles as they stand at ``time``, for a ``duration``, on velocities v (owned, 3) [m/s].
+
+        q, rows, per_mass : (owned, 3) [m]; the nodes that move; (owned,) [1/kg]
+        begin, end        : the substep [s] in which an obstacle carries along what it holds
+        """
+        for p, side in self._pressing(time, sides):
+            if p.friction > 0:
+                path = p.obstacle.path
+                carried = beside(q, (path.at(end) - path.at(begin)) / (end - begin))
+                rub(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
+
+    def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray) -> np.ndarray:
+        """(owned,) [N/m]: no less than what obstacles add to a node's stiffness from start to ``time``.
+
+        q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
+            makes good is counted as inside already
+        """
+        stiffness = np.zeros(len(q), like=q)
+        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
+            if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
+                way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
+                reach = 2 * (speed * (time - start) + np.linalg.norm(way))
+                inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals)
+                stiffness += p.stiffness * ((inside > -reach) | (side > 0))
+        return stiffness
+
+    def power(self, q: np.ndarray, time: float, begin: float, end: float, sides: np.ndarray) -> float:
+        """Of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m], which move as in the substep from
+        begin to end [W]."""
+        power = 0.0
+        for p, side in self._pressing(time, sides):
+            way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
+            if way.any():
+                inside, face = p.at(time, side).depths(q)
+                along = beside(q, fetch(p.obstacle.normals) @ way)[face]
+                power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
+        return power
+
+    def appearing(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
+        """Energy [J] of the push of penalties that were not there when a substep began, at its end."""
+        new = [p.at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        return Contact(new, self.lattice.owned).energy(q) if new else 0.0
+
+    def dragged(
+        self,
+        before: tuple[np.ndarray, np.ndarray],
+        after: tuple[np.ndarray, np.ndarray],
+        time: float,
+        time_step: float,
+    ) -> float:
+        """No less than the work [J] that the friction of moving obstacles does on this rank's nodes in a step between
+        two positions (owned, 3) [m], with their sides: mu N times how far they go."""
+        work = 0.0
+        for row, p in enumerate(self.penalties):
+            if not p.obstacle.acts_at(time):
+                continue
+            way = np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step))
+            if p.friction > 0 and way > 0:
+                for (q, sides), when in ((before, time - time_step), (after, time)):
+                    inside, _ = p.at(when, sides[row, : len(q)]).depths(q)
+                    work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
+        return work
+
+    def _pressing(self, time: float, sides: np.ndarray | None) -> list[tuple[Penalty, np.ndarray]]:
+        sides = (self.no_sides if sides is None else sides)[self.pressing]
+        return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
+
+    def reflect(
+        self,
+        q: np.ndarray,
+        q_previous: np.ndarray,
+        time: float,
+        time_step: float,
+        held: np.ndarray,
+        sides: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """q_n and q_(n-1) after the obstacles that nodes bounce off; the very same arrays if nothing is touched. And
+        the work [J] of these obstacles on this rank's nodes.
+
+        held : (l,) bool, the nodes that do not give way
+        """
+        free, work = ~held[:, None], 0.0
+        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
+            after, before = reflection.reflect(q, q_previous, time, time_step, side)
+            if after is not q:
+                after, before = np.where(free, after, q), np.where(free, before, q_previous)
+                work += self._struck(reflection.obstacle, (after - before) - (q - q_previous), time, time_step)
+                q, q_previous = after, before
+        return q, q_previous, work
+
+    def turn(
+        self,
+        q: np.ndarray,
+        q_previous: np.ndarray,
+        a: np.ndarray,
+        time: float,
+        time_step: float,
+        held: np.ndarray,
+        sides: np.ndarray,
+    ) -> tuple[np.ndarray, float]:
+        """The same for an integrator that leaves nodes where they are: q_(n-1) and the work.
+
+        a : (l, 3) [m] acceleration times t^2
+        """
+        free, work = ~held[:, None], 0.0
+        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
+            before = reflection.turn(q, q_previous, a, time, time_step, side)
+            if before is not q_previous:
+                before = np.where(free, before, q_previous)
+                work += self._struck(reflection.obstacle, q_previous - before, time, time_step)
+                q_previous = before
+        return q_previous, work
+
+    def _struck(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
+        """Work [J] of an obstacle that changes velocities by change / t: the impulse times its own velocity."""
+        if not obstacle.path.leads_away:
+            return 0.0
+        way = obstacle.path.at(time) - obstacle.path.at(time - time_step)
+        mass = self.lattice.mass
+        return float(fetch(mass @ change[: len(mass)]) @ way) / time_step**2

@@ -1,0 +1,66 @@
+"""How a body is at time 0: where its nodes are, and how fast."""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.scene.schema import Start, Twist
+
+State = tuple[np.ndarray, np.ndarray]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+
+
+def at_rest(lattice: Lattice) -> State:
+    """The rest shape, without a copy."""
+    return lattice.nodes, np.zeros_like(lattice.nodes)
+
+
+def start_of(comm: MPI.Comm, start: Start | None, lattice: Lattice, held: np.ndarray, bounds: np.ndarray) -> State:
+    """A scene's start (collective).
+
+    held   : (l,) bool, nodes that stay at rest where they are
+    bounds : (2, 3) the body's bounding box at rest [m]
+    """
+    if start is None:
+        return at_rest(lattice)
+    middle = bounds.mean(axis=0)
+    q = middle + np.array(start.scale) * (lattice.nodes - middle)
+    if start.twist is not None:
+        q = twisted(q, start.twist, lattice.nodes, bounds)
+    if start.scatter > 0:
+        anywhere = bounds[0] + uniform(lattice.global_numbers) * (bounds[1] - bounds[0])
+        q = (1 - start.scatter) * q + start.scatter * anywhere
+    q[held] = lattice.nodes[held]
+    velocity = np.array(start.velocity) + np.cross(start.spin, q - centre_of_mass(comm, q, lattice.mass))
+    velocity[held] = 0
+    return q, velocity
+
+
+def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """q (n, 3) [m] turned about the axis through the middle of the bounds by an angle that grows with the place of the
+    ``nodes`` (n, 3) at rest along the axis: none where the bounds begin, all degrees where they end.
+
+    Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 - cos(angle))
+    """
+    a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
+    extent = np.abs(a) @ (bounds[1] - bounds[0])
+    angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
+    p = q - middle
+    along = (p @ a)[:, None] * a
+    return middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+
+
+def uniform(numbers: np.ndarray) -> np.ndarray:
+    """Three random numbers in [0, 1) for each global node number (n,): the same whatever ranks there are.
+
+    SplitMix64 (Steele, Lea and Flood 2014), at its place 3 n + c.
+    """
+    z = (3 * numbers[:, None] + np.arange(1, 4)).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return ((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
+
+
+def centre_of_mass(comm: MPI.Comm, q: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Of all ranks' owned nodes (3,) [m] (collective). q (l, 3) [m], mass (owned,) [kg]"""
+    total = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
+    return total[:3] / total[3]

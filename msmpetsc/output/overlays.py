@@ -1,0 +1,154 @@
+"""What stands beside the body at a time: obstacles, arrows for the forces, and the parts that are held.
+
+Geometry only, in the scene's axes [m]; it comes from the scene and the lattice of a result, nothing is drawn here.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from msmpetsc.model.paths import Path, within
+from msmpetsc.model.region import inside
+from msmpetsc.output.camera import Camera, unit
+from msmpetsc.scene.schema import Region, SceneFile
+
+ARROW = 0.2  # length of an arrow, of the body's longest side
+NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
+CUT = 1.3  # a longer box is cut to this, of the bodies' extent
+MARGIN = 0.08  # around the bodies, of their longest extent: so much larger a plane is drawn
+THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A plane that the body stands on or lies against: corners (4, 3) of the part drawn, unit normal (3,)."""
+
+    corners: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Of one panel.
+
+    grounds : planes drawn as they are
+    glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
+    arrows  : (2, 3) each, tail and tip
+    """
+
+    grounds: list[Ground]
+    glass: list[np.ndarray]
+    arrows: list[np.ndarray]
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(n, 3) of all obstacles."""
+        return np.concatenate([np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass])
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The body at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m]."""
+
+    nodes: np.ndarray
+    cells: np.ndarray
+    points: np.ndarray
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) corners of the surface's bounding box [m]."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+
+    def find(self, region: Region) -> np.ndarray:
+        """Which nodes (n,) bool a region means; none if it is painted in a file, which the result does not hold."""
+        if region.painted is None:
+            return inside(region, self.nodes, self.bounds)
+        where = np.zeros(len(self.nodes), bool)
+        if not isinstance(region.painted, str):
+            middles = KDTree(self.nodes[self.cells].mean(axis=1))
+            cells = middles.query(self.points[list(region.painted)], p=np.inf)[1]  # cubes: the nearest is around it
+            where[self.cells[cells]] = True
+        return where
+
+
+def marks_at(
+    scene: SceneFile, time: float, rest: Rest, position: np.ndarray, bodies: np.ndarray, camera: Camera
+) -> Marks:
+    """What stands beside the body at a time [s].
+
+    position : (n, 3) of the nodes at that time [m]
+    bodies   : (b, 3) surface points of all panels [m], which say how much of an obstacle is worth showing
+    """
+    grounds, glass = _obstacles(scene, time, bodies, camera)
+    return Marks(grounds, glass, _arrows(scene, time, rest, position))
+
+
+def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
+    grounds, glass = [], []
+    for obstacle in scene.obstacle:
+        if not within(time, obstacle.start, obstacle.stop):
+            continue
+        by = Path.through(obstacle.path).at(time)
+        if obstacle.shape == "box":
+            glass += _box(np.array(obstacle.box) + by, bodies)
+            continue
+        point, normal = np.array(obstacle.point) + by, np.array(obstacle.normal)
+        if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
+            continue
+        if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:
+            grounds.append(_patch(point, normal, bodies, np.array([camera.right, camera.away])))
+        else:
+            glass.append(_plate(_patch(point, normal, bodies, np.eye(3)), THICKNESS * _reach(bodies)))
+    return grounds, glass
+
+
+def _reach(bodies: np.ndarray) -> float:
+    return np.ptp(bodies, axis=0).max()
+
+
+def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, axes: np.ndarray) -> Ground:
+    """The rectangle of a plane that the bodies stand before, with a margin; one side as one of the axes if it can."""
+    across = min(axes, key=lambda axis: abs(axis @ normal))
+    one = unit(across - (across @ normal) * normal)
+    sides = np.array([one, np.cross(normal, one)])
+    reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
+    (left, low), (right, high) = reached.min(axis=0) - margin, reached.max(axis=0) + margin
+    corners = np.array([(left, low), (right, low), (right, high), (left, high)]) @ sides
+    return Ground(corners + (point @ normal) * normal, normal)
+
+
+def _plate(patch: Ground, thickness: float) -> np.ndarray:
+    """(8, 3) corners of a plate on the side of the plane where no body is."""
+    front = patch.corners[[0, 1, 3, 2]]
+    return np.concatenate([front, front - thickness * patch.normal])
+
+
+def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
+    """(8, 3) corners of a box (2, 3), cut along the axes where it is much longer than the bodies; none if far away."""
+    low, high = bodies.min(axis=0), bodies.max(axis=0)
+    extent = high - low
+    margin = (CUT - 1) / 2 * extent
+    long = box[1] - box[0] > CUT * extent
+    box = np.where(long, np.clip(box, low - margin, high + margin), box)
+    gap = np.maximum(box[0] - high, low - box[1]).max()
+    if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
+        return []
+    return [np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])]
+
+
+def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
+    length = ARROW * np.ptp(rest.bounds, axis=0).max()
+    found = []
+    for force in scene.force:
+        if within(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
+            tail = position[where].mean(axis=0)
+            found.append(np.array([tail, tail + length * unit(force.total)]))
+    return found
+
+
+def held(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
+    """Which nodes (n,) bool are pinned or led at a time."""
+    regions = [pin.region for pin in scene.pin]
+    regions += [anchor.region for anchor in scene.anchor if within(time, 0.0, anchor.stop)]
+    return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, regions)], axis=0)

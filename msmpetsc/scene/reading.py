@@ -1,0 +1,179 @@
+"""Scene file (TOML) and what the command line changes in it -> a checked Scene."""
+
+import re
+import tomllib
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+from pydantic import ValidationError
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene.problems import as_given, problem_lines
+from msmpetsc.scene.schema import Scene, SceneFile
+
+LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
+DEEPEST = 50  # parts of a key: tomllib takes time by their square
+KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE)
+
+
+def load_scene(
+    path: str | Path, overrides: Iterable[str] = (), presets: Collection[str] | None = None, by_user: bool = True
+) -> Scene:
+    """Read and check a scene file.
+
+    overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
+        number; they replace or insert before anything is checked.
+    presets: the known names of solver presets; any name will do if None.
+    by_user: whether the overrides are a user's own words, which may name files outside the folder; a file's may not.
+
+    Raises InputError naming every problem of the file, one a line.
+    """
+    path = Path(path)
+    return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
+
+
+def scene_of(
+    path: Path,
+    file_text: str,
+    overrides: Iterable[str] = (),
+    presets: Collection[str] | None = None,
+    by_user: bool = True,
+    to_read: bool = True,
+) -> Scene:
+    """The same of a text that stood in the file.
+
+    to_read: whether the files that it names are to be read
+    """
+    overrides, data = list(overrides), _parse(path, file_text)
+    keys = {_override(data, override): override for override in overrides}
+    try:
+        checked = SceneFile.model_validate(data, context={"presets": presets})
+    except ValidationError as error:
+        raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
+    if to_read:
+        _refuse_outside(path, checked, keys if by_user else ())
+    return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+
+
+def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
+    """Text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    text = _read(path, kind)
+    return text, _parse(path, text)
+
+
+def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]]) -> None:
+    """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name."""
+    for keys, name in scene.named_files():
+        if any(keys[: len(own)] == own for own in given) or lies_below(path.parent, name):
+            continue
+        key = ".".join(map(str, keys))
+        raise InputError(
+            f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it; --set {key}=PATH allows it"
+        )
+
+
+def lies_below(folder: Path, name: str) -> bool:
+    """Whether a path from ``folder`` leads to what lies in it, links followed."""
+    path = folder / name
+    try:
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
+            path.resolve(strict=True)  # from Python 3.13 on a loop of links is an error only so
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a null character, a name too long
+        return False
+
+
+def _read(path: Path, kind: str) -> str:
+    try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise InputError(f"{path}: is a pipe or a device, not a {kind} file")
+        with open(path, "rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            raise InputError(f"{path}: is too long for a {kind} file: more than {LONGEST / 2**20:g} MiB")
+        return content.decode("utf-8-sig")  # -sig: some editors start the file with a byte order mark
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such {kind} file") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, not a {kind} file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not UTF-8 text (byte {error.start})") from None
+    except ValueError:
+        raise InputError(f"{as_given(str(path))}: no path has a null character") from None
+
+
+def toml_of(text: str) -> dict[str, Any]:
+    """Its data. Raises ValueError for what is not TOML, RecursionError for what is nested too deeply."""
+    if DEEP_KEY.search(text):
+        raise RecursionError
+    return tomllib.loads(text)
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return toml_of(text)
+    except tomllib.TOMLDecodeError as error:
+        last = text.rstrip().count("\n") + 1
+        problem = str(error).replace("at end of document", f"at the end, line {last}")
+        raise InputError(f"{path}: is not TOML: {problem}") from None
+    except RecursionError:
+        raise InputError(f"{path}: is nested too deeply") from None
+    except ValueError:  # all that tomllib leaves to int(): Python's limit on digits
+        raise InputError(f"{path}: has an integer of too many digits") from None
+
+
+def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
+    """Carry out one "key.path=value" in ``data``; returns the key path."""
+    try:
+        if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
+            raise InputError("is not UTF-8 text")
+        name, equals, raw = override.partition("=")
+        path = tuple(int(key) if key.isdecimal() and len(key) < 10 else key for key in name.strip().split("."))
+        if not equals or not raw.strip() or "" in path:
+            raise InputError("must read key.path=value")
+        if len(path) > DEEPEST:
+            raise InputError("is nested too deeply")
+        value = _override_value(raw.strip())
+        holder: Any = data
+        for key, following in zip(path, path[1:], strict=False):
+            empty = [] if isinstance(following, int) else {}
+            holder = _put(holder, key, empty, replace=False)
+        _put(holder, path[-1], value, replace=True)
+    except InputError as error:
+        raise InputError(f"--set {as_given(override)}: {error}") from None
+    return path
+
+
+def _override_value(raw: str) -> Any:
+    try:
+        parsed = toml_of(f"value = {raw}")
+    except (ValueError, RecursionError):
+        if raw[0] in "\"'[{" or "\n" in raw:
+            raise InputError("the value is not TOML") from None
+        return raw
+    if set(parsed) != {"value"}:
+        raise InputError("must hold a single value")
+    return parsed["value"]
+
+
+def _put(holder: Any, key: str | int, value: Any, replace: bool) -> Any:
+    """Put ``value`` at ``key`` of a table or list (where absent, or ``replace``); returns what is there then."""
+    if isinstance(holder, dict):
+        key = str(key)
+        if replace or key not in holder:
+            holder[key] = value
+    elif not isinstance(holder, list):
+        raise InputError(f"{key!r} has no place in {as_given(holder)}, which is no table or list")
+    elif not isinstance(key, int) or key > len(holder):
+        raise InputError(f"{key!r} is no item of a list of {len(holder)}: the next would be {len(holder)}")
+    elif key == len(holder):
+        holder.append(value)
+    elif replace:
+        holder[key] = value
+    return holder[key]

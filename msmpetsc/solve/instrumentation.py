@@ -1,0 +1,69 @@
+"""What is measured of a run beside its frames: true errors, the way of one step, where the time went."""
+
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.solve.nonlinear.step import LOCAL_EVENT, Stepper
+
+EVENTS = {"factor": "PCSetUp", "local": LOCAL_EVENT, "ksp": "KSPSolve"}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a run is asked for.
+
+    true_error : every so many steps the true error is measured; None for never
+    trace      : the step whose iterates are followed; None for none
+    """
+
+    true_error: int | None = None
+    trace: int | None = None
+
+    def asks(self, index: int) -> bool:
+        return index == self.trace or (self.true_error is not None and index % self.true_error == 0)
+
+
+@dataclass
+class Trace:
+    """The iterates of a step: at each its number, the KSP iterations and seconds so far, positions (l, 3) [m]."""
+
+    iteration: list[int] = field(default_factory=list)
+    ksp_its: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    positions: list[np.ndarray] = field(default_factory=list)
+
+    def follow(self, stepper: Stepper) -> None:
+        """From now on, which is when the step begins."""
+        begin, before = perf_counter(), stepper.all_its()
+
+        def observe(stepper: Stepper) -> None:
+            nonlocal begin
+            now = perf_counter()
+            self.iteration.append(len(self.iteration))
+            self.ksp_its.append(stepper.all_its() - before)
+            self.seconds.append(now - begin)
+            self.positions.append(stepper.functional.q.copy())
+            begin += perf_counter() - now  # not of the step
+
+        stepper.observer = observe
+
+    def told(self, index: int, errors: np.ndarray) -> dict:
+        """As plain lists, with the errors (k, 2) of the iterates."""
+        lists = {"iteration": self.iteration, "ksp_its": self.ksp_its, "seconds": self.seconds}
+        return {"frame": index, **lists, "position_error": errors[:, 0].tolist(), "energy_error": errors[:, 1].tolist()}
+
+
+def begin_timing() -> None:
+    """PETSc's events are timed from here on."""
+    PETSc.Log.begin()
+
+
+def times(comm: MPI.Comm) -> dict[str, float]:
+    """Seconds in the events of PETSc's main stage, the greatest of all ranks (collective)."""
+    return {
+        name: comm.allreduce(PETSc.Log.Event(event).getPerfInfo()["time"], MPI.MAX) for name, event in EVENTS.items()
+    }

@@ -1,0 +1,66 @@
+"""What a step starts from."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.linear.ghosted import with_ghosts
+
+HISTORY, SIDES = ("history_q", "history_v"), "sides"
+
+
+@dataclass(frozen=True)
+class State:
+    """q_n and q_(n-1), (l, 3) [m], ghosts included; the velocity is (q_n - q_(n-1)) / t. After contact a step's are
+    not what the frame shows, which is the step as it was solved.
+
+    history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
+    sides   : (o, l) by which faces of the obstacles nodes are in contact (model.environment); None: the nearest
+    """
+
+    q: np.ndarray
+    q_previous: np.ndarray
+    history: tuple[np.ndarray, np.ndarray] | None = None
+    sides: np.ndarray | None = None
+
+    def velocity(self, time_step: float) -> np.ndarray:
+        """(l, 3) [m/s]"""
+        return (self.q - self.q_previous) / time_step
+
+    def over(self, time_step: float, shorter: float) -> "State":
+        """The same for steps of another length, which have no history yet."""
+        return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
+
+    def save(self, saved: Saved, owned: int, looks_back: bool, has_sides: bool) -> None:
+        """looks_back, has_sides : whether the integrator has a use for the history, and contact for the sides"""
+        saved.rows |= {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
+        if looks_back:
+            saved.numbers["history"] = self.history is not None
+            history = self.history or (np.zeros((owned, 3)),) * 2
+            saved.rows |= {name: rows[:owned] for name, rows in zip(HISTORY, history, strict=True)}
+        if has_sides:
+            saved.rows[SIDES] = 1.0 * self.sides[:, :owned].T
+
+    @staticmethod
+    def restored(comm: MPI.Comm, lattice: Lattice, saved: Saved) -> "State":
+        """Collective."""
+        names = ("q", "q_previous", *HISTORY) if saved.count("history", 1) else ("q", "q_previous")
+        q, q_previous, *history = (with_ghosts(comm, lattice, saved.row(name)) for name in names)
+        sides = _sides(comm, lattice, saved.rows[SIDES]) if SIDES in saved.rows else None
+        return State(q, q_previous, tuple(history) or None, sides)
+
+
+def _sides(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
+    """(o, l) from the owned ones (owned, o), three at a time (collective)."""
+    count = rows.shape[1]
+    sides = np.zeros((count, len(lattice.nodes)), np.int8, like=lattice.nodes)
+    for first in range(0, count, 3):
+        three = np.zeros((lattice.owned, 3))
+        three[:, : min(3, count - first)] = rows[:, first : first + 3]
+        whole = with_ghosts(comm, lattice, three)
+        for row in range(first, min(first + 3, count)):
+            sides[row] = whole[:, row - first]
+    return sides

@@ -1,0 +1,280 @@
+"""Velocity Verlet: a step t of the scene in N substeps dt under the stability limit, with nothing to solve.
+
+Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact included:
+
+    v_(n+1/2) = v_n + dt/2 a(q_n),    q_(n+1) = q_n + dt v_(n+1/2),    v_(n+1) = v_(n+1/2) + dt/2 a(q_(n+1))
+
+The two half kicks at one time are one, but for a step's first and last: so v is of the same time as q wherever a
+frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
+"""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import beside, greatest
+from msmpetsc.backend.kernel import each
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.build import Model
+from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.environment import Surroundings
+from msmpetsc.scene import schema as scene
+from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.solve.integrators.stability_limit import HighestMode
+from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.petsc.options import refuse_unused
+
+SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
+RETRIES = 4  # of a step
+MOST_SUBSTEPS = 1e6  # of a step
+TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
+
+
+class Verlet:
+    """The substeps of one model. ``time.substep`` may only shorten them."""
+
+    looks_back = False
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        model: Model,
+        surroundings: Surroundings,
+        time: scene.Time,
+        _: scene.Solver,
+        measured: Measured = Measured(),
+    ):
+        if measured != Measured():
+            raise InputError("the true error and the trace are of a step that is solved: verlet has none")
+        self.comm, self.lattice, self.around = comm, model.lattice, surroundings
+        self.time_step, self.substep = time.step, time.substep or np.inf
+        self.elasticity = Elasticity(comm, self.lattice)
+        self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
+        self.highest = HighestMode(comm, self.lattice, self.elasticity)
+        owned = self.lattice.owned
+        self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
+        self.before = np.empty_like(self.q)
+        self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
+        self.sides = surroundings.no_sides[:, :owned]
+        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
+        self.known = None  # the positions that ``gradient`` and the highest frequency are of
+        self.anchors = None  # how many hold
+        springs = slice(self.lattice.springs_owned)
+        crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
+        self.most = TORN * comm.allreduce(crushed)  # [J]
+
+    @property
+    def unknowns(self) -> int:
+        """Free nodes of this rank: pinned ones and led ones aside."""
+        return int((~self.around.pinned_at(self.time_step)[: self.lattice.owned]).sum())
+
+    def set_up(self) -> None:
+        """There is no matrix to make ready."""
+
+    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
+        """Raise InputError for PETSc options of the user, which have no use here (collective)."""
+        refuse_unused(self.comm, set(), at_end, awaited)
+
+    def save(self, saved: Saved, state: State) -> None:
+        """grad E is found again from q, if it is known of that."""
+        saved.rows["mode"] = self.highest.mode.values[: self.lattice.owned]
+        if self.anchors is not None:  # it has taken a step
+            saved.numbers |= {"squared": self.highest.squared, "known": state.q is self.known}
+        else:
+            saved.numbers |= {"squared": -1.0, "known": False}
+        saved.numbers["substep"] = self.substep
+
+    def restore(self, saved: Saved, state: State, time: float) -> None:
+        """Go on after a step that ended at ``time`` (collective)."""
+        squared = saved.number("squared", -1.0, -1.0, np.finfo(float).max)
+        if squared < 0:
+            return
+        self._hold(time)
+        self.highest.mode.values[: self.lattice.owned] = beside(self.v, saved.row("mode"))
+        self.highest.mode.update()
+        self.highest.squared, self.substep = squared, saved.number("substep", self.substep, np.finfo(float).tiny)
+        if saved.count("known", 1):
+            self.known = state.q
+            self.position.values[:] = state.q
+            sides = self.around.no_sides if state.sides is None else state.sides
+            self.sides = sides[:, : self.lattice.owned]
+            self._pull(time)
+
+    def forget(self) -> None:
+        """Let the steps so far leave no trace in the next."""
+        self.known = self.anchors = None
+
+    def advance(self, state: State, time: float) -> tuple[StepResult, State]:
+        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
+
+        Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body.
+        """
+        start = time - self.time_step
+        self._begin(state, start)
+        pushed = self._pushed(start, time)
+        squared = pushed + (self.highest.squared or self._elastic_squared())
+        for _ in range(1 + RETRIES):
+            count = self._count(squared)
+            begun = self._squared_acceleration(start)
+            with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
+                self._take(count, start, time)
+            energy, dt = self._energy(), self.time_step / count
+            after = pushed + self._elastic_squared() if energy <= self.most else np.inf
+            if dt**2 * after <= 4:
+                return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
+            squared = np.clip(after, 2 * squared, 16 * squared)
+            self._begin(state, start)
+        raise StepFailed(
+            f"became unstable: elastic energy {energy:.2e} J after substeps of {dt:.2e} s; "
+            "try a smaller time.step, a softer material, or implicit-euler",
+            "unstable",
+        )
+
+    def _begin(self, state: State, start: float) -> None:
+        """q, v and grad E of a state."""
+        self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
+        self._hold(start)
+        self.work = 0.0
+        if state.q is not self.known:
+            self.position.values[:] = state.q
+            self._meet(state, start)
+            self._pull(start)
+            self.highest.squared = 0.0
+
+    def _meet(self, state: State, time: float) -> None:
+        """The sides of a state."""
+        before = None if state.sides is None else state.sides[:, : self.lattice.owned]
+        self.sides = self.around.met(self.q, self.q, time, 0.0, before, self.held)
+
+    def _take(self, count: int, start: float, time: float) -> None:
+        """All substeps of a step."""
+        self.known = None
+        times = np.linspace(start, time, 1 + count).tolist()
+        duration = 0.5 * (times[1] - start)
+        for begin, end in zip(times, times[1:], strict=False):
+            self._kick(begin, duration, begin, end)
+            self._drift(begin, end)
+            self.work += self.around.appearing(self.q, begin, end, self.sides)
+            self._pull(end)
+            duration = end - begin
+        self._kick(time, 0.5 * duration, begin, time)
+
+    def _squared_acceleration(self, time: float) -> float:
+        """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
+        force = (self.around.load(time) - self.gradient[: self.lattice.owned])[self.free]
+        return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
+
+    def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
+        self.velocity.update()
+        self.known = self.position.values.copy()
+        previous = self.known - self.time_step * self.velocity.values
+        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True, swing=swing)
+        return result, State(self.known, previous, sides=self.sides)
+
+    def _pull(self, time: float) -> None:
+        """grad E at q, with what obstacles push."""
+        self.gradient[:] = 0
+        self.elasticity.add_gradient(self.position.values, self.gradient)
+        contact = self.around.push(time, self.sides)
+        if contact:
+            contact.add_gradient(self.q, self.gradient)
+
+    def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
+        """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
+        load = self.around.load(time)
+        kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
+        self.work += duration * self.around.power(self.q, time, begin, end, self.sides)
+        self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
+
+    def _drift(self, begin: float, end: float) -> None:
+        """q to the end of a substep: led nodes along their path, nodes that strike something back."""
+        self._hold(end)
+        drift(len(self.free), self.free, self.v, end - begin, self.q)
+        if self.anchors:
+            self._lead(begin, end)
+        if self.around.reflections or self.around.has_sides:
+            self._strike(begin, end)
+        self.position.update()
+
+    def _lead(self, begin: float, end: float) -> None:
+        led = self.around.led(self.position.values, end)[: self.lattice.owned]
+        where = np.flatnonzero(self.held & ~self.lattice.pinned[: self.lattice.owned])
+        self.v[where] = (led[where] - self.q[where]) / (end - begin)
+        self.q[where] = led[where]
+
+    def _strike(self, begin: float, end: float) -> None:
+        """By which faces nodes come into contact. One that bounces off is set back, and its velocity is what then led it
+        there."""
+        np.multiply(self.v, begin - end, out=self.before)
+        self.before += self.q
+        self.sides = self.around.met(self.before, self.q, end, end - begin, self.sides, self.held)
+        after, before, work = self.around.reflect(self.q, self.before, end, end - begin, self.held, self.sides)
+        self.work += work
+        if after is not self.q:
+            struck = np.flatnonzero((after != self.q).any(axis=1))
+            self.v[struck] = (after[struck] - before[struck]) / (end - begin)
+            self.q[struck] = after[struck]
+
+    def _hold(self, time: float) -> None:
+        """Know the free nodes anew where an anchor's time has come."""
+        anchors = len(self.around.held_at(time))
+        if anchors != self.anchors:
+            self.anchors = anchors
+            self.held = self.around.pinned_at(time)[: self.lattice.owned]
+            self.free = np.flatnonzero(~self.held)
+            self.highest.hold(self.held)
+
+    def _pushed(self, start: float, time: float) -> float:
+        """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
+        fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
+        speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
+        speed = self.comm.allreduce(speed, MPI.MAX)
+        pushed = self.around.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
+        return self.comm.allreduce(greatest(pushed), MPI.MAX)
+
+    def _count(self, squared: float) -> int:
+        """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""
+        limit = SAFETY * 2 / np.sqrt(squared) if squared > 0 else np.inf
+        if limit < self.substep < np.inf:
+            log.warning(
+                "time.substep = %.3g s is beyond the stability limit: %.3g s is taken, and under it later",
+                self.substep, limit,
+            )  # fmt: skip
+            self.substep = np.inf  # said once
+        count = self.time_step / min(limit, self.substep)
+        if not count < MOST_SUBSTEPS:
+            raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler", "unstable")
+        return max(1, int(np.ceil(count * (1 - 1e-12))))
+
+    def _elastic_squared(self) -> float:
+        return self.highest.squared_at(self.position.values)
+
+    def _energy(self) -> float:
+        """E of the springs [J] (collective)."""
+        return self.comm.allreduce(self.elasticity.energy(self.position.values))
+
+    def destroy(self) -> None:
+        """Collective."""
+        for field in (self.position, self.velocity, self.highest):
+            field.destroy()
+
+
+@each
+def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
+    """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
+    for row in range(first, count, step):
+        i = rows[row]
+        for c in range(3):
+            v[i, c] += duration * per_mass[i] * (load[i, c] - gradient[i, c])
+
+
+@each
+def drift(first, count, step, rows, v, duration, q):
+    """q += duration v at the rows of (l, 3) arrays."""
+    for row in range(first, count, step):
+        i = rows[row]
+        for c in range(3):
+            q[i, c] += duration * v[i, c]

@@ -1,0 +1,182 @@
+"""What PETSc's solvers see: operators and a preconditioner on vectors of three coordinates.
+
+Each is a Python context over the scalar matrix A, which acts on the m x 3 block that a vector of
+unknowns is: one product or one solve for three right-hand sides.
+"""
+
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.explicit import asks_for_entries, explicit
+from msmpetsc.solve.petsc.memory import HOST, Memory
+
+DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
+
+
+class Block:
+    """PETSc dense m x 3 matrix that vectors of unknowns are copied into and out of."""
+
+    def __init__(self, matrix: PETSc.Mat, memory: Memory):
+        rows, _ = matrix.getSizes()
+        self.mat, self.memory = memory.dense(rows, 3, matrix.comm), memory
+        self.destroy = self.mat.destroy
+
+    @property
+    def values(self) -> np.ndarray:
+        """x, then y, then z; to be read or written at once."""
+        return self.memory.values(self.mat)
+
+
+class ContactBlocks:
+    """t^2 (Hessian of contact): a 3 x 3 block for each node in contact, added to either operator below."""
+
+    def __init__(self, unknowns: Unknowns, time_step: float):
+        self.t2, self.unknowns, self.parts = time_step**2, unknowns, []
+        row = np.full(unknowns.lattice.owned, -1)
+        row[fetch(unknowns.free)] = np.arange(unknowns.size)
+        self.row = beside(unknowns.free, row)
+
+    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
+        """Take the blocks at positions q, ``true`` ones or such as go with A."""
+        self.parts = []
+        for nodes, blocks in contact.hessian(q, true) if contact else ():
+            free = np.flatnonzero(self.row[nodes] >= 0)
+            if len(free):
+                self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
+
+    def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y += blocks x."""
+        if self.parts:
+            x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
+        for rows, blocks in self.parts:
+            y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
+
+
+class Viewable:
+    """A MATPYTHON context that can be written to a file: an empty one would be all that PETSc could make of it."""
+
+    unknowns: Unknowns
+
+    def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        if asks_for_entries(viewer):
+            matrix = explicit(operator, self.unknowns)
+            matrix.view(viewer)
+            matrix.destroy()
+
+
+class ThreeColumns(Viewable):
+    """A (x) I_3 without forming it; ``contact`` is None where the scene has no penalty."""
+
+    def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
+        self.matrix, self.unknowns, self.memory, self.contact = matrix, unknowns, unknowns.memory, contact
+        self.input = Block(matrix, self.memory)
+        self.product = matrix.matMult(self.input.mat)
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.input.values[:] = self.memory.read(x)
+        self.matrix.matMult(self.input.mat, result=self.product)
+        self.memory.write(y)[:] = self.memory.values(self.product)
+        if self.contact:
+            self.contact.add(x, y)
+
+    def destroy(self, _: PETSc.Mat) -> None:
+        self.input.destroy()
+        self.product.destroy()
+
+
+class TrueHessian(Viewable):
+    """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring."""
+
+    def __init__(
+        self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, contact: ContactBlocks | None = None
+    ):
+        self.unknowns, self.elasticity, self.t2, self.contact = unknowns, elasticity, time_step**2, contact
+        lattice = unknowns.lattice
+        self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
+        self.product = np.empty_like(lattice.nodes)
+
+    def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool = False) -> None:
+        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs)."""
+        self.elastic = self.elasticity.hessian_at(q, projected)
+        if self.contact:
+            self.contact.linearise(contact, q, True)
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.unknowns.to_nodes(x, self.v)
+        self.product[:] = 0
+        self.elastic.add_product(self.v, self.product)
+        self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+        if self.contact:
+            self.contact.add(x, y)
+
+
+class Preconditioned:
+    """What stands for A where PETSc wants a matrix to precondition with, 3m x 3m: a MATPYTHON that A is seen through."""
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.matrix = matrix
+
+    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        self.matrix.view(viewer)
+
+
+class Preconditioner:
+    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
+
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
+    preconditioned with.
+
+    matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
+    """
+
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str):
+        self.matrix, self.memory, self.columns, self.blocks = matrix, memory, columns, []
+        self.pc = PETSc.PC().create(matrix.comm)
+        self.pc.setOptionsPrefix(prefix)
+        self.pc.setOperators(matrix)
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        self.pc.setFromOptions()
+
+    def setUp(self, _: PETSc.PC) -> None:
+        self.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        if self.columns == 1:
+            self.pc.apply(x, y)
+            return
+        given, found = self.blocks = self.blocks or self._create_blocks()
+        values = given.values
+        values[:] = beside(values, self.memory.read(x))
+        self.pc.matApply(given.mat, found.mat)
+        y = self.memory.write(y)
+        y[:] = beside(y, found.values)
+
+    def _create_blocks(self) -> list[Block]:
+        """Where the inner one works: a direct solver does on the CPU."""
+        memory = HOST if self.pc.getType() in DIRECT else self.memory
+        return [Block(self.matrix, memory), Block(self.matrix, memory)]
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.pc.view(viewer)
+
+    def destroy(self, _: PETSc.PC) -> None:
+        for part in (*self.blocks, self.pc):
+            part.destroy()
+
+
+def python_matrix(
+    unknowns: Unknowns, context: ThreeColumns | TrueHessian | Preconditioned, comm: PETSc.Comm
+) -> PETSc.Mat:
+    """A MATPYTHON on vectors of unknowns."""
+    size = (3 * unknowns.size, 3 * unknowns.total)
+    matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
+    matrix.setName(type(context).__name__)
+    matrix.setVecType(unknowns.memory.vec_type)
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    matrix.setUp()
+    return matrix

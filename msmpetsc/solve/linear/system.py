@@ -1,0 +1,73 @@
+"""The constant matrix A = M + t^2 L as a PETSc matrix (paper Eq. 15-17, without the Kronecker factor).
+
+A is scalar, m x m over the free nodes; solve.linear.operators lets it act on three coordinates at once.
+"""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import coo_array
+
+from msmpetsc.backend.arrays import fetch
+from msmpetsc.errors import InputError
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.limits import refuse_nonzeros
+
+
+def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int = 1, prefix: str = "") -> PETSc.Mat:
+    """A = M + t^2 L [kg] as a PETSc matrix; ``-mat_type`` chooses its type (collective).
+
+    columns : 1 for A, m x m; 3 for A (x) I_3, 3m x 3m, as methods have it that do not see that it is three times A
+
+    Raises InputError for more nonzeros than PETSc can count, and for a type whose vectors are not where the arrays are.
+    """
+    lattice = unknowns.lattice
+    row, free = np.full(len(lattice.nodes), -1), fetch(unknowns.free)
+    row[free] = np.arange(unknowns.size)
+    weight = time_step**2 * lattice.stiffness
+    ends = np.concatenate([lattice.springs, lattice.springs[:, ::-1]])
+    diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[free]
+    diagonal += fetch(lattice.mass)[free]
+    kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
+    refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
+    rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
+    nodes = np.concatenate([free, ends[kept, 1]])
+    values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])
+    places = unknowns.numbers[:, None] if columns == 1 else unknowns.places
+    sizes = (columns * unknowns.size, columns * unknowns.total)
+    rows = (rows + unknowns.size * np.arange(columns)[:, None]).ravel()
+    csr = coo_array((np.tile(values, columns), (rows, places[nodes].T.ravel())), shape=sizes).tocsr()
+
+    matrix = PETSc.Mat().create(comm=comm)
+    matrix.setOptionsPrefix(prefix)
+    matrix.setSizes((sizes, sizes))
+    matrix.setType(unknowns.memory.mat_type)
+    matrix.setOption(PETSc.Mat.Option.SPD, True)
+    matrix.setFromOptions()
+    matrix.setName("A" if columns == 1 else "A (x) I_3")
+    _check_memory(matrix, unknowns)
+    matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
+    return matrix
+
+
+class ViewOfA:
+    """Keeps -mat_view to A, which is assembled by now: PETSc would show all matrices, its own and those of solvers, and
+    write each into the same file. Given back by ``destroy``."""
+
+    def __init__(self, prefix: str):
+        self.option, given = f"{prefix}mat_view", PETSc.Options().getAll()
+        self.is_given, self.value = self.option in given, given.get(self.option)
+        if self.is_given:
+            PETSc.Options().delValue(self.option)
+
+    def destroy(self) -> None:
+        if self.is_given:
+            PETSc.Options().setValue(self.option, self.value)
+            PETSc.Options().getString(self.option)  # it has been of use
+
+
+def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
+    given, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
+    if ("cusparse" in given) != on_gpu:
+        prefix = matrix.getOptionsPrefix() or ""
+        raise InputError(f"-{prefix}mat_type {given}: the run computes on the {'GPU' if on_gpu else 'CPU'}")

@@ -1,0 +1,115 @@
+"""Which PETSc unknown is which coordinate of which node.
+
+Pinned nodes are no unknowns. A vector of unknowns holds, on each rank, the x of its free nodes,
+then their y, then their z: so its local array is an m x 3 dense block, which a scalar m x m matrix
+can multiply at once.
+"""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.backend.kernel import each
+from msmpetsc.comm import Route
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.petsc.limits import refuse_unknowns
+from msmpetsc.solve.petsc.memory import memory_of
+
+
+class Unknowns:
+    """The free nodes of a lattice, numbered over all ranks, and the scatter that fills the ghosts.
+
+    free    : (m,) local numbers of the free owned nodes, where the lattice's arrays are
+    numbers : (l,) global number of each local node among the free ones, -1 where pinned
+    places  : (l, 3) where its x, y and z stand in a vector of unknowns, of no meaning where pinned
+    total   : number of free nodes on all ranks
+    memory  : what PETSc's vectors are in
+
+    Raises InputError for more of them than PETSc can number.
+    """
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.lattice, self.memory = lattice, memory_of(lattice.nodes)
+        self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
+        self.size = len(self.free)
+        first = comm.exscan(self.size) or 0
+        self.total = comm.allreduce(self.size)
+        refuse_unknowns(self.total)
+        own = np.full(lattice.owned, -1, np.int64)
+        own[fetch(self.free)] = first + np.arange(self.size)
+        to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
+        asked = to_owner.send(lattice.ghosts) - lattice.table.first
+        self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
+        place = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
+        self.places = np.concatenate([place, to_owner.answer(place[asked])])
+        self._scatter_ghosts(comm)
+
+    def _scatter_ghosts(self, comm: MPI.Comm) -> None:
+        owned = self.lattice.owned
+        free_ghosts = owned + np.flatnonzero(self.numbers[owned:] >= 0)
+        sources = self.places[free_ghosts].ravel().astype(PETSc.IntType)
+        self.free_ghosts = beside(self.free, free_ghosts)
+        self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
+        self.ghost_values = PETSc.Vec().create(PETSc.COMM_SELF)
+        self.ghost_values.setSizes(len(sources))
+        self.ghost_values.setType(self.memory.vec_type)
+        vector = self.create_vector(comm)
+        index = PETSc.IS().createGeneral(sources, comm=comm)
+        self.scatter = PETSc.Scatter().create(vector, index, self.ghost_values, None)
+        index.destroy()
+        vector.destroy()
+
+    def create_vector(self, comm: MPI.Comm) -> PETSc.Vec:
+        vector = PETSc.Vec().create(comm)
+        vector.setSizes((3 * self.size, 3 * self.total))
+        vector.setType(self.memory.vec_type)
+        return vector
+
+    def columns(self, vector: PETSc.Vec) -> np.ndarray:
+        """A vector of unknowns as (3, m), not to be written to."""
+        return self.memory.read(vector).reshape(3, self.size)
+
+    def columns_to_write(self, vector: PETSc.Vec) -> np.ndarray:
+        return self.memory.write(vector).reshape(3, self.size)
+
+    def to_nodes(self, vector: PETSc.Vec, nodes: np.ndarray) -> None:
+        """Write unknowns into the free rows, ghosts included, of ``nodes`` (l, 3) (collective)."""
+        if self.has_ghosts:
+            self.scatter.scatter(vector, self.ghost_values)
+        _spread(self.size, self.columns(vector), self.free, nodes)
+        if len(self.free_ghosts):
+            nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
+
+    def from_nodes(self, nodes: np.ndarray, vector: PETSc.Vec) -> None:
+        """Write the free owned rows of ``nodes`` (>= owned, 3) into the unknowns."""
+        _collect(self.size, nodes, self.free, self.columns_to_write(vector))
+
+    def scaled_sum(self, a: np.ndarray, t2: float, b: np.ndarray, vector: PETSc.Vec) -> None:
+        """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
+        _scaled_sum(self.size, self.lattice.mass, a, t2, b, self.free, self.columns_to_write(vector))
+
+    def destroy(self) -> None:
+        self.scatter.destroy()
+        self.ghost_values.destroy()
+
+
+@each
+def _spread(first, count, step, columns, rows, nodes):
+    for i in range(first, count, step):
+        for c in range(3):
+            nodes[rows[i], c] = columns[c, i]
+
+
+@each
+def _collect(first, count, step, nodes, rows, columns):
+    for i in range(first, count, step):
+        for c in range(3):
+            columns[c, i] = nodes[rows[i], c]
+
+
+@each
+def _scaled_sum(first, count, step, mass, a, t2, b, rows, columns):
+    for i in range(first, count, step):
+        for c in range(3):
+            columns[c, i] = mass[rows[i]] * a[rows[i], c] + t2 * b[rows[i], c]

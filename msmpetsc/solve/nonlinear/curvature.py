@@ -1,0 +1,241 @@
+"""Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
+
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
+positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
+for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
+the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when
+the body is compressed anew or more than it was, or something showed a negative curvature; at all other steps the mode
+found last is followed in a few iterations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import beside, fetch, greatest
+from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.initial_state import uniform
+from msmpetsc.solve.linear.operators import Preconditioner, TrueHessian
+from msmpetsc.solve.nonlinear.functional import StepFunctional
+
+BLOCK = 4  # directions of a long search
+MOST = 100  # iterations of it
+LEAST = 12  # of one that finds nothing
+FOLLOWED = 2  # of a short one, of two directions
+SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
+SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
+MORE = 1.25  # times the compression of the last long search: time for another, for modes come and go
+ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
+TINY = np.finfo(float).tiny
+DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
+
+Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
+
+
+@dataclass(frozen=True)
+class Compression:
+    """Of all ranks: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+
+    greatest: float
+    total: float
+    resists: bool
+
+    @property
+    def is_harmless(self) -> bool:
+        """H is positive definite for certain: M outweighs all that is negative in it."""
+        return self.least_curvature > 0
+
+    @property
+    def least_curvature(self) -> float:
+        """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
+        return max(1 - self.greatest, 0.0) if not self.resists else 0.0
+
+    def exceeds(self, other: "Compression") -> bool:
+        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
+
+
+NONE = Compression(0.0, 0.0, False)
+
+
+class LowestCurvature:
+    """Looks for directions of negative curvature of a step's Hessian. All methods but properties are collective.
+
+    preconditioner : of the step's linear solves
+    """
+
+    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner):
+        self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
+        self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
+        self.its = 0  # of all searches so far, one product with H each
+        self.searched = NONE  # the compression that the last long search was at
+        self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.vectors: list[PETSc.Vec] | None = None
+        self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
+
+    def compression(self, q: np.ndarray) -> Compression:
+        """At positions q (l, 3) [m]."""
+        functional, free = self.functional, self.unknowns.free
+        elasticity = functional.elasticity
+        shares = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
+        found = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
+        most, sums, resist = zip(*found, strict=True)
+        return Compression(max(most), sum(sums), any(resist))
+
+    def lowest(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray]:
+        """The lowest eigenvalue of M^(-1) H that was found, and a direction (n,) of about that curvature, about where H
+        was linearised last.
+
+        alarmed : something showed a negative curvature
+        hint    : a direction that may have part in it
+        """
+        if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
+            self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
+            values, modes = self._search_at_length(hint)
+        else:
+            values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
+        if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
+            self.mode = None
+            return -np.inf, self._random(1)[0]
+        self.mode = modes[0].copy()
+        if values[0] < 0:
+            return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
+        return values[0], self.mode
+
+    def _way_down(self, modes: np.ndarray) -> np.ndarray:
+        """What a random direction has of all of them (k, n): where a body may buckle to many sides, no matter which of
+        them rounding has made the first, so that it goes the same way on any ranks."""
+        direction = self._sum(fetch((modes * self.functional.mass) @ self._random(1)[0]))
+        return beside(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
+
+    def _search_at_length(self, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
+        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
+        for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
+        start = self._random(BLOCK)
+        if hint is not None:
+            start[0] += self._unit(self.memory.read(hint)[None])[0]
+        self.rigid = self._rigid_motions()
+        _, modes = self._iterate(self._without_rigid(start), MOST, LEAST)
+        known = [] if self.mode is None else [self.mode[None]]
+        rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
+        return self._iterate(np.concatenate([modes, *known, *rigid]), MOST, LEAST // 2)
+
+    def _random(self, count: int) -> np.ndarray:
+        """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
+        lattice, free = self.functional.lattice, fetch(self.unknowns.free)
+        numbers = lattice.global_numbers[: lattice.owned][free]
+        seeds = lattice.table.total * np.arange(count)
+        random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
+        return self._unit(self._preconditioned(beside(self.functional.mass, random)))
+
+    def _iterate(self, start: np.ndarray, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest eigenvalues (k,) that the iterations come to from directions (l, n), and theirs (k, n)."""
+        size, mass = min(BLOCK, len(start)), self.functional.mass
+        values, (x, last) = self._ritz((start, self._product(start)), size)
+        size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
+        for its in range(1, most + 1):
+            residuals = self._without_rigid(self._preconditioned(x[1] - beside(mass, values)[:, None] * mass * x[0]))
+            w = self._unit(residuals)
+            blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
+            values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
+            lowest.append(values[0])
+            self.its += len(w)
+            if lowest[-1] < 0:
+                if its >= 2 and lowest[-1] > SHARPENED * lowest[-3]:
+                    break
+            elif its >= least and lowest[-1] > SETTLED * lowest[its // 2]:
+                break
+        return values, x[0]
+
+    def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
+        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
+        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        span, products = block
+        grams = self._sum(np.stack([fetch(span @ products.T), fetch((span * self.functional.mass) @ span.T)]))
+        sizes, parts = np.linalg.eigh(grams[1])
+        kept = sizes > DEPENDENT * max(sizes[-1], TINY)
+        parts = parts[:, kept] / np.sqrt(sizes[kept])
+        values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
+        parts = (parts @ turns)[:, :size].T
+        best = tuple(beside(a, parts) @ a for a in block)
+        if len(span) <= size:
+            return values[:size], (best, None)
+        moved = tuple(beside(a, parts[:, size:]) @ a[size:] for a in block)
+        lengths = np.maximum(self._lengths(moved[0]), TINY)
+        return values[:size], (best, tuple(a / beside(a, lengths)[:, None] for a in moved))
+
+    def _rigid_motions(self) -> np.ndarray | None:
+        """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
+        if self.unknowns.total < self.functional.lattice.table.total:
+            return None
+        columns = self.functional.q[self.unknowns.free].T
+        motions = np.zeros((6, *columns.shape), like=columns)
+        for c in range(3):
+            motions[c, c] = 1.0
+            motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
+        motions = motions.reshape(6, -1)
+        for _ in range(2):  # once more, for what the first left of rounding
+            sizes, parts = np.linalg.eigh(self._sum(fetch((motions * self.functional.mass) @ motions.T)))
+            kept = sizes > DEPENDENT * sizes[-1]
+            motions = beside(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
+        return motions
+
+    def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
+        if self.rigid is None:
+            return directions
+        parts = self._sum(fetch((directions * self.functional.mass) @ self.rigid.T))
+        return directions - beside(directions, parts) @ self.rigid
+
+    def _product(self, directions: np.ndarray) -> np.ndarray:
+        """H of each."""
+        return self._of_each(self.hessian.mult, directions)
+
+    def _preconditioned(self, directions: np.ndarray) -> np.ndarray:
+        """P^(-1) of each."""
+        return self._of_each(self.preconditioner.apply, directions)
+
+    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
+        if self.vectors is None:
+            self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
+        given, made = self.vectors
+        results = np.empty_like(directions)
+        for direction, result in zip(directions, results, strict=True):
+            self.memory.write(given)[:] = direction
+            act(None, given, made)
+            result[:] = self.memory.read(made)
+        return results
+
+    def _unit(self, directions: np.ndarray) -> np.ndarray:
+        """Of unit length in the norm of M; those of no length stay so."""
+        return directions / beside(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+
+    def _lengths(self, directions: np.ndarray) -> np.ndarray:
+        return np.sqrt(self._sum(fetch(directions**2 @ self.functional.mass)))
+
+    def _sum(self, values: np.ndarray) -> np.ndarray:
+        """Over all ranks."""
+        return self.comm.allreduce(values)
+
+    def save(self, saved: Saved) -> None:
+        """What the next step's search depends on."""
+        lattice = self.functional.lattice
+        rows = saved.rows["lowest_mode"] = np.zeros((lattice.owned, 3), like=lattice.nodes)
+        if self.mode is not None:
+            rows[self.unknowns.free] = self.mode.reshape(3, -1).T
+        saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
+        saved.numbers["knows_mode"] = self.mode is not None
+
+    def restore(self, saved: Saved) -> None:
+        """Go on from there; from nothing saved as if no step had been taken."""
+        self.searched = Compression(
+            saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False
+        )
+        self.mode = None
+        if saved.count("knows_mode", 1):
+            rows = beside(self.functional.mass, saved.row("lowest_mode"))
+            self.mode = rows[self.unknowns.free].T.ravel()
+
+    def destroy(self) -> None:
+        for vector in self.vectors or ():
+            vector.destroy()

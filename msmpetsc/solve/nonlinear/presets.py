@@ -1,0 +1,232 @@
+"""Presets: a method is a set of PETSc options on the one SNES of solve.nonlinear.step.
+
+Each option is only a default: the user's own option of that name wins. With A constant, Newton's
+method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The bare -ksp_ and -pc_
+options always mean the linear solve with A (or with the true Hessian, for ``newton``).
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+from petsc4py import PETSc
+
+from msmpetsc.errors import InputError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Preset:
+    """about: when to use it. options: PETSc's, without the dash.
+
+    true_hessian : the Jacobian is the true Hessian of g, not the constant A
+    projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
+    start_from_b : CG starts from x = b, as in the paper's Algorithm 1
+    extrapolate  : a step starts from the best of several guesses, not from y as published
+    iterations   : a fixed number of them is the method as published; None iterates to the error target
+    inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
+    kronecker    : A is factored as A (x) I_3, 3m x 3m
+    """
+
+    about: str
+    options: dict[str, str]
+    true_hessian: bool = False
+    projected: int = 0
+    start_from_b: bool = False
+    extrapolate: bool = True
+    iterations: int | None = None
+    inexact: bool = False
+    kronecker: bool = False
+
+
+CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
+JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
+NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
+PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
+MANY = "3000"  # a hard step takes hundreds of newton's cheap iterations (tests/test_recovery.py), and gets there
+NEWTON = {
+    "snes_type": "newtonls",
+    "snes_linesearch_type": "bt",
+    "snes_max_it": MANY,
+    **NO_STOP_BY_SIZE,
+    "snes_max_linear_solve_fail": MANY,  # of an indefinite Hessian: CG's direction leads down all the same
+    **JACOBI_CG,
+    "ksp_rtol": "3e-2",
+}
+
+LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
+    "npc_snes_type": "newtonls",
+    "npc_snes_linesearch_type": "basic",
+    "npc_snes_max_it": "1",
+    "npc_snes_norm_schedule": "none",
+    "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
+    **JACOBI_CG,
+    "ksp_rtol": "1e-1",
+}
+
+PRESETS = {
+    "anderson": Preset(
+        "Anderson-accelerated local/global iterations with loose CG solves: easy steps to few digits, no Hessian",
+        {
+            "snes_type": "anderson",
+            "snes_anderson_m": "5",
+            "snes_npc_side": "left",
+            "snes_max_it": "300",
+            **LOCAL_GLOBAL,
+        },
+        inexact=True,
+    ),
+    "ngmres": Preset(
+        "Nonlinear GMRES over the same iterations, its own line search: where anderson runs astray",
+        {
+            "snes_type": "ngmres",
+            "snes_ngmres_m": "5",
+            "snes_max_it": "300",
+            **NO_STOP_BY_SIZE,
+            **LOCAL_GLOBAL,
+        },
+        inexact=True,
+    ),
+    "lbfgs": Preset(
+        "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
+        {
+            "snes_type": "qn",
+            "snes_qn_type": "lbfgs",
+            "snes_qn_scale_type": "jacobian",
+            "snes_qn_restart_type": "none",
+            "snes_qn_m": "5",
+            "snes_linesearch_type": "bt",
+            "snes_max_it": "300",
+            **NO_STOP_BY_SIZE,
+            **JACOBI_CG,
+            "ksp_rtol": "1e-1",
+        },
+        inexact=True,
+    ),
+    "chebyshev": Preset(
+        "Wang 2015: local/global iterations with Chebyshev's weights, no inner products: for many cores or a GPU",
+        {
+            "snes_type": "python",
+            "snes_python_type": "msmpetsc.solve.nonlinear.chebyshev.Chebyshev",
+            "snes_max_it": "1000",
+            **NO_STOP_BY_SIZE,
+            **JACOBI_CG,
+            "ksp_rtol": "1e-1",
+        },
+        inexact=True,
+    ),
+    "newton": Preset(
+        "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
+        NEWTON,
+        true_hessian=True,
+        inexact=True,
+    ),
+    "newton-multigrid": Preset(
+        "The same with algebraic multigrid for A: long steps, stiff bodies, fine lattices",
+        {**NEWTON, "pc_type": "gamg"},
+        true_hessian=True,
+        inexact=True,
+    ),
+    "newton-projected": Preset(
+        "Newton's method, for long without the Hessian's negative parts: slower, and what a hard step falls back on",
+        NEWTON,
+        true_hessian=True,
+        projected=100,
+        inexact=True,
+    ),
+    "fast-msm": Preset(
+        "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
+        {**PLAIN, **CHOLESKY},
+        extrapolate=False,
+        iterations=10,
+    ),
+    "fast-msm-kronecker": Preset(
+        "The same as the seed paper must have had it: the factor of A (x) I_3, 3m x 3m; only to compare with",
+        {**PLAIN, **CHOLESKY},
+        extrapolate=False,
+        iterations=10,
+        kronecker=True,
+    ),
+    "paper": Preset(
+        "Zheng et al.: the same iterations with plain CG from x = b to a fixed tolerance",
+        {
+            **PLAIN,
+            "ksp_type": "cg",
+            "pc_type": "none",
+            "ksp_norm_type": "unpreconditioned",
+            "ksp_rtol": "1e-10",  # of |b|, as Algorithm 1 has it: 1e-6 left the step 17% off on a swinging beam
+            "ksp_converged_use_initial_residual_norm": "",
+        },
+        start_from_b=True,
+        extrapolate=False,
+        iterations=10,
+    ),
+}
+
+
+# a user who chooses another type does not want what only goes with ours
+BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
+# these solve with A or the Hessian themselves: a plain iteration as their preconditioner has no place
+SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
+
+
+in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's
+
+
+def find_preset(name: str) -> Preset:
+    """Raises InputError with the nearest name for an unknown one."""
+    if name not in PRESETS:
+        raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}")
+    return PRESETS[name]
+
+
+def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
+    """Put the preset's options into PETSc's database where the user has set none; returns their names.
+
+    SNES then does not give up before the ``budget`` of iterations is spent.
+    """
+    options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
+    database = PETSc.Options()
+    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
+    ours = options.keys() - given
+    for chosen, bound in BOUND_TO_TYPE.items():
+        if chosen in given:
+            ours -= bound
+    if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
+        ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
+    for name in ours:
+        database.setValue(prefix + name, options[name] or None)
+    names = {prefix + name for name in ours}
+    in_use.update(names)
+    return names
+
+
+def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
+    """What PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
+
+    solvers : prefix of their options -> preset and budget of iterations
+
+    A tolerance that is held to what a step needs stands in a comment: given, it would be held to as it is.
+    """
+    ours = {prefix: set_defaults(preset, prefix, budget) for prefix, (preset, budget) in solvers.items()}
+    adapting = {f"{prefix}ksp_rtol" for prefix, (preset, _) in solvers.items() if preset.inexact}
+    adapting &= set().union(*ours.values())
+    lines = []
+    for name, value in sorted(PETSc.Options().getAll().items()):
+        line = f"-{name} {_quoted(value)}".rstrip()
+        lines.append(
+            f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line
+        )
+    for names in ours.values():
+        forget_defaults(names)
+    return lines
+
+
+def _quoted(value: str | None) -> str:
+    return f'"{value}"' if value and " " in value else value or ""
+
+
+def forget_defaults(names: set[str]) -> None:
+    """Take them out again: another preset may follow, and -options_left is to show the user's own."""
+    in_use.subtract(names)
+    for name in names:
+        if not in_use[name]:
+            PETSc.Options().delValue(name)

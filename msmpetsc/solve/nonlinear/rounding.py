@@ -1,0 +1,55 @@
+"""What the rounding of numbers leaves of a step: nothing is known better than that, and no error is smaller."""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import greatest
+from msmpetsc.errors import StepFailed
+from msmpetsc.solve.nonlinear.functional import StepFunctional
+
+ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
+OF_ONE_ROW = 10.0  # times as much in a single row
+NEGLIGIBLE = 1e-6  # of the body's size: rounding that moves it less is of no concern
+HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
+
+
+class Rounding:
+    """Of the steps of one lattice and time step. All methods are collective.
+
+    diagonal : (m,) of A, of each free node of this rank [kg]
+    """
+
+    def __init__(self, functional: StepFunctional, diagonal: np.ndarray):
+        self.functional, self.comm = functional, functional.comm
+        self.rows = np.tile(ROUNDINGS * diagonal, 3)  # of F [kg m] for each metre of a coordinate
+        stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))
+        # Springs whose forces are k eps off move the nodes by no more than sqrt(sum t^2 k) eps in the norm of H
+        # where that is positive definite, and in that of M no farther; the diagonal of A is no less than the sum.
+        self.moved, self.size = ROUNDINGS * np.sqrt(stiffness), np.sqrt(mass)
+
+    def is_all_of(self, f: PETSc.Vec) -> bool:
+        """Whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones."""
+        functional = self.functional
+        rows = np.abs(functional.memory.read(f)) / (self.rows * max(functional.reach, np.finfo(float).tiny))
+        squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
+        return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= OF_ONE_ROW)
+
+    def added_to(self, error: float, away: float) -> float:
+        """A relative error of a step that took x ``away`` = |x - y|_M from y, or what rounding makes of it if that is
+        more; where nothing moves but by rounding, that is relative to the size of the body.
+
+        Raises StepFailed where rounding moves the body about as far as its forces do.
+        """
+        reach = self.functional.reach
+        moved, size = self.moved * reach, self.size * reach
+        if moved > max(NEGLIGIBLE * size, HOPELESS * away):
+            raise StepFailed(
+                f"cannot be solved in double precision: rounding in the stiffest springs moves the body by "
+                f"{moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; try softer materials, less different "
+                "ones, or a smaller time.step",
+                "rounding",
+            )
+        if not away > moved:
+            return moved / max(size, np.finfo(float).tiny)
+        return max(error, moved / away)

@@ -1,0 +1,69 @@
+"""Operators that are only known by their products, as matrices with entries: to be viewed, or written to a file."""
+
+from itertools import product
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import coo_array
+
+from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.solve.linear.unknowns import Unknowns
+
+SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)
+
+
+def asks_for_entries(viewer: PETSc.Viewer) -> bool:
+    """Whether a matrix is to be written whole, not described in a line."""
+    return viewer.getType() != PETSc.Viewer.Type.ASCII or viewer.getFormat() not in SUMMARIES
+
+
+def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
+    """An operator on vectors of unknowns, 3m x 3m, as AIJ (collective).
+
+    It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so that
+    one product a colour and coordinate tells the entries of all its columns: 81 products.
+    """
+    (a, b), colours, free = _neighbours(unknowns), _colours(unknowns), fetch(unknowns.free)
+    row = np.full(len(colours), -1)
+    row[free] = np.arange(unknowns.size)
+    row, places, colour = row[a], unknowns.places[b], colours[b]
+    x, y = operator.createVecs()
+    rows, columns, values = [], [], []
+    for wanted, c in product(range(27), range(3)):
+        chosen = np.zeros((3, unknowns.size))
+        chosen[c] = colours[free] == wanted
+        target = unknowns.columns_to_write(x)
+        target[:] = beside(target, chosen)
+        operator.mult(x, y)
+        found, hit = fetch(unknowns.columns(y)), np.flatnonzero(colour == wanted)
+        rows.append((row[hit] + unknowns.size * np.arange(3)[:, None]).ravel())
+        columns.append(np.tile(places[hit, c], 3))
+        values.append(found[:, row[hit]].ravel())
+    x.destroy()
+    y.destroy()
+    sizes = 3 * unknowns.size, 3 * unknowns.total
+    csr = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=sizes).tocsr()
+    csr.eliminate_zeros()
+    index = csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType)
+    matrix = PETSc.Mat().createAIJ((sizes, sizes), csr=(*index, csr.data), comm=operator.comm)
+    matrix.setName(operator.getName())
+    return matrix
+
+
+def _neighbours(unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of local numbers of free nodes that are the same or joined, the first of this rank."""
+    springs, free = fetch(unknowns.lattice.springs), fetch(unknowns.free)
+    a = np.concatenate([springs[:, 0], springs[:, 1], free])
+    b = np.concatenate([springs[:, 1], springs[:, 0], free])
+    kept = (a < unknowns.lattice.owned) & (unknowns.numbers[a] >= 0) & (unknowns.numbers[b] >= 0)
+    return a[kept], b[kept]
+
+
+def _colours(unknowns: Unknowns) -> np.ndarray:
+    """(l,) of 27: where a node is among its cell and the next two, along each axis (collective)."""
+    lattice = unknowns.lattice
+    nodes, corner = fetch(lattice.nodes), np.empty(3)
+    lattice.table.comm.Allreduce(nodes.min(axis=0, initial=np.inf), corner, MPI.MIN)
+    index = np.rint((nodes - corner) / lattice.cell_size).astype(np.int64) % 3
+    return index @ [9, 3, 1]

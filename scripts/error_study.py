@@ -1,0 +1,286 @@
+#!/usr/bin/env python3
+"""Holds the error that steps say they have against their true one, on random hard scenes; prints a Markdown table.
+
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT.json] [--at-once 2]
+
+Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft or
+stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with friction, in
+parts of up to 1e8 to 1, pinned, led or free, in short and long steps, by any preset. Every step is solved a second time to
+rounding from where it ended: what it says of its error over that distance is the ratio.
+
+Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a fault.
+
+    --only K        run scene K alone, and print each step
+    --write FOLDER  leave scene K there, with its mesh, for `msmpetsc run`
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+
+LEAST, SECONDS, NOTHING = (
+    1 / 3,
+    300,
+    1e-9,
+)  # ratio that is too small; a scene may take; true errors not to be told from 0
+ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
+Draw = np.random.Generator
+
+
+def draw_scene(seed: int, number: int, folder: Path) -> Path:
+    """Write scene ``number`` of a seed and its mesh; the path of the scene."""
+    import tomli_w
+
+    draw = np.random.default_rng([seed, number])
+    sides = np.array(SIDES[draw.integers(len(SIDES))])
+    scene = {
+        "mesh": {"source": mesh_of(draw, sides, folder / f"hard_{number}.obj")},
+        "cages": {"count": int(draw.integers(40, 151))},
+        "material": material_of(draw),
+        "time": {"step": log_uniform(draw, 1e-4, 0.2), "duration": 0.0},
+        "output": {"surface": False},
+        "solver": solver_of(draw),
+    }
+    scene["time"]["duration"] = 3 * scene["time"]["step"]
+    if draw.random() < 0.25:
+        scene["time"]["integrator"] = "bdf2"
+    if draw.random() < 0.8:
+        scene["gravity"] = {"acceleration": [0.0, 0.0, -9.81]}
+    for chance, add in ((0.7, add_start), (0.4, add_pin), (0.45, add_plates), (0.3, add_part), (0.2, add_anchor)):
+        if draw.random() < chance:
+            add(draw, scene, sides)
+    path = folder / f"hard_{number}.toml"
+    path.write_text(tomli_w.dumps(scene))
+    return path
+
+
+SIDES = ([1, 0.25, 0.25], [1, 0.12, 0.12], [0.5, 0.5, 0.5], [1, 1, 0.15], [0.6, 0.6, 0.6])
+
+
+def log_uniform(draw: Draw, low: float, high: float) -> float:
+    return float(np.exp(draw.uniform(np.log(low), np.log(high))))
+
+
+def mesh_of(draw: Draw, sides: np.ndarray, path: Path) -> str:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(2, 0.3) if sides[0] == 0.6 else trimesh.creation.box(sides)
+    if draw.random() < 0.5:  # a body along the grid hides much
+        mesh.apply_transform(trimesh.transformations.random_rotation_matrix(draw.random(3)))
+    mesh.export(path)
+    return path.name
+
+
+def material_of(draw: Draw) -> dict:
+    law = "linear" if draw.random() < 0.6 else "stiffening"
+    return {"young_modulus": log_uniform(draw, 1e3, 1e9), "density": 1000.0, "law": law}
+
+
+def solver_of(draw: Draw) -> dict:
+    from msmpetsc.solve.nonlinear.presets import PRESETS
+
+    preset = str(draw.choice(list(PRESETS)))
+    if draw.random() < 0.1:
+        return {"preset": preset, "max_iterations": int(draw.integers(1, 20))}
+    return {"preset": preset, "error": float(draw.choice(ERRORS))}
+
+
+def add_start(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    start = scene["start"] = {}
+    kind = draw.integers(5)
+    if kind == 0:
+        start["scale"] = squashed(draw, log_uniform(draw, 0.02, 0.9))
+    elif kind == 1:
+        start["scale"] = [float(s) for s in draw.uniform(0.3, 2.0, 3)]
+    elif kind == 2:
+        axis = [0.0, 0.0, 0.0]
+        axis[draw.integers(3)] = 1.0
+        start["twist"] = {"axis": axis, "degrees": float(draw.uniform(20, 270))}
+    elif kind == 3:
+        start["scatter"] = log_uniform(draw, 0.01, 1.0)
+    if draw.random() < 0.4:
+        start["spin"] = [float(w) for w in draw.normal(0, 5, 3)]
+    if draw.random() < 0.4:
+        start["velocity"] = [float(v) for v in draw.normal(0, 3, 3)]
+
+
+def squashed(draw: Draw, share: float) -> list[float]:
+    scale = [1.0, 1.0, 1.0]
+    scale[draw.integers(3)] = share
+    return scale
+
+
+def add_pin(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    scene["pin"] = [{"region": {"box": [[-0.1, -0.1, -0.1], [0.15, 1.1, 1.1]], "relative": True}}]
+
+
+def add_plates(draw: Draw, scene: dict, sides: np.ndarray) -> None:
+    """The ground, and for one in two a plate that comes down."""
+    half = 0.5 * sides[2] if sides[0] != 0.6 else 0.3
+    response = "reflect" if draw.random() < 0.15 else "penalty"
+    ground = {"shape": "plane", "point": [0.0, 0.0, -half - 0.01], "normal": [0.0, 0.0, 1.0], "response": response}
+    if response == "penalty" and draw.random() < 0.6:
+        ground["friction"] = float(draw.uniform(0, 1))
+    scene["obstacle"] = [ground]
+    if response == "penalty" and draw.random() < 0.5:
+        by = [0.0, 0.0, -float(draw.uniform(0.1, 1.5)) * half]
+        path = [{"time": scene["time"]["duration"], "by": by}]
+        plate = {"shape": "plane", "point": [0.0, 0.0, half], "normal": [0.0, 0.0, -1.0], "path": path}
+        scene["obstacle"].append(plate | {"response": "penalty"})
+
+
+def add_part(draw: Draw, scene: dict, _: np.ndarray) -> None:
+    contrast = log_uniform(draw, 1, 1e8)
+    region = {"half_space": {"point": [0.5, 0.5, 0.5], "normal": [1.0, 0.0, 0.0]}, "relative": True}
+    stiff = min(contrast * scene["material"]["young_modulus"], 1e12)
+    scene["part"] = [{"region": region, "young_modulus": stiff}]
+
+
+def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
+    """The far end is led inwards or aside."""
+    by = [float(x) for x in draw.normal(0, 0.3, 3) * sides[0]]
+    region = {"box": [[0.85, -0.1, -0.1], [1.1, 1.1, 1.1]], "relative": True}
+    scene["anchor"] = [{"region": region, "path": [{"time": scene["time"]["duration"], "by": by}]}]
+
+
+def measured(seed: int, number: int) -> dict:
+    """What became of one scene: ``status``, its words, and a (said, true) pair of each step."""
+    with tempfile.TemporaryDirectory() as folder:
+        return measured_in(draw_scene(seed, number, Path(folder)), number)
+
+
+def measured_in(path: Path, number: int) -> dict:
+    import logging
+
+    from mpi4py import MPI
+
+    from msmpetsc.errors import InputError, StepFailed
+    from msmpetsc.model.build import build_model
+    from msmpetsc.scene.reading import load_scene
+    from msmpetsc.solve.instrumentation import Measured
+    from msmpetsc.solve.simulate import Simulation
+
+    logging.disable(logging.WARNING)
+    scene, steps = load_scene(path), []
+    row = {"number": number, "preset": scene.solver.preset, "goal": scene.solver.error, "status": 0, "said": ""}
+    signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(SECONDS)
+    try:
+        model = build_model(MPI.COMM_SELF, scene)
+        with Simulation(MPI.COMM_SELF, scene, model, Measured(true_error=1)) as simulation:
+            for frame in simulation.frames():
+                if frame.index:
+                    steps.append([float(frame.step_error), float(frame.true_error), int(frame.ksp_its)])
+    except StepFailed as failure:
+        row |= {"status": 3, "said": str(failure)}
+    except InputError as error:
+        row |= {"status": 2, "said": str(error)}
+    except TimeoutError as late:
+        row |= {"status": 4, "said": str(late)}
+    except Exception as fault:  # noqa: BLE001 (whatever it is, it is a finding)
+        row |= {"status": 1, "said": f"{type(fault).__name__}: {fault}"}
+    signal.alarm(0)
+    return row | {"steps": steps}
+
+
+def too_long(_: int, __: FrameType | None) -> None:
+    raise TimeoutError(f"took more than {SECONDS} s")
+
+
+def ratios_of(rows: list[dict]) -> np.ndarray:
+    """Said over true, of the steps whose truth is known and more than nothing."""
+    pairs = np.array([step[:2] for row in rows for step in row["steps"]]).reshape(-1, 2)
+    known = pairs[np.isfinite(pairs[:, 1]) & (pairs[:, 1] > NOTHING)]
+    return known[:, 0] / known[:, 1]
+
+
+def table_row(name: str, rows: list[dict]) -> list[str]:
+    statuses = [row["status"] for row in rows]
+    counts = [str(statuses.count(status)) for status in (0, 3, 2, 4, 1)]
+    ratios = ratios_of(rows)
+    if not len(ratios):
+        return [name, *counts, "0", "", "", "", ""]
+    within = ratios[np.isfinite(ratios)]
+    shares = [f"{value:.2g}" for value in np.quantile(within, [0, 0.05, 0.5])] if len(within) else [""] * 3
+    return [name, *counts, str(len(ratios)), *shares, str(int((ratios < LEAST).sum()))]
+
+
+COLUMNS = (
+    "preset",
+    "done",
+    "stopped",
+    "refused",
+    "cut off",
+    "faults",
+    "steps",
+    "least ratio",
+    "5%",
+    "median",
+    "below 1/3",
+)
+
+
+def print_table(rows: list[dict]) -> None:
+    names = sorted({row["preset"] for row in rows})
+    lines = [table_row(name, [row for row in rows if row["preset"] == name]) for name in names]
+    for cells in (COLUMNS, ["---"] * len(COLUMNS), *lines, table_row("all", rows)):
+        print("|", " | ".join(cells), "|")
+
+
+def bad(row: dict) -> bool:
+    return row["status"] == 1 or bool((ratios_of([row]) < LEAST).any())
+
+
+def run_all(numbers: range, seed: int, at_once: int, each: Callable[[dict], None]) -> list[dict]:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(at_once, get_context("spawn")) as pool:
+        rows = []
+        for future in [pool.submit(measured, seed, number) for number in numbers]:
+            rows.append(future.result())
+            each(rows[-1])
+    return rows
+
+
+def tell(row: dict) -> None:
+    if bad(row):
+        steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true, _ in row["steps"])
+        print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", type=int)
+    parser.add_argument("--write", type=Path)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--at-once", type=int, default=2)
+    args = parser.parse_args()
+    if args.write:
+        args.write.mkdir(parents=True, exist_ok=True)
+        print(draw_scene(args.seed, args.only or 0, args.write))
+        return 0
+    if args.only is not None:
+        row = measured(args.seed, args.only)
+        print(json.dumps(row, indent=1))
+        return int(bad(row))
+    rows = run_all(range(args.scenes), args.seed, args.at_once, tell)
+    if args.json:
+        args.json.write_text(json.dumps(rows))
+    print_table(rows)
+    return int(any(map(bad, rows)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""--device and -mat_type, on a machine that has no GPU or whose GPU is not asked for."""
+
+import ctypes
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from block_scene import block_scene, play
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend import cuda
+from msmpetsc.errors import InputError
+from msmpetsc.solve.petsc import device
+from msmpetsc.solve.petsc.library import petsc_library
+
+FALL = {"time": {"step": 0.01, "duration": 0.02}, "gravity": {"acceleration": [0, 0, -9.81]}}
+
+
+@pytest.fixture
+def options():
+    """PETSc's, as they were before."""
+    database = PETSc.Options()
+    before = database.getAll()
+    yield database
+    for name in database.getAll().keys() - before.keys():
+        database.delValue(name)
+
+
+@pytest.fixture
+def no_gpu():
+    """Or skipped where there is one."""
+    if device.what_is_missing() is None:
+        pytest.skip("there is a GPU here")
+
+
+@pytest.mark.parametrize("words", [["--device", "cuda"], ["-mat_type", "aijcusparse"], ["-mat_type", "mpiaijcusparse"]])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_without_a_gpu_one_line_says_what_is_missing(tmp_path: Path, msmpetsc, words: list[str], ranks: int, no_gpu):
+    path, out = block_scene(tmp_path, **FALL), tmp_path / "out.h5"
+    done = msmpetsc(ranks, "run", path, "-o", out, *words)
+    said = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc:")]
+    assert done.returncode == 2 and len(said) == 1 and not out.exists()
+    assert device.what_is_missing() in said[0] and words[-1] in said[0]
+    assert "Traceback" not in done.stderr and "CAUGHT SIGNAL" not in done.stderr.upper()
+
+
+def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
+    done = msmpetsc(1, "run", block_scene(tmp_path, **FALL), "--device", "cuda", "-mat_type", "aij")
+    assert done.returncode == 2 and "--device cuda and -mat_type aij contradict each other" in done.stderr
+
+
+def test_the_cpu_may_be_named(tmp_path: Path, msmpetsc):
+    done = msmpetsc(
+        1, "run", block_scene(tmp_path, **FALL), "-o", tmp_path / "out.h5", "--device", "cpu", "-mat_type", "aij"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("count", "says"),
+    [(lambda: 0, "no GPU is seen"), (lambda: 1 / 0, "no GPU is seen: division by zero"), (lambda: 2, None)],
+)
+def test_the_runtime_is_asked_for_a_gpu(count, says: str | None):
+    cupy = type("cupy", (), {"cuda": type("cuda", (), {"runtime": type("runtime", (), {"getDeviceCount": count})})})
+    with patch.dict("sys.modules", cupy=cupy):
+        assert cuda.missing() == says
+
+
+def test_a_package_that_is_not_there_is_named():
+    with patch.dict("sys.modules", cupy=None):
+        assert cuda.missing() == "cupy cannot be imported; pip install 'msmpetsc[cuda]' brings it"
+
+
+@pytest.mark.parametrize("knows", [True, False])
+@pytest.mark.parametrize("given", [None, "1"])
+def test_messages_are_staged_on_the_cpu_where_mpi_knows_no_gpus(options, knows: bool, given: str | None):
+    """But for a user who knows better. PETSc's own variable tells."""
+    aware = ctypes.c_bool.in_dll(petsc_library(), "use_gpu_aware_mpi")
+    before, aware.value = aware.value, True
+    options["mat_type"] = "aijcusparse"
+    if given:
+        options["use_gpu_aware_mpi"] = given
+    try:
+        with (
+            patch.object(device, "what_is_missing", lambda: None),
+            patch.object(cuda, "take_one", lambda rank: None),
+            patch.object(device, "_mpi_knows_gpus", lambda: knows),
+        ):
+            assert device.sender(MPI.COMM_SELF) is cuda.send
+        assert aware.value == bool(knows or given)
+    finally:
+        aware.value = before
+
+
+@pytest.mark.cuda
+def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path, options):
+    """A prefix has a matrix type of its own, for the spare solver of a rescue or of the true error."""
+    if device.what_is_missing():
+        pytest.skip(device.what_is_missing())
+    options["mat_type"] = "seqaijcusparse"
+    with patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array):
+        with pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"):
+            play(block_scene(tmp_path, **FALL))

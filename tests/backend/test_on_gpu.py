@@ -1,0 +1,295 @@
+"""Runs on a GPU, a real one where there is one, and one that is pretended (pretend_gpu): the same frames as on the CPU,
+no array of one place among those of the other, and nothing carried but what frames and checkpoints need."""
+
+import importlib
+import json
+import operator
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import h5py
+import numba
+import numpy as np
+import pretend_gpu
+import pytest
+from block_scene import CELL, block_scene
+from conftest import ENVIRONMENT, WORKERS
+from mpi4py import MPI
+from petsc4py import PETSc
+from pretend_gpu import pretended
+
+import msmpetsc
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.build import build_model
+from msmpetsc.model.frame import Frame
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.solve.petsc import device
+from msmpetsc.solve.simulate import Simulation
+
+PACKAGE = Path(msmpetsc.__file__).parent
+T = 0.01
+GRAVITY = {"acceleration": [0, 0, -9.81]}
+FALL = {"time": {"step": T, "duration": 8 * T}, "gravity": GRAVITY, "start": {"velocity": [0.1, 0, -1.0]}}
+FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1]}
+PLATE = {
+    "shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.5]], "response": "penalty", "friction": 0.3,
+    "path": [{"time": 4 * T, "by": [0.01, 0, -0.05]}],
+}  # fmt: skip
+THIN = {"shape": "box", "box": [[-1, -1, -0.0041], [2, 2, -0.004]]}  # passed within a step
+HELD = {"pin": [{"region": {"box": [[0, 0, 0], [0.1, 1, 1]], "relative": True}}]}
+LED = {
+    "anchor": [{"region": {"box": [[0.9, 0, 0], [1, 1, 1]], "relative": True}, "stop": 4 * T,
+                "path": [{"time": 4 * T, "by": [0.05, 0, 0]}]}]
+}  # fmt: skip
+STIFFENING = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "stiffening"}}
+CASES = {
+    "newton": FALL,
+    "held, led and let go": {**FALL, **HELD, **LED},
+    "reflected": {**FALL, "obstacle": [{**FLOOR, "response": "reflect"}]},
+    "pressed, rubbed and stiffening": {**FALL, **STIFFENING, "obstacle": [{**FLOOR, "response": "penalty"}, PLATE]},
+    "thin plates": {**FALL, "obstacle": [{**THIN, "response": "penalty", "friction": 0.3}, {**THIN, "start": 5 * T}]},
+    "thin plates, bdf2": {
+        **FALL, "time": {**FALL["time"], "integrator": "bdf2"}, "obstacle": [THIN, {**THIN, "response": "penalty"}],
+    },
+    "thin plates, verlet": {
+        **FALL, "time": {**FALL["time"], "integrator": "verlet"},
+        "obstacle": [{**THIN, "response": "penalty", "path": [{"time": 1.0, "by": [0, 0, 1.0]}]}],
+    },
+    "bdf2": {**FALL, **HELD, "time": {**FALL["time"], "integrator": "bdf2"}},
+    "verlet": {
+        **FALL, **LED, "time": {**FALL["time"], "integrator": "verlet"},
+        "obstacle": [{**FLOOR, "response": "reflect"}, PLATE],
+    },
+    **{
+        preset: {**FALL, **HELD, "solver": {"preset": preset, "error": 1e-9}}
+        for preset in ("anderson", "lbfgs", "chebyshev", "newton-multigrid", "newton-projected", "fast-msm")
+    },
+    "paper": {**FALL, **HELD, "solver": {"preset": "paper"}},
+}  # fmt: skip
+
+
+FAILING = {  # struck too hard for a plain iteration
+    **CASES["pressed, rubbed and stiffening"], "time": {"step": T, "duration": 4 * T},
+    "solver": {"preset": "fast-msm", "error": 1e-9}, "start": {"velocity": [0.1, 0, -10.0]},
+}  # fmt: skip
+
+
+@contextmanager
+def real() -> Iterator[None]:
+    """Runs within compute on the GPU that is there."""
+    lacking = device.what_is_missing()
+    if lacking:
+        pytest.skip(lacking)
+    PETSc.Options()["mat_type"] = "aijcusparse"
+    try:
+        yield
+    finally:
+        del PETSc.Options()["mat_type"]
+
+
+on_a_gpu = pytest.mark.parametrize("on_gpu", [pretended, pytest.param(real, marks=pytest.mark.cuda)])
+
+
+def play(path: Path, measured: Measured = Measured()) -> list[Frame]:
+    scene = load_scene(path)
+    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), measured) as simulation:
+        return list(simulation.frames())
+
+
+def positions(frames: list[Frame]) -> np.ndarray:
+    """(T, n, 3) [m]"""
+    return np.array([frame.position for frame in frames])
+
+
+@on_a_gpu
+@pytest.mark.parametrize("case", CASES)
+def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
+    path = block_scene(tmp_path, **CASES[case])
+    here = play(path)
+    with on_gpu() as counted:
+        there = play(path)
+    assert not counted or counted["launches"] > 50
+    assert np.abs(positions(here) - here[0].position).max() > 1e-3
+    np.testing.assert_allclose(positions(there), positions(here), rtol=0, atol=1e-8)
+    for name in ("kinetic", "elastic", "potential", "contact"):
+        energies = [[getattr(frame, name) for frame in frames] for frames in (there, here)]
+        np.testing.assert_allclose(*energies, rtol=1e-5, atol=1e-9)
+    assert [frame.inverted for frame in there] == [frame.inverted for frame in here]
+
+
+@on_a_gpu
+def test_multigrid_may_share_its_matrix_with_our_products(tmp_path: Path, on_gpu):
+    """cuSPARSE keeps what it prepared for a product with the matrix, which here has two."""
+    path = block_scene(tmp_path, **CASES["anderson"])
+    PETSc.Options()["pc_type"] = "gamg"
+    try:
+        here = play(path)
+        with on_gpu():
+            there = play(path)
+    finally:
+        del PETSc.Options()["pc_type"]
+    np.testing.assert_allclose(positions(there), positions(here), rtol=0, atol=1e-8)
+
+
+@on_a_gpu
+def test_true_errors_are_measured_there(tmp_path: Path, on_gpu):
+    path = block_scene(tmp_path, **{**FALL, **HELD, "solver": {"preset": "newton", "error": 1e-2}})
+    here = play(path, Measured(true_error=4))
+    with on_gpu():
+        there = play(path, Measured(true_error=4))
+    errors = [[frame.true_error for frame in frames if frame.index % 4 == 0 < frame.index] for frames in (there, here)]
+    assert min(errors[1]) > 0 and max(errors[1]) < 1e-2
+    np.testing.assert_allclose(*errors, rtol=1e-3)
+
+
+@on_a_gpu
+def test_a_step_that_fails_says_the_same(tmp_path: Path, on_gpu):
+    path, says = block_scene(tmp_path, **FAILING), []
+    for place in (nullcontext, on_gpu):
+        with place(), pytest.raises(StepFailed) as failure:
+            play(path)
+        says.append(re.sub(r"[-\d.]+(e[-+]\d+)?", "", str(failure.value)))
+    assert says[0] == says[1] and "worst at node" in says[0]
+
+
+@on_a_gpu
+def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
+    path = block_scene(tmp_path, **FAILING, safety={"on_failure": "fallback"})
+    here = play(path)
+    with on_gpu():
+        there = play(path)
+    assert sum(frame.fallbacks for frame in there) == sum(frame.fallbacks for frame in here) > 0
+    np.testing.assert_allclose(positions(there), positions(here), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("case", ["newton", "held, led and let go", "pressed, rubbed and stiffening", "verlet"])
+def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(tmp_path: Path, case: str):
+    """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has come to."""
+    scene = load_scene(block_scene(tmp_path, **CASES[case], output={"surface": False, "every": 4}))
+    with pretended() as counted, Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        for frame in simulation.advance():
+            if simulation.step == 4:
+                counted.clear()
+    assert simulation.step == 8 and frame is not None
+    assert counted["arrays from the GPU"] == 1 and counted["arrays to the GPU"] == 0
+
+
+@pytest.mark.parametrize("case", ["held, led and let go", "pressed, rubbed and stiffening", "bdf2", "verlet"])
+def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case: str):
+    scene = load_scene(block_scene(tmp_path, **CASES[case]))
+    model = build_model(MPI.COMM_SELF, scene)
+    with pretended():
+        with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+            frames = simulation.frames()
+            for _ in range(5):  # of them one at the start
+                next(frames)
+            saved = simulation.saved()
+            assert all(isinstance(rows, np.ndarray) for rows in saved.rows.values())
+            whole = [frame.position for frame in frames]
+        with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+            simulation.restore(saved)
+            np.testing.assert_array_equal([frame.position for frame in simulation.frames()], whole)
+
+
+SMALLEST = {
+    "sides": np.array([2, 1, 1]) * CELL,
+    "start": {"velocity": [0.3, 0, -3.0]},
+}  # 12 threads: a simulated one is slow
+SIMULATED = {
+    "pressed": {
+        **CASES["pressed, rubbed and stiffening"], "time": {"step": T, "duration": 2 * T},
+        "solver": {"preset": "newton", "error": 1e-4},
+    },
+    "verlet": {**CASES["verlet"], "time": {"step": T, "duration": T, "integrator": "verlet"}},
+}  # fmt: skip
+
+
+def test_kernels_do_the_same_as_threads(tmp_path: Path):
+    """All of them, in numba's simulator."""
+    paths = [block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()]
+    worker = [sys.executable, WORKERS / "simulator_worker.py", *paths]
+    ran, *last = subprocess.run(worker, env=ENVIRONMENT, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert set(ran.split()) == {body.__name__ for body in bodies()}
+    for path, line in zip(paths, last, strict=True):
+        here, there = positions(play(path)), np.array([float.fromhex(x) for x in line.split()]).reshape(-1, 3)
+        assert np.abs(here[-1] - here[0]).max() > 1e-2
+        np.testing.assert_allclose(there, here[-1], rtol=0, atol=1e-12)
+
+
+def bodies() -> list[Callable]:
+    """Of all kernels: what ``each`` was given."""
+    found = []
+    for path in PACKAGE.rglob("*.py"):
+        if "\n@each\n" in path.read_text():
+            module = importlib.import_module(".".join(("msmpetsc", *path.relative_to(PACKAGE).with_suffix("").parts)))
+            found += [one.__wrapped__ for one in vars(module).values() if hasattr(one, "compiled")]
+    return found
+
+
+def test_kernels_compile_for_a_gpu(tmp_path: Path):
+    """To PTX, for the arguments that runs give them, and where there is ptxas to machine code that keeps what it works with
+    in registers; it needs no GPU."""
+    for package in ("numba_cuda", "cupy"):
+        pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
+    from numba import cuda
+
+    given = {}
+
+    def launcher(body):
+        def launch(count, *arguments):
+            given[body] = arguments
+            pretend_gpu.launcher(body)(count, *arguments)
+
+        return launch
+
+    with pretended(launcher):
+        for name, case in SIMULATED.items():
+            play(block_scene(tmp_path, name=name, **{**case, **SMALLEST}))
+    assert set(given) == set(bodies())
+    from msmpetsc.backend import threads
+
+    h200 = SimpleNamespace(compute_capability=(9, 0))
+    with patch("numba.cuda.dispatcher.get_current_device", lambda: h200):
+        for body, arguments in given.items():
+            types = numba.types.Tuple([numba.typeof(pretend_gpu.bare(one)) for one in arguments])
+            ptx, _ = cuda.compile_ptx(threads.kernel_of(body).py_func, (numba.int64, types), cc=(9, 0))
+            assert ".target sm_90" in ptx and "threads" in ptx
+            with warnings.catch_warnings(action="error"):  # a grid of one block is no one's concern
+                threads.kernel_of(body)[1, threads.THREADS]
+            if shutil.which("ptxas"):
+                (tmp_path / "kernel.ptx").write_text(ptx)
+                command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]
+                said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+                print(body.__name__, said)
+                assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
+
+
+def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():
+    cupy = pytest.importorskip("cupy", reason="no CuPy here: pip install 'msmpetsc[cuda]'")
+    for name in pretend_gpu.KNOWN:
+        assert operator.attrgetter(name)(cupy)
+
+
+def test_ranks_agree_on_gpus_too(tmp_path: Path, on_ranks):
+    """And a run of the command line: three ranks with ghosts, against one on the CPU."""
+    path = block_scene(tmp_path, **CASES["pressed, rubbed and stiffening"])
+    files, devices = [], []
+    for ranks, worker in ((1, ["-m", "msmpetsc"]), (3, [WORKERS / "gpu_worker.py"])):
+        files.append(tmp_path / f"{ranks}.h5")
+        cost = files[-1].with_suffix(".json")
+        done = on_ranks(ranks, *worker, "run", path, "-o", files[-1], "--measure", cost)
+        assert done.returncode == 0, done.stderr
+        devices.append(json.loads(cost.read_text())["device"])
+    assert devices == ["cpu", "cuda"]
+    frames = [h5py.File(file)["frames/position"][:] for file in files]
+    assert np.abs(frames[0] - frames[0][0]).max() > 1e-3
+    np.testing.assert_allclose(*frames, rtol=0, atol=1e-8)

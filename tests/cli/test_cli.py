@@ -1,0 +1,360 @@
+"""The command line: what it writes, what it refuses and how, and that no failure hangs or leaves anything behind."""
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from conftest import ENVIRONMENT, run
+
+from msmpetsc.cli.main import split_petsc_options
+from msmpetsc.output.writer import finished
+
+SCENE = """
+[mesh]
+source = "ball.ply"
+[cages]
+count = 150
+[material]
+young_modulus = 1e5
+density = 1000
+[time]
+step = 0.01
+duration = 0.03
+[gravity]
+acceleration = [0, 0, -9.81]
+[[pin]]
+region = { box = [[0, 0, 0.8], [1, 1, 1]], relative = true }
+[output]
+surface = false
+"""
+COMMAND = ("-m", "msmpetsc.cli.main", "run")
+NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", "Warning")
+ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
+
+
+def write_ply(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
+    """In text, so that NaN and infinity get through."""
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty double x\nproperty double y\nproperty double z\n"
+    head += f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [*points.tolist(), *([3, *corners] for corners in triangles.tolist())]
+    path.write_text(head + "".join(" ".join(map(str, row)) + "\n" for row in rows))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """scene.toml and its ball, and meshes and scenes with something wrong."""
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "scene.toml").write_text(SCENE)
+    (folder / "broken.toml").write_text("[mesh\n")
+    (folder / "text.ply").write_text("a shopping list\n")
+    (folder / "empty.ply").write_text("")
+    nan, infinite = ball.vertices.copy(), ball.vertices.copy()
+    nan[3], infinite[5, 0] = np.nan, np.inf
+    both_sides = np.vstack([ball.faces, ball.faces[:, ::-1]])
+    write_ply(folder / "ball.ply", ball.vertices, ball.faces)
+    write_ply(folder / "nan.ply", nan, ball.faces)
+    write_ply(folder / "infinite.ply", infinite, ball.faces)
+    write_ply(folder / "flat.ply", ball.vertices * [1, 1, 0], ball.faces)
+    write_ply(folder / "folded.ply", ball.vertices, both_sides)
+    write_ply(folder / "points.ply", ball.vertices, ball.faces[:0])
+    write_ply(folder / "foil.ply", ball.vertices * [1, 1, 1e-5], ball.faces)
+    write_ply(folder / "open.ply", ball.vertices, ball.faces[20:])
+    return folder
+
+
+@pytest.fixture
+def scene(folder: Path) -> Path:
+    return folder / "scene.toml"
+
+
+def alone(*arguments: object, timeout: float = 60) -> subprocess.CompletedProcess:
+    """The command without mpiexec."""
+    command = [sys.executable, *COMMAND, *map(str, arguments)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
+
+
+def on(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
+    return alone(*arguments) if ranks == 1 else run(ranks, *COMMAND, *arguments, timeout=60)
+
+
+def errors(told: str) -> list[str]:
+    return [line for line in told.splitlines() if line.startswith("msmpetsc: error:")]
+
+
+def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
+    """It ended with this status, said why in one line that holds these words, and ended cleanly."""
+    assert done.returncode == status, done.stdout + done.stderr
+    assert len(errors(done.stderr)) == 1, done.stderr
+    assert all(word in errors(done.stderr)[0] for word in words), errors(done.stderr)
+    assert not [noise for noise in NOISE if noise in done.stdout + done.stderr], done.stdout + done.stderr
+
+
+# What it writes
+
+
+def test_the_default_output_is_in_out_and_is_not_replaced_unasked(scene: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert alone(scene).returncode == 0
+    result = tmp_path / "out/scene.h5"
+    assert sorted(p.name for p in result.parent.iterdir()) == ["scene.h5", "scene.xdmf"]
+    before = result.read_bytes()
+    assert_one_line(alone(scene, "--frames", "1"), 2, "out/scene.h5 exists", "--overwrite")
+    assert result.read_bytes() == before
+    assert alone(scene, "--frames", "1", "--overwrite").returncode == 0
+    with h5py.File(result) as file:
+        assert finished(file) == 2
+
+
+def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
+    out = tmp_path / "new" / "named.h5"
+    more = ("--error", "1e-6", "--frames", "2", "--set", "cages.count=80", "--set", "output.surface=true")
+    done = alone("-ksp_max_it", "400", scene, "-o", out, "--preset", "newton", *more)
+    assert done.returncode == 0, done.stderr
+    with h5py.File(out) as file:
+        as_run = tomllib.loads(file.attrs["scene"])
+        assert as_run["solver"] == {"preset": "newton", "error": 1e-6}
+        assert "-ksp_max_it 400" in file.attrs["petsc_options"]
+        assert "--frames 2" in file.attrs["command"]
+        assert finished(file) == 3
+        assert 0 < file["frames/step_error"][:].max() <= 1e-6
+        assert len(file["lattice/cells"]) < 120  # 80 asked, 150 in the file
+        assert file["frames/surface"].shape == (3, len(ball.vertices), 3)
+    assert out.with_suffix(".xdmf").is_file()
+
+
+def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path):
+    done = on(2, scene, "-o", tmp_path / "o.h5", "-ksp_type", "pipecg", "-ksp_view", "-log_view", "--frames", "1")
+    assert done.returncode == 0, done.stderr
+    assert "type: pipecg" in done.stdout and "type: cg\n" not in done.stdout
+    assert done.stdout.count("PETSc Performance Summary") == 1
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "seen"),
+    [
+        ("anderson", "", ""),
+        ("newton", "", ""),
+        ("newton-multigrid", "-ksp_view", "type: gamg"),
+        ("fast-msm", "", ""),
+        ("fast-msm-kronecker", "", ""),
+        ("paper", "", ""),
+        ("ngmres", "", ""),
+        ("lbfgs", "-snes_view", "type is LBFGS"),
+        ("chebyshev", "", ""),
+        ("anderson", "-snes_anderson_m 2 -snes_view", "Number of stored past updates: 2"),
+        ("fast-msm", "-pc_type gamg -ksp_view", "type: gamg"),
+    ],
+)
+def test_no_option_is_left_unused_and_the_users_wins(scene: Path, tmp_path: Path, preset: str, options: str, seen: str):
+    done = alone(scene, "-o", tmp_path / "o.h5", "--preset", preset, "--frames", "1", *options.split(), "-options_left")
+    assert done.returncode == 0, done.stderr
+    assert "There are no unused options." in done.stdout
+    assert seen in done.stdout
+
+
+def test_the_presets_are_listed_once(msmpetsc):
+    done = msmpetsc(2, "run", "--list-presets", timeout=60)
+    assert done.returncode == 0
+    names = [line.split()[0] for line in done.stdout.splitlines()]
+    presets = {"anderson", "ngmres", "lbfgs", "chebyshev", "newton", "newton-multigrid", "fast-msm", "paper"}
+    assert presets <= set(names) and len(names) == len(set(names))
+
+
+@pytest.mark.parametrize(
+    ("given", "ours", "petsc"),
+    [
+        ("run s.toml -log_view", "run s.toml", "-log_view"),
+        ("run -log_view s.toml", "run s.toml", "-log_view"),
+        ("run -ksp_view -pc_type gamg s.toml", "run s.toml", "-ksp_view -pc_type gamg"),
+        ("run s.toml -log_view --frames 2", "run s.toml --frames 2", "-log_view"),
+        ("run s.toml -log_view -o out.h5", "run s.toml -o out.h5", "-log_view"),
+        ("run s.toml -mg_levels_shift -0.5", "run s.toml", "-mg_levels_shift -0.5"),
+        ("run s.toml --error 1e-3", "run s.toml --error 1e-3", ""),
+    ],
+)
+def test_our_options_and_petscs_stand_in_any_order(given: str, ours: str, petsc: str):
+    assert split_petsc_options(given.split()) == (ours.split(), petsc.split())
+
+
+# What it refuses
+
+REFUSED_OPTIONS = {
+    "-ksp_tpye cg": ("-ksp_tpye", "'ksp_type'"),
+    "-pc_typ jacobi": ("-pc_typ", "'pc_type'"),
+    "-log_veiw": ("-log_veiw",),
+    "-ksp_type nonsense": ("KSP type nonsense",),
+    "-pc_type nonsense": ("PC type nonsense",),
+    "-mat_type nonsense": ("Mat type", "nonsense"),
+    "-ksp_rtol abc": ("abc has no numeric value",),
+    "--presett anderson": ("--presett", "'--preset'"),
+}
+
+
+@pytest.mark.parametrize(
+    ("ranks", "options"),
+    [*((1, options) for options in REFUSED_OPTIONS), *((2, options) for options in list(REFUSED_OPTIONS)[::3])],
+)
+def test_options_that_cannot_be_meant_are_refused_before_the_first_frame(scene: Path, tmp_path: Path, ranks, options):
+    done = on(ranks, scene, "-o", tmp_path / "o.h5", *options.split())
+    assert_one_line(done, 2, *REFUSED_OPTIONS[options])
+    assert "frame 0" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(scene: Path, tmp_path: Path):
+    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")  # newton has no NPC
+    assert_one_line(done, 2, "-npc_ksp_view")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]  # what was computed is kept, whole
+
+
+def test_a_preconditioner_that_ranks_do_not_share_is_refused(scene: Path, tmp_path: Path):
+    done = on(2, scene, "-o", tmp_path / "o.h5", "-pc_type", "icc")  # PETSc's ICC is for one rank
+    assert_one_line(done, 2, "ICC")
+    assert list(tmp_path.iterdir()) == []
+
+
+def mesh(name: str, *more: str) -> list[str]:
+    return sets(f"mesh.source={name}", *more)
+
+
+def sets(*pairs: str) -> list[str]:
+    return [word for pair in pairs for word in ("--set", pair)]
+
+
+BAD = {  # what is wrong: arguments after the scene, and what the one line must say
+    "mesh missing": (mesh("gone.ply"), ["gone.ply"]),
+    "mesh is text": (mesh("text.ply"), ["text.ply", "not a readable PLY mesh"]),
+    "mesh empty": (mesh("empty.ply"), ["empty.ply", "is empty"]),
+    "mesh without triangles": (mesh("points.ply"), ["holds no triangles"]),
+    "mesh NaN": (mesh("nan.ply"), ["nan.ply", "NaN"]),
+    "mesh infinite": (mesh("infinite.ply"), ["infinite.ply", "infinite"]),
+    "mesh flat": (mesh("flat.ply"), ["no volume", "flat"]),
+    "mesh folded": (mesh("folded.ply"), ["no volume", "folded"]),
+    "mesh thin for its cells": (mesh("foil.ply", "cages={cell_size=1e-5}"), ["cages.max_cells"]),
+    "mesh of size 0": (sets("mesh.size=0"), ["mesh.size", "> 0"]),
+    "mesh of negative size": (sets("mesh.size=-1"), ["mesh.size", "> 0"]),
+    "mesh huge": (sets("mesh.size=1e300"), ["mesh.size: must be < 1e+60"]),
+    "mesh tiny": (sets("mesh.size=1e-300"), ["1e-300 m", "too small"]),
+    "mesh far away": (sets("mesh.base=[1e300, 0, 0]"), ["1e+300 m", "too far away"]),
+    "cells too many": (sets("cages={cell_size=0.001}"), ["0.001 m", "cages.max_cells = 5000000"]),
+    "cells of size 0": (sets("cages={cell_size=0}"), ["cages.cell_size", "> 0"]),
+    "cells too small": (sets("cages={cell_size=1e-300}"), ["cages.cell_size", "1e-300"]),
+    "count beyond max_cells": (sets("cages.max_cells=10"), ["150", "max_cells = 10"]),
+    "preset unknown": (["--preset", "andersen"], ["'anderson'"]),
+    "error not a number": (["--error", "small"], ["solver.error", "number"]),
+    "no frames": (["--frames", "0"], ["--frames", "at least 1"]),
+    "frames not a number": (["--frames", "many"], ["--frames", "many"]),
+    "key unknown": (sets("mehs.size=1"), ["mehs", "'mesh'"]),
+    "density negative": (sets("material.density=-1"), ["material.density", "> 0"]),
+    "pin without a node": (sets("pin.0.region.box=[[5, 5, 5], [6, 6, 6]]"), ["pin.0.region", "no node"]),
+    "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "held"]),
+    "disk too small": (sets("time.duration=9e6"), ["GB"]),
+    "two scenes": (["another.toml"], ["unknown argument another.toml"]),
+}
+REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2])]
+IN_ONE_PROCESS = """
+import contextlib, io, json, sys
+from mpi4py import MPI
+from msmpetsc.cli.main import main
+for arguments in json.loads(sys.argv[1]):
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told):
+        status = main(arguments)
+    answers = MPI.COMM_WORLD.gather((status, told.getvalue()))
+    if answers:
+        print(json.dumps(answers), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def refusals(folder: Path) -> dict:
+    """(ranks, what is wrong) -> (status, what was told) of each rank: all in one process, half of them on two ranks."""
+    found = {}
+    for ranks in (1, 2):
+        names = [name for number, name in REFUSALS if number == ranks]
+        out = folder / f"refused{ranks}" / "o.h5"
+        commands = [["run", str(folder / "scene.toml"), "-o", str(out), *BAD[name][0]] for name in names]
+        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=120)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr.strip() == "", "not even the C libraries speak"
+        answers = map(json.loads, done.stdout.splitlines())
+        found |= {(ranks, name): answer for name, answer in zip(names, answers, strict=True)}
+    return found
+
+
+@pytest.mark.parametrize(("ranks", "name"), REFUSALS)
+def test_bad_input_is_one_line_from_one_rank(refusals: dict, ranks: int, name: str):
+    answers = refusals[ranks, name]
+    assert [status for status, _ in answers] == [2] * ranks
+    lines = [line for _, told in answers for line in told.splitlines() if "note:" not in line]
+    assert lines == errors(answers[0][1]) and len(lines) == 1, answers
+    assert all(word in lines[0] for word in BAD[name][1]), lines
+
+
+def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
+    left = [path.name for ranks in (1, 2) for path in (folder / f"refused{ranks}").glob("*")]
+    assert left == []
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize(("name", "words"), [("gone.toml", "no such scene"), ("broken.toml", "is not TOML")])
+def test_a_scene_that_is_not_there_or_not_one(folder: Path, tmp_path: Path, ranks: int, name: str, words: str):
+    assert_one_line(on(ranks, folder / name, "-o", tmp_path / "o.h5"), 2, name, words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("open.ply", ["open (14 boundary edges)", "winding number will decide what is inside"]), ("foil.ply", [])],
+)
+def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path, name: str, words: list[str]):
+    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh(name, "pin=[]"))
+    assert done.returncode == 0, done.stderr
+    warnings = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")]
+    assert len(warnings) == (1 if words else 0)
+    assert all(word in warnings[0] for word in words)
+
+
+# What fails on the way
+
+
+@pytest.mark.parametrize(("ranks", "preset"), [(1, "newton"), (1, "anderson"), (2, "anderson")])
+def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
+    scene: Path, tmp_path: Path, ranks: int, preset: str
+):
+    """At rest until a force sets in at 0.025 s: frames 0 to 2 need no iteration, frame 3 more than one."""
+    out = tmp_path / "o.h5"
+    force = "force.0={region={sphere={center=[0,0,-1],radius=1}},total=[1e4,0,0],start=0.025}"
+    at_rest = sets("gravity.acceleration=[0,0,0]", force, "time.duration=0.05")
+    done = on(ranks, scene, "-o", out, *at_rest, "--preset", preset, "--error", "1e-12", "-snes_max_it", "1")
+    assert_one_line(done, 3, "frame 3 ", "DIVERGED_MAX_IT", "residual", "try ")
+    with h5py.File(out) as file:
+        assert finished(file) == len(file["frames/position"]) == 3
+        assert np.isfinite(file["frames/position"][:]).all()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]
+
+
+BUG_ON_RANK_1 = """
+import sys
+from mpi4py import MPI
+from msmpetsc.cli.main import main
+from msmpetsc.model import build
+def broken(body, scene):
+    raise ValueError("planted")
+if MPI.COMM_WORLD.rank == 1:
+    build.fill_cages = broken
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_bug_on_one_rank_ends_all(scene: Path, tmp_path: Path):
+    done = run(2, "-c", BUG_ON_RANK_1, "run", scene, "-o", tmp_path / "o.h5", timeout=30)
+    assert done.returncode == 1
+    assert "msmpetsc: rank 1: Traceback" in done.stderr and "ValueError: planted" in done.stderr
+    assert not (tmp_path / "o.h5").exists()

@@ -1,0 +1,240 @@
+"""What inspect says of R ranks, against what R ranks hold; and where integers end."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ENVIRONMENT, WORKERS
+from mpi4py import MPI
+
+from msmpetsc.cli.inspect import largest
+from msmpetsc.cli.main import main
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError
+from msmpetsc.model.build import build_model, fill_cages, read_body
+from msmpetsc.model.partition import Shares, count_shares
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.linear.system import assemble
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc import limits
+from msmpetsc.study import forecast
+from msmpetsc.study.forecast import Forecast, Network, Trial, held, units
+
+WORKER = WORKERS / "shares_worker.py"
+SELF = MPI.COMM_SELF
+
+
+@pytest.fixture
+def scene(ball: Path, tmp_path: Path) -> Path:
+    """A ball of 300 cells, struck by the ground: its steps need iterations."""
+    path = tmp_path / "scene.toml"
+    shutil.copy(ball, tmp_path / "ball.ply")
+    path.write_text("""
+        mesh = { source = "ball.ply" }
+        cages = { count = 300 }
+        material = { young_modulus = 1e5, density = 1000 }
+        time = { step = 0.01, duration = 0.1 }
+        start = { scale = [1, 1, 0.8] }
+    """)
+    return path
+
+
+@pytest.fixture
+def own_log():
+    """The command line sets up the log for its own process: afterwards it is as it was."""
+    before = log.handlers, log.level
+    yield
+    log.handlers, log.level = before
+
+
+def counted(scene: Path, cells: int, ranks: int) -> Shares:
+    """What count_shares says."""
+    read = load_scene(scene, [f"cages.count={cells}"])
+    body = read_body(SELF, read)
+    cages = fill_cages(body, read)
+    return count_shares(body, cages, build_model(SELF, read).lattice, ranks)
+
+
+def test_the_counts_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
+    ranks = 3
+    done = on_ranks(ranks, WORKER, scene, tmp_path / "held.json", "cages.count=3000")
+    assert done.returncode == 0, done.stderr
+    real = json.loads((tmp_path / "held.json").read_text())
+    found = counted(scene, 3000, ranks)
+    assert {name: getattr(found, name).tolist() for name in real} == real
+    assert min(real["ghosts"]) > 0 and sum(real["cells"]) == pytest.approx(3000, rel=0.01)
+
+
+def test_one_rank_holds_all(scene: Path):
+    found, lattice = counted(scene, 300, 1), build_model(SELF, load_scene(scene)).lattice
+    assert (found.cells[0], found.nodes[0], found.inner[0]) == (len(lattice.cells), lattice.owned, len(lattice.springs))
+    assert found.ghosts[0] == found.cut[0] == found.neighbours[0] == 0
+    assert found.nonzeros[0] == lattice.owned + 2 * len(lattice.springs)
+
+
+def test_more_ranks_than_nodes(scene: Path):
+    found = counted(scene, 300, 5000)
+    assert found.nodes.sum() == counted(scene, 300, 1).nodes.sum() and found.nodes.min() == 0
+
+
+def test_what_is_scaled_is_near_what_is_counted(scene: Path):
+    """Eight times the cells on 8 ranks: sums to the surface term, ghosts within a quarter."""
+    coarse, fine = (counted(scene, cells, 8) for cells in (4000, 32000))
+    scaled = coarse.scaled(fine.cells.sum())
+    for name, tolerance in {"nodes": 0.01, "nonzeros": 0.01, "springs": 0.03, "ghosts": 0.25}.items():
+        assert getattr(scaled, name).mean() == pytest.approx(getattr(fine, name).mean(), rel=tolerance), name
+    assert scaled.ghosts.mean() > 1.5 * coarse.ghosts.mean()
+    assert scaled.neighbours is coarse.neighbours
+
+
+def test_scaled_to_itself_nothing_changes(scene: Path):
+    found = counted(scene, 300, 4)
+    for name, values in vars(found.scaled(found.cells.sum())).items():
+        assert np.allclose(values, getattr(found, name)), name
+
+
+# Where integers end
+
+
+def a_cube(side: int) -> Shares:
+    nodes, cells = (side + 1) ** 3, side**3
+    springs = 3 * side * (side + 1) ** 2 + 6 * side**2 * (side + 1) + 4 * side**3
+    return Shares(*(np.array([float(value)]) for value in (cells, nodes, 0, springs, 0, 0)))
+
+
+def test_the_number_of_cells_at_which_unknowns_end():
+    """A cube of s^3 cells has 3 (s + 1)^3 unknowns."""
+    found = largest(a_cube(100), lambda s: 3 * s.nodes.sum(), 2**31 - 1)
+    assert found == pytest.approx((np.cbrt((2**31 - 1) / 3) - 1) ** 3, rel=1e-4)
+    assert a_cube(100).scaled(1e9).nonzeros.sum() == pytest.approx(a_cube(1000).nonzeros.sum(), rel=1e-3)
+
+
+def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
+    lattice = build_model(SELF, load_scene(scene)).lattice
+    nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
+    monkeypatch.setattr(limits, "LARGEST", 3 * nodes - 1)
+    for holder in (Unknowns, Ghosted):
+        with pytest.raises(InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns.*64-bit"):
+            holder(SELF, lattice)
+    monkeypatch.setattr(limits, "LARGEST", nonzeros - 1)
+    unknowns = Unknowns(SELF, lattice)
+    with pytest.raises(InputError, match=f"{nonzeros} nonzeros .* on one rank .* more ranks"):
+        assemble(SELF, unknowns, 0.01)
+    with pytest.raises(InputError, match=f"{3 * nonzeros} nonzeros"):
+        assemble(SELF, unknowns, 0.01, columns=3)
+    monkeypatch.setattr(limits, "LARGEST", nonzeros)
+    assemble(SELF, unknowns, 0.01).destroy()
+    unknowns.destroy()
+
+
+# Memory and time
+
+
+def trial(side: int, program: float, factor: float, its: float) -> Trial:
+    """As of a machine that takes 2e-5 s + 3e-9 s a spring for an iteration."""
+    cube = a_cube(side)
+    cells, nodes, springs, nonzeros = (float(v[0]) for v in (cube.cells, cube.nodes, cube.inner, cube.nonzeros))
+    memory = program + factor * held(cells, nodes, springs, nonzeros)
+    return Trial(cells, nodes, springs, nonzeros, memory, units(its, 2) * (2e-5 + 3e-9 * springs), 2, its)
+
+
+def test_the_laws_of_memory_and_time_are_found():
+    found = Forecast(trial(8, 3e8, 1.2, 40), trial(20, 3e8, 1.2, 100))  # its as the side
+    cube = a_cube(60)
+    assert found.program == pytest.approx(3e8)
+    arrays = held(cube.cells, cube.nodes, cube.inner, cube.nonzeros)
+    assert found.memory(cube) == pytest.approx(3e8 + 1.2 * arrays)
+    assert found.memory(cube, mesh=1e12) == pytest.approx(3e8 + 1e12)
+    assert found.its(cube.cells.sum()) == pytest.approx(300)
+    assert found.computing(cube) == pytest.approx(units(300, 2) * (2e-5 + 3e-9 * cube.inner[0]))
+    assert found.messages(cube, Network(1e-6, 1e9)) == 0  # alone
+
+
+def test_its_grow_no_faster_than_the_side_and_never_fall():
+    assert Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 500)).its(40**3) == pytest.approx(1000)
+    assert Forecast(trial(8, 0, 1, 30), trial(20, 0, 1, 20)).its(40**3) == 20
+    solved = Forecast(trial(8, 0, 1, 0), trial(20, 0, 1, 0))
+    assert solved.its(40**3) == 0 and solved.iterations(40**3) == 2
+
+
+def test_substeps_of_verlet_grow_as_the_side():
+    coarse, fine = (replace(trial(side, 0, 1, 0), iterations=side) for side in (8, 20))
+    assert Forecast(coarse, fine).iterations(40**3) == pytest.approx(40)
+
+
+def test_messages_cost_latency_and_bandwidth():
+    """Two ranks of 1000 ghosts, one neighbour each."""
+    two = Shares(*(np.array([v, v], float) for v in (1e4, 1e4, 1000, 1e5, 1e4, 1)))
+    found = Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 10))
+    exchanges, sums = 10 + 4 * 3, 3 * 10 + 10 * 3
+    assert found.messages(two, Network(1e-6, 1e9)) == pytest.approx(exchanges * (1e-6 + 24e-6) + sums * 2e-6)
+
+
+# The command
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--ranks", "0"], "--ranks must be at least 1"),
+        (["--frames", "0"], "--frames must be at least 1"),
+        (["--latency", "-1"], "--latency must be no less than 0"),
+        (["--bandwidth", "0"], "--bandwidth must be more than 0"),
+        (["--set", "cages.cuont=3"], "did you mean 'count'"),
+        (["--ranks", "many"], "invalid int value"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, own_log, words: list[str], said: str):
+    assert main(["inspect", str(scene), *words]) == 2
+    told = capsys.readouterr()
+    assert said in told.err and told.err.count("\n") == 1 and told.out == ""
+
+
+def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log, monkeypatch):
+    monkeypatch.setattr(forecast, "forecast", None)
+    found = counted(scene, 300, 3)
+    assert main(["inspect", str(scene), "--ranks", "3", "--no-times"]) == 0
+    told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
+    assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
+    assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
+
+
+def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, own_log, monkeypatch):
+    monkeypatch.setattr("msmpetsc.cli.inspect.MOST_BUILT", 1000)
+    many = "cages={count = 800000, max_cells = 100000}"
+    with pytest.raises(InputError, match="more than cages.max_cells"):
+        fill_cages(read_body(SELF, load_scene(scene)), load_scene(scene, [many]))
+    assert main(["inspect", str(scene), "--ranks", "8", "--no-times", "--set", many]) == 0
+    told = capsys.readouterr()
+    assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err
+    assert main(["inspect", str(scene), "--no-times", "--set", "cages={cell_size = 0.02}"]) == 0
+    (cells,) = [line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")]
+    volume = 4 / 3 * np.pi * 0.98  # of 320 triangles inside the sphere
+    assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
+
+
+def test_times_are_measured_once_and_kept(scene: Path, capsys, own_log, monkeypatch, tmp_path: Path):
+    for name, value in {**ENVIRONMENT, "XDG_CACHE_HOME": str(tmp_path / "cache")}.items():
+        monkeypatch.setenv(name, value)
+    words = ["inspect", str(scene), "--ranks", "2", "--frames", "2"]
+    assert main(words) == 0
+    first = capsys.readouterr().out
+    monkeypatch.setattr(forecast, "_measured", None)  # not again
+    assert main(words) == 0
+    assert capsys.readouterr().out == first
+    (memory,) = [float(line.split()[-2]) for line in first.splitlines() if line.startswith("memory")]
+    assert 0.1 < memory < 1  # [GB]: a Python with PETSc
+    assert "time of a frame" in first and "KSP iterations and" in first
+
+
+def test_memory_is_that_of_the_process_not_of_its_parent():
+    code = "from msmpetsc.cli.profile import peak_memory; print(peak_memory())"
+    large = np.ones(75_000_000)  # 600 MB
+    told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert 2e7 < int(told.stdout) < large.nbytes

@@ -1,0 +1,136 @@
+"""Whole runs through the command line under real mpiexec: the file alone must prove what happened."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ROOT
+
+pytest.importorskip("pymeshfix", reason="the bunny comes with pymeshfix")
+
+SCENES = ROOT / "scenes"
+GRAVITY = np.array([0, 0, -9.81])
+SMALL = ("--set", "cages.count=600")  # cells of 23 mm
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+def run_bunny(msmpetsc, path: Path, ranks: int, *options: str) -> h5py.File:
+    done = msmpetsc(ranks, "run", SCENES / "bunny_fall.toml", "-o", path, *SMALL, *options, timeout=200)
+    assert done.returncode == 0, done.stderr
+    return h5py.File(path)
+
+
+@pytest.fixture(scope="module")
+def fall(folder: Path) -> h5py.File:
+    """The shipped scene at its own time step, solved tightly by newton."""
+    from conftest import run
+
+    msmpetsc = lambda ranks, *arguments, **options: run(ranks, "-m", "msmpetsc.cli.main", *arguments, **options)  # noqa: E731
+    return run_bunny(msmpetsc, folder / "fall.h5", 1, "--preset", "newton", "--error", "1e-9")
+
+
+def frames_before_contact(file: h5py.File) -> int:
+    return int(np.argmax(file["frames/position"][:, :, 2].min(axis=1) <= 0))
+
+
+def test_free_fall_matches_the_schemes_closed_form(fall: h5py.File):
+    """q_n = q_0 + g t^2 n (n + 1) / 2 for implicit Euler from rest."""
+    count, t = frames_before_contact(fall), fall["frames/time"][1]
+    assert count >= 11  # at least ten frames of free fall
+    n = np.arange(count)[:, None, None]
+    q = fall["frames/position"][:count]
+    np.testing.assert_allclose(q, q[0] + GRAVITY * t**2 * n * (n + 1) / 2, rtol=0, atol=1e-10)
+
+
+def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5py.File):
+    ends, r, k, m = (fall["lattice"][name][:] for name in ("springs", "rest_length", "stiffness", "mass"))
+    q, t = fall["frames/position"], fall["frames/time"][1]
+    scale = np.linalg.norm(m[:, None] * GRAVITY * t**2)
+    for n in range(frames_before_contact(fall)):
+        x, y = q[n + 1], 2 * q[n] - q[max(n - 1, 0)]
+        along = x[ends[:, 0]] - x[ends[:, 1]]
+        force = (k * (1 - r / np.linalg.norm(along, axis=1)))[:, None] * along
+        gradient = np.zeros_like(x)
+        np.add.at(gradient, ends[:, 0], force)
+        np.add.at(gradient, ends[:, 1], -force)
+        F = m[:, None] * (x - y) + t**2 * (gradient - m[:, None] * GRAVITY)
+        assert np.linalg.norm(F) < 1e-8 * scale
+
+
+def test_the_bunny_hits_the_ground_leaps_and_keeps_its_shape(fall: h5py.File):
+    q, m = fall["frames/position"][:], fall["lattice/mass"][:]
+    height = q[:, :, 2] @ m / m.sum()
+    contact = frames_before_contact(fall)
+    lowest = contact + int(np.argmin(height[contact : contact + 60]))
+    assert height[lowest:].max() > height[lowest] + 0.005  # it leaps: 5 mm and more
+    assert fall["frames/momentum"][contact - 1, 2] < 0 < fall["frames/momentum"][lowest + 15, 2]
+    assert fall["frames/elastic"][contact : lowest + 5].max() > 0.01 * fall["frames/kinetic"][contact - 1]
+    assert q[:, :, 2].min() > -0.01  # nowhere deeper than half a cell
+    assert shape_error(q[-1], q[0]) < 0.05 * 0.3  # 5% of the bunny's 0.3 m
+
+
+def shape_error(q: np.ndarray, rest: np.ndarray) -> float:
+    """Root mean square distance [m] after the best rigid motion (Kabsch)."""
+    a, b = rest - rest.mean(axis=0), q - q.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return float(np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()))
+
+
+def test_the_energies_and_momentum_of_the_file_are_those_of_its_frames(fall: h5py.File):
+    m, n, t = fall["lattice/mass"][:], frames_before_contact(fall) - 1, fall["frames/time"][1]
+    q, before = fall["frames/position"][n], fall["frames/position"][n - 1]
+    velocity = (q - before) / t
+    assert fall["frames/kinetic"][n] == pytest.approx(0.5 * m @ (velocity**2).sum(axis=1))
+    assert fall["frames/potential"][n] == pytest.approx(9.81 * m @ q[:, 2])
+    np.testing.assert_allclose(fall["frames/momentum"][n], m @ velocity, atol=1e-9)
+
+
+def test_the_surface_is_W_times_the_positions(fall: h5py.File):
+    from scipy.sparse import csr_array
+
+    W = csr_array(tuple(fall["embedding"][name][:] for name in ("weights", "indices", "indptr")))
+    rest, last = fall["lattice/nodes"][:], fall["frames/position"][-1]
+    np.testing.assert_allclose(W.sum(axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(W @ rest, fall["surface/points"][:], atol=1e-12)
+    np.testing.assert_allclose(W @ last, fall["frames/surface"][-1], atol=1e-6)  # stored in single precision
+
+
+HANG = (  # the bunny hangs by its ears and swings: pins, a force that ends, no contact
+    "--set", "pin.0.region={box=[[0,0,0.85],[1,1,1]],relative=true}",
+    "--set", "force.0={region={half_space={point=[0,0,0.1],normal=[0,0,-1]},relative=true},total=[2,0,0],stop=0.025}",
+    "--set", "time.step=0.01", "--set", "time.duration=0.04", "--set", "cages.count=300",
+    "--set", "material.young_modulus=1e5", "--error", "1e-10",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("preset", "more"), [("newton", (2, 4)), ("anderson", (3,)), ("fast-msm", (2,))])
+def test_any_number_of_ranks_gives_the_same_file(msmpetsc, folder: Path, preset: str, more: tuple):
+    files = {
+        ranks: run_bunny(msmpetsc, folder / f"{preset}{ranks}.h5", ranks, "--preset", preset, *HANG)
+        for ranks in (1, *more)
+    }
+    one = files[1]
+    assert np.ptp(one["frames/position"][:], axis=0).max() > 1e-3  # it does move
+    for ranks, file in files.items():
+        assert file.attrs["ranks"] == ranks
+        for name in ("cells", "cell_kind", "springs", "pinned"):
+            np.testing.assert_array_equal(file["lattice"][name][:], one["lattice"][name][:])
+        for name in ("lattice/nodes", "lattice/rest_length", "lattice/stiffness", "lattice/mass", "embedding/weights"):
+            np.testing.assert_allclose(file[name][:], one[name][:], rtol=1e-13)
+        moved = np.linalg.norm(one["frames/position"][:] - one["frames/position"][0])
+        for name in ("position", "surface"):
+            difference = np.linalg.norm(file["frames"][name][:] - one["frames"][name][:])
+            assert difference < 1e-8 * moved or (name == "surface" and difference < 1e-6 * moved)
+
+
+def test_contact_is_the_same_on_two_ranks(msmpetsc, folder: Path, fall: h5py.File):
+    two = run_bunny(msmpetsc, folder / "fall2.h5", 2, "--preset", "newton", "--error", "1e-9")
+    q, other = fall["frames/position"][:], two["frames/position"][:]
+    assert np.linalg.norm(other - q) < 1e-8 * np.linalg.norm(q - q[0])

@@ -1,0 +1,182 @@
+"""Runs that are asked to stop, and go on: in this process, and on two ranks under a real mpiexec."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import block_scene
+from conftest import ENVIRONMENT
+
+from msmpetsc.cli.main import main
+from msmpetsc.output.writer import finished
+
+EVERY, STEPS = 3, 40
+STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
+pytestmark = pytest.mark.timeout(100)
+
+
+def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
+    """A soft block that hangs by one side and swings, a frame every third step."""
+    side = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
+    material = {"young_modulus": 1e5, "density": 1000.0}
+    output = {"surface": True, "every": EVERY}
+    gravity = {"acceleration": [0.0, 1.0, -9.81]}
+    scene = dict(
+        gravity=gravity, pin=side, time={"step": 0.01, "duration": 0.01 * steps}, material=material, output=output
+    )
+    return block_scene(folder, **scene | {"solver": {"preset": "newton", "error": 1e-3}} | tables)
+
+
+def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
+    """All frames of two files, bit by bit unless they may differ, but for how long they took."""
+    with h5py.File(path) as one, h5py.File(whole) as other:
+        assert one["frames"].keys() == other["frames"].keys() and finished(one) == finished(other)
+        names = ["frames/position"] if rtol else [f"frames/{name}" for name in one["frames"] if name != "wall_time"]
+        for name in names:
+            found, expected = one[name][...], other[name][...]
+            assert found.shape == expected.shape, name
+            if rtol:
+                np.testing.assert_allclose(found, expected, rtol=0, atol=rtol * np.abs(expected).max())
+            else:
+                assert np.array_equal(found, expected, equal_nan=True), name
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert main(["run", str(hanging(folder)), "-o", str(folder / "whole.h5")]) == 0
+    return folder / "whole.h5"
+
+
+def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
+    """This process gets the signal when the run has taken that step."""
+    from msmpetsc.solve.simulate import Simulation
+
+    advance = Simulation.advance
+
+    def watched(simulation):
+        for frame in advance(simulation):
+            if simulation.step == step:
+                os.kill(os.getpid(), number)
+            yield frame
+
+    monkeypatch.setattr(Simulation, "advance", watched)
+
+
+@pytest.mark.parametrize("number", STATUS)
+def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(whole: Path, tmp_path, monkeypatch, capsys, number):
+    path, handler = tmp_path / "x.h5", signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        signal_after(patch, 10, number)  # between frames
+        assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == STATUS[number]
+    told = f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run --resume {path}\n"
+    assert told in capsys.readouterr().err
+    assert signal.getsignal(number) == handler
+    with h5py.File(path) as file:
+        assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
+    assert main(["run", "--resume", str(path)]) == 0
+    assert_same(path, whole)
+    assert sorted(os.listdir(tmp_path)) == ["x.h5", "x.xdmf"]
+
+
+def test_stopped_again_and_again(whole: Path, tmp_path, monkeypatch):
+    path = tmp_path / "x.h5"
+    arguments = ["run", str(whole.parent / "scene.toml"), "--resume", str(path)]  # the same command each time
+    for step in (0, 1, 7, 8, 27, 39):
+        with monkeypatch.context() as patch:
+            signal_after(patch, step, signal.SIGUSR1)
+            assert main(arguments) == 0
+        with h5py.File(path) as file:
+            assert finished(file) == 1 + step // EVERY and max(file["checkpoint/step"]) == step
+    assert main(arguments) == 0
+    assert_same(path, whole)
+
+
+def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, monkeypatch, capsys):
+    signal_after(monkeypatch, STEPS, signal.SIGTERM)
+    path = tmp_path / "x.h5"
+    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == 0
+    assert "stopped" not in capsys.readouterr().err
+    assert_same(path, whole)
+
+
+def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
+    """A run in a process of its own, which has come to its first frame."""
+    launcher = ["mpiexec", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
+    command = [*launcher, sys.executable, "-m", "msmpetsc.cli.main", "run", *map(str, arguments)]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.startswith("frame 0/"):
+            return process
+    raise AssertionError("it never began")
+
+
+def test_a_second_interrupt_stops_at_once(tmp_path, msmpetsc):
+    """Both come within one step, which these settings would not end for minutes."""
+    path = tmp_path / "x.h5"
+    stiff = {"young_modulus": 1e9, "density": 1000.0}
+    scene = hanging(
+        tmp_path, 2, cages={"cell_size": 1 / 48}, material=stiff, solver={"preset": "anderson", "error": 1e-9}
+    )
+    process = start(scene, "-o", path, "-snes_max_it", "100000")
+    with process:
+        time.sleep(0.5)  # before the step begins, the first interrupt alone would end the run
+        for _ in range(20):
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                time.sleep(0.02)
+        told = process.stderr.read()
+    assert process.returncode == 130 and "stopped at once" in told
+    with h5py.File(path) as file:
+        assert finished(file) >= 1
+
+
+INTERRUPTED_AT_THE_END = """
+import atexit, os, signal
+from msmpetsc.cli import main
+main.main = lambda: 143
+atexit.register(os.kill, os.getpid(), signal.SIGINT)
+main.entry_point()
+"""
+
+
+def test_an_interrupt_after_the_end_changes_nothing():
+    command = [sys.executable, "-c", INTERRUPTED_AT_THE_END]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 143 and done.stderr == ""
+
+
+def test_a_signal_to_one_rank_stops_all_together(tmp_path):
+    path = tmp_path / "x.h5"
+    scene = hanging(tmp_path, 3000, output={"surface": False})
+    with start(scene, "-o", path, ranks=2) as process:
+        os.kill(ranks_of(process)[1], signal.SIGTERM)
+        told = process.stderr.read()
+    assert process.returncode == 143
+    step = int(told.partition("after step ")[2].split()[0])
+    with h5py.File(path) as file:
+        # step may be 0: on busy cores the signal comes before the first
+        assert max(file["checkpoint/step"]) == step and finished(file) == 1 + step
+
+
+def test_mpiexec_hands_on_what_it_is_sent(tmp_path):
+    path = tmp_path / "x.h5"
+    with start(hanging(tmp_path, 3000, output={"surface": False}), "-o", path, ranks=2) as process:
+        process.send_signal(signal.SIGUSR1)
+        told = process.stderr.read()
+    assert "stopped by SIGUSR1" in told and process.returncode == 0
+    with h5py.File(path) as file:
+        assert max(file["checkpoint/step"]) == finished(file) - 1
+
+
+def ranks_of(mpiexec: subprocess.Popen) -> list[int]:
+    """Process numbers of its ranks."""
+    children = Path(f"/proc/{mpiexec.pid}/task/{mpiexec.pid}/children").read_text().split()
+    return sorted(int(child) for child in children if b"python" in Path(f"/proc/{child}/cmdline").read_bytes())

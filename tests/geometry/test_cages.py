@@ -1,0 +1,376 @@
+"""A surface filled with cells: which cells it touches, what it encloses, the same on any number of ranks.
+
+Two oracles. Touched cells: a separating-axis test in integers, so nothing is rounded. A cell is the
+half-open box [i, i+1)^3, but what touches only its far faces, where it is interpolated, may be marked
+or not: so all cells of the half-open test must be there, and none beyond the closed one.
+Enclosed cells: scipy.ndimage.label on the dense grid.
+"""
+
+import os
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from cages_worker import FILLED, enclosed
+from conftest import WORKERS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from mpi4py import MPI
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry import morton
+from msmpetsc.geometry.boundary import sampled_cells, touched_cells
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, fill
+from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.prepare import compact, prepare
+from msmpetsc.geometry.surface import Surface, examine, read_surface
+
+WORKER = WORKERS / "cages_worker.py"
+MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
+with_meshes = pytest.mark.skipif("MSMPETSC_MESH_DIR" not in os.environ, reason="needs $MSMPETSC_MESH_DIR")
+SIDE = 6  # cells of the small grid of the boundary tests
+
+
+# --- Morton keys ---
+
+
+@settings(deadline=None)
+@given(arrays(np.int64, (9, 3), elements=st.integers(0, morton.LIMIT - 1)))
+def test_morton_round_trip_in_the_order_of_the_interleaved_bits(ijk):
+    keys = morton.encode(ijk)
+    assert np.array_equal(morton.decode(keys), ijk)
+    bits = ["".join(f"{k:021b}"[b] + f"{j:021b}"[b] + f"{i:021b}"[b] for b in range(21)) for i, j, k in ijk.tolist()]
+    assert keys.tolist() == [int(b, 2) for b in bits]
+
+
+@given(st.integers(0, morton.LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
+def test_morton_keeps_the_order_along_each_axis(at, axis, ijk):
+    low, high = ijk.copy(), ijk.copy()
+    low[axis], high[axis] = at, at + 1
+    assert morton.encode(low) < morton.encode(high)
+
+
+def test_morton_is_minus_one_outside():
+    outside = np.array([[-1, 0, 0], [0, morton.LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
+    assert (morton.encode(outside) == -1).all()
+    assert morton.encode(outside[:, None]).shape == (4, 1)
+
+
+# --- boundary cells ---
+
+
+def cells_of(corners: np.ndarray, mark=touched_cells, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[int, ...]]:
+    return set(map(tuple, mark(np.atleast_3d(corners).reshape(-1, 3, 3), np.array(low), np.array(high)).tolist()))
+
+
+UNIT = 64  # triangles of the oracle have corners at multiples of 1/64
+FINE = 1 << 34  # and a half-open cell is one that ends 1/64 * 2^-34 before its far faces
+
+
+def boxes_touched(triangle: np.ndarray, gap: int) -> set[tuple[int, ...]]:
+    """Separating axes between a triangle (3, 3) in 1/64 cells and all boxes [i, i + 1 - gap / (64 * 2^34)].
+
+    Akenine-Moller 2001, in integers below 2^63.
+    """
+    cells = np.stack(np.indices((SIDE,) * 3), -1).reshape(-1, 3)
+    low, high = cells * UNIT * FINE, (cells + 1) * UNIT * FINE - gap
+    edges = np.roll(triangle, -1, axis=0) - triangle
+    crossed = np.cross(edges[:, None], np.eye(3, dtype=np.int64)).reshape(9, 3)
+    axes = np.concatenate([np.eye(3, dtype=np.int64), np.cross(edges[:1], edges[1:2]), crossed])
+    at = axes @ (triangle.T * FINE)
+    nearest = np.minimum(axes * low[:, None], axes * high[:, None]).sum(-1)
+    farthest = np.maximum(axes * low[:, None], axes * high[:, None]).sum(-1)
+    apart = (at.max(1) < nearest) | (at.min(1) > farthest)
+    return set(map(tuple, cells[~apart.any(1)].tolist()))
+
+
+def assert_exact(triangle: np.ndarray) -> bool:
+    """Returns whether the oracle leaves no choice."""
+    at_least, at_most = boxes_touched(triangle, 1), boxes_touched(triangle, 0)
+    found = cells_of(triangle / UNIT)
+    assert at_least <= found <= at_most, triangle
+    return at_least == at_most
+
+
+off_planes = st.integers(0, SIDE * UNIT // 2 - 1).map(lambda x: 2 * x + 1)
+often_on_planes = st.integers(0, SIDE * 4 - 1).map(lambda x: 16 * x)
+
+
+@settings(max_examples=300, deadline=None)  # the first example compiles
+@given(st.one_of(*(arrays(np.int64, (3, 3), elements=place) for place in (off_planes, often_on_planes))))
+def test_touched_cells_are_those_of_a_separating_axis_test(triangle):
+    assert_exact(triangle)
+
+
+def test_for_most_triangles_the_oracle_leaves_no_choice():
+    rng = np.random.default_rng(1)
+    decided = [assert_exact(2 * rng.integers(0, SIDE * UNIT // 2, (3, 3)) + 1) for _ in range(200)]
+    assert np.mean(decided) > 0.95
+
+
+@settings(max_examples=300, deadline=None)  # the first example compiles
+@given(arrays(np.int64, (3, 3), elements=st.integers(0, 300 * 1024)), st.integers(0, 8), st.sampled_from([1, 1024]))
+def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
+    # corners at multiples of 1/1024, points of 1/64 steps in the triangle: all exact in double precision.
+    # The division makes some slivers: thin across one axis
+    corners = corners / 1024 // (1 / unit) * (1 / unit) / np.array([1, 1 << power, 1])
+    i, j = np.indices((65, 65)).reshape(2, -1)[:, np.indices((65, 65)).sum(axis=0).ravel() <= 64] / 64
+    a, b, c = corners
+    points = a + i[:, None] * (b - a) + j[:, None] * (c - a)
+    marked = touched_cells(corners[None], np.zeros(3, np.int64), np.full(3, 301))
+    assert np.isin(morton.encode(np.floor(points).astype(np.int64)), morton.encode(marked)).all()
+
+
+def through_grid_points(count: int) -> np.ndarray:
+    """Triangles of one side through a grid point, at a place where interpolation rounds: (count, 3, 3)."""
+    rng = np.random.default_rng(2)
+    grid_point, side = rng.integers(5, 15, (count, 3)), rng.normal(size=(count, 3))
+    before, after = rng.integers(1, 4, (2, count, 1))
+    a, b = grid_point - before * side, grid_point + after * side
+    return np.stack([a, b, rng.uniform(0, 20, (count, 3))], axis=1)
+
+
+def test_cut_into_slabs_a_triangle_marks_the_same_cells():
+    for triangle in through_grid_points(1000):
+        slabs = [cells_of(triangle, low=(i, -9, -9), high=(i + 1, 30, 30)) for i in range(20)]
+        assert set.union(*slabs) == cells_of(triangle, low=(0, -9, -9), high=(20, 30, 30))
+
+
+def test_a_long_sliver_marks_what_its_axis_passes():
+    # its edges rise from y = 1/2 at x = 1/2 and reach y = 1 at x = 500.5 and 500.99: both in cell 500
+    corners = np.array([[0.5, 0.5, 0.5], [1000.5, 1.5, 0.5], [1000.5, 1.5 - 1 / 1024, 0.5]])
+    lower, upper = {(i, 0, 0) for i in range(501)}, {(i, 1, 0) for i in range(500, 1001)}
+    assert cells_of(corners, high=(1001, 9, 9)) == lower | upper
+
+
+def test_points_and_segments_are_triangles_too():
+    assert cells_of(np.full((3, 3), 2.5)) == {(2, 2, 2)}
+    assert cells_of(np.full((3, 3), 2.0)) == {(2, 2, 2)}  # low faces are the cell's own
+    segment = np.array([[0.5, 0.5, 0.5], [4.5, 0.5, 0.5], [2.0, 0.5, 0.5]])
+    assert cells_of(segment) == {(i, 0, 0) for i in range(5)}
+    assert assert_exact(np.array([[1, 3, 5], [381, 211, 77], [1, 3, 5]]))  # a slanted one
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_triangle_in_a_grid_plane_marks_the_layer_above_it(axis):
+    flat = np.array([[0.3, 0.2, 3.0], [5.7, 1.1, 3.0], [2.9, 5.3, 3.0]])
+    assert {cell[axis] for cell in cells_of(np.roll(flat, axis + 1, axis=1))} == {3}
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_triangle_that_stands_on_a_grid_plane_marks_nothing_below(axis):
+    standing = np.array([[0.5, 0.5, 3.0], [5.3, 0.7, 3.0], [2.1, 4.4, 5.2]])
+    assert {cell[axis] for cell in cells_of(np.roll(standing, axis + 1, axis=1))} == {3, 4, 5}
+
+
+@pytest.mark.parametrize("mark", [touched_cells, sampled_cells])
+def test_cells_outside_the_limits_are_left_out(mark):
+    rng = np.random.default_rng(3)
+    triangles = rng.uniform(0, SIDE, (40, 1, 3)) + rng.uniform(-1, 1, (40, 3, 3)) * rng.choice([0.01, 2], (40, 1, 1))
+    everywhere = cells_of(triangles, mark, (-9,) * 3, (20,) * 3)
+    low, high = (1, 2, 3), (4, 5, 5)
+    within = {cell for cell in everywhere if all(a <= c < b for a, c, b in zip(low, cell, high, strict=True))}
+    assert cells_of(triangles, mark, low, high) == within != everywhere
+    assert cells_of(triangles, mark, low, low) == set()
+
+
+def test_the_papers_samples_miss_cells_that_a_sphere_grazes():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    triangles = (np.asarray(ball.vertices) * 9.7 + 10)[ball.faces]
+    exact, sample = (cells_of(triangles, mark, high=(20,) * 3) for mark in (touched_cells, sampled_cells))
+    assert sample < exact
+    assert len(exact - sample) > 0.02 * len(exact)
+
+
+def test_the_papers_samples_hold_every_corner():
+    triangles = np.random.default_rng(4).uniform(0, SIDE, (500, 3, 3))
+    triangles[:, :, 0] = np.floor(triangles[:, :, 0])  # on grid planes, where rounding down changes the cell
+    corners = set(map(tuple, np.floor(triangles).astype(int).reshape(-1, 3).tolist()))
+    assert corners <= cells_of(triangles, sampled_cells)
+
+
+# --- interior cells ---
+
+
+def body_of(mesh: trimesh.Trimesh | Surface) -> Body:
+    if isinstance(mesh, trimesh.Trimesh):
+        mesh = Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
+    surface = compact(mesh.points, mesh.triangles)
+    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
+    return Body(MPI.COMM_SELF, surface, examine(surface), bounds)
+
+
+def dense(cages: Cages, kind: int) -> np.ndarray:
+    grid = np.zeros(cages.grid.shape, bool)
+    grid[tuple(cages.ijk[cages.kind == kind].T)] = True
+    return grid
+
+
+def hollow_ball(turned: bool) -> trimesh.Trimesh:
+    shell, cavity = trimesh.creation.icosphere(3, radius=1.0), trimesh.creation.icosphere(3, radius=0.6)
+    if turned:
+        cavity.invert()
+    return trimesh.util.concatenate([shell, cavity])
+
+
+def two_balls() -> trimesh.Trimesh:
+    far = trimesh.creation.icosphere(2).apply_translation([0.3, 2.5, 0.1])
+    return trimesh.util.concatenate([trimesh.creation.icosphere(2), far])
+
+
+UPRIGHT = trimesh.transformations.rotation_matrix(1.3, [1, 1, 0])
+SHAPES = {
+    "torus": (trimesh.creation.torus(1.0, 0.35), 0.06),
+    "torus upright": (trimesh.creation.torus(1.0, 0.35).apply_transform(UPRIGHT), 0.06),
+    "hollow ball": (hollow_ball(turned=True), 0.07),
+    "two balls": (two_balls(), 0.08),
+    "one cell": (trimesh.creation.icosphere(2), 2.5),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_interior_is_what_a_dense_flood_fill_finds(name):
+    mesh, cell_size = SHAPES[name]
+    cages = fill(body_of(mesh), cell_size)
+    assert np.array_equal(dense(cages, INTERIOR), enclosed(dense(cages, BOUNDARY)))
+
+
+@pytest.mark.parametrize("name", ["torus", "two balls"])
+def test_valid_cells_have_the_bodys_volume_and_half_its_boundary_cells_more(name):
+    mesh, cell_size = SHAPES[name]
+    cages = fill(body_of(mesh), cell_size)
+    boundary = (cages.kind == BOUNDARY).sum()
+    # a smooth surface cuts its cells in half on average
+    assert (len(cages.kind) - boundary / 2) * cell_size**3 == pytest.approx(mesh.volume, rel=0.02)
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_a_cavity_is_filled_however_it_is_wound(turned):
+    # the flood comes from outside and cannot reach it: the paper's interior is what is enclosed
+    cages = fill(body_of(hollow_ball(turned)), 0.1)
+    middle = np.floor((0 - cages.grid.origin) / 0.1).astype(int)
+    assert dense(cages, INTERIOR)[tuple(middle)]
+
+
+def test_time_and_memory_follow_the_cells_not_the_bounding_box():
+    # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3: a bit for each of its cells is 1 TB
+    ends = np.array([[0, 0, 0], [20_000, 20_000, 20_000]])
+    body = body_of(trimesh.creation.cylinder(radius=1.5, segment=ends, sections=5))
+    fill(body, 2000.0)  # compile
+    tracemalloc.start()
+    cages = fill(body, 1.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert cages.grid.shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
+    assert peak < 500 * len(cages.kind)  # bytes
+
+
+# --- cages ---
+
+
+def aligned_box(lid: bool = True) -> Body:
+    box = trimesh.creation.box((1, 0.5, 0.3))
+    box.vertices = np.array([1, 0.5, 0.3]) * (box.vertices > 0)
+    if not lid:
+        box.update_faces(~(box.vertices[box.faces][:, :, 2] == 0.3).all(axis=1))
+    return body_of(box)
+
+
+def test_an_aligned_box_is_filled_with_its_own_cells():
+    cages = fill(aligned_box(), 0.1)
+    assert cages.grid.shape.tolist() == [10, 5, 3] and len(cages.kind) == cages.table.total == 150
+    assert (cages.kind == INTERIOR).sum() == 8 * 3 * 1
+    assert np.array_equal(dense(cages, BOUNDARY), ~np.pad(np.ones((8, 3, 1), bool), 1))
+
+
+def test_without_its_lid_the_winding_number_fills_the_box():
+    body = aligned_box(lid=False)
+    assert not body.report.closed
+    cages = fill(body, 0.1)
+    assert len(cages.kind) == 150
+    assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
+
+
+def test_the_longest_side_may_be_any():
+    whole = fill(aligned_box(), 0.1).ijk
+    for turns in (1, 2):
+        points = np.roll(aligned_box().surface.points, turns, axis=1)
+        turned = fill(body_of(Surface(points, aligned_box().surface.triangles)), 0.1).ijk
+        assert set(map(tuple, np.roll(turned, -turns, axis=1))) == set(map(tuple, whole))
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Cages]]:
+    """A folder with the meshes that the worker fills, and their cells on one rank."""
+    folder, cages = tmp_path_factory.mktemp("filled"), {}
+    for name, cell_size, method in FILLED:
+        mesh = SHAPES["one cell" if name == "one cell" else "torus upright"][0].copy()
+        if name == "open":
+            mesh.update_faces(np.arange(len(mesh.faces)) > 20)
+        body = body_of(mesh)
+        np.savez(folder / f"{name}.npz", points=body.surface.points, triangles=body.surface.triangles)
+        cages[name] = fill(body, cell_size, method)
+    return folder, cages
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4, 5])
+def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_enclose(on_ranks, filled, ranks):
+    folder, serial = filled
+    done = on_ranks(ranks, "-m", "mpi4py", WORKER, folder, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("passed") == ranks
+    for name, cages in serial.items():
+        with np.load(folder / f"{name}.cells.npz") as cells:
+            assert np.array_equal(cells["ijk"], cages.ijk) and np.array_equal(cells["kind"], cages.kind), name
+    assert len(serial["one cell"].kind) == 1 and len(serial["sampled"].kind) < len(serial["closed"].kind)
+
+
+def test_too_many_cells_are_refused():
+    with pytest.raises(InputError, match="above cages.max_cells = 149"):
+        fill(aligned_box(), 0.1, max_cells=149)
+    assert len(fill(aligned_box(), 0.1, max_cells=150).kind) == 150
+    with pytest.raises(InputError, match="above cages.max_cells"):
+        fill(aligned_box(), 1e-5)  # at once: 1.5e14 cells are not tried
+    with pytest.raises(InputError, match="cages.cell_size: 1e-08 m would cut the body into 1e"):
+        fill(aligned_box(), 1e-8)
+
+
+@with_meshes
+def test_an_unrepaired_scan_has_the_cells_of_the_repaired_one():
+    scan = read_surface(MESHES / "nasty_bunny_nonmanifold.ply")
+    whole = body_of(prepare(scan, ["repair"]))
+    open_body = body_of(scan)
+    assert whole.report.closed and not open_body.report.closed
+    cells = fill(whole, 2.0), fill(open_body, 2.0)
+    found, expected = (set(map(tuple, np.rint(c.grid.node_positions(c.ijk) / 2 * 4))) for c in cells)
+    assert len(found) == pytest.approx(len(expected), rel=0.03)
+    assert len(expected) > 3000
+
+
+# --- cell size ---
+
+
+@with_meshes
+@pytest.mark.parametrize("count", [1000, 9946, 30_000])
+@pytest.mark.parametrize("name", ["armadillo", "bunny", "dragon", "heart", "lung"])
+def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
+    body = body_of(read_surface(MESHES / f"{name}.ply"))
+    cages = fill(body, choose_cell_size(body, count))
+    assert cages.table.total == pytest.approx(count, rel=0.01)
+
+
+def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
+    # a cube has its own k^3 cells, and no other number: 8 and 27 lie around 20
+    cube = body_of(trimesh.creation.box((1, 1, 1)))
+    with caplog.at_level("WARNING", logger="msmpetsc"):
+        cages = fill(cube, choose_cell_size(cube, 20))
+    assert cages.table.total == 27
+    assert "20 cells within 1%; taking 27" in caplog.text
+
+
+def test_more_cells_than_allowed_are_not_sought():
+    with pytest.raises(InputError, match="cages.count: 151 is more than cages.max_cells = 150"):
+        choose_cell_size(aligned_box(), 151, max_cells=150)

@@ -1,0 +1,259 @@
+"""The embedding weights: exactness, continuity, smoothness, accuracy, and a plain evaluation of Eq. 1-9."""
+
+import runpy
+from itertools import permutations
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.stencil import KINDS, stencil_weights
+
+STUDY = runpy.run_path(str(ROOT / "scripts" / "embedding_study.py"))
+NODES, BLOCK = STUDY["NODES"], STUDY["BLOCK"]
+ALL_KINDS = pytest.mark.parametrize("kind", KINDS)
+SMOOTH_KINDS = pytest.mark.parametrize("kind", ["cages", "affine"])
+
+near_face = st.sampled_from([0.0, 1e-300, 1e-16, 3e-14, 1e-13, 1e-12, 1e-9, 1e-5, 0.00999, 0.01001])
+coordinate = st.one_of(near_face, near_face.map(lambda x: 1 - x), st.just(0.5), st.floats(0, 1))
+local_points = st.tuples(coordinate, coordinate, coordinate)
+# every cell of the block touches the middle one: any set of them is connected
+neighbour_masks = st.lists(st.booleans(), min_size=27, max_size=27).map(lambda m: [*m[:13], True, *m[14:]])
+
+
+def weights(kind, u, mask, smoothing=1.0):
+    """Weights (64,) of one point."""
+    return stencil_weights(kind, np.array([u], float), np.array([mask], bool), smoothing)[0]
+
+
+def random_masks(rng, count):
+    masks = rng.random((count, 27)) < rng.choice([0.1, 0.5, 0.9], (count, 1))
+    masks[:, 13] = True
+    return masks
+
+
+def exists(masks):
+    """(p,64) bool: the node belongs to a valid cell."""
+    has_node = ((NODES - BLOCK[:, None] >= 0) & (NODES - BLOCK[:, None] <= 1)).all(-1)
+    return masks @ has_node > 0
+
+
+# ---- a plain evaluation of Eq. 1-9, cell by cell, triangle by triangle
+
+
+def surface_triangles(cells):
+    """Outward triangles, as nodes, of a union of cells (set of low corners); squares cut from low to high corner."""
+    triangles = []
+    for cell in cells:
+        for axis, end in np.ndindex(3, 2):
+            outwards = np.eye(3, dtype=int)[axis] * (2 * end - 1)
+            if tuple(cell + outwards) not in cells:
+                a, b = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
+                low = np.array(cell) + end * np.eye(3, dtype=int)[axis]
+                for pair in ((low + a, low + a + b), (low + a + b, low + b)):
+                    triangles.append((low, *(pair if end else pair[::-1])))
+    return triangles
+
+
+def plain_mvc(p, cells):
+    """Eq. 2-5 -> (64,); cells: set of low corners."""
+    w = np.zeros(64)
+    for triangle in surface_triangles(cells):
+        e = [(v - p) / np.linalg.norm(v - p) for v in triangle]
+        beta = [np.arccos(e[i - 2] @ e[i - 1]) for i in range(3)]  # opposite to vertex i
+        n = [np.cross(e[i - 2], e[i - 1]) for i in range(3)]
+        n = [x / np.linalg.norm(x) for x in n]
+        for i, v in enumerate(triangle):
+            mu = sum(beta[j] * n[j] @ n[i] for j in range(3)) / (2 * e[i] @ n[i])
+            w[(v + 1) @ (16, 4, 1)] += mu / np.linalg.norm(v - p)
+    return w / w.sum()
+
+
+def plain_cages(p, mask, h):
+    """Eq. 7-9 -> (64,)."""
+    valid = {tuple(offset) for offset in BLOCK[mask]}
+    corners = [np.array(v) for v in np.ndindex(2, 2, 2)]
+    around = {tuple(v): {c for c in valid if all(v - c >= 0) and all(v - c <= 1)} for v in corners}
+    own = plain_mvc(p, {(0, 0, 0)})
+    b, step = 1.0, lambda z: z * z * (3 - 2 * z)
+    for c in valid - {(0, 0, 0)}:
+        b *= 1 - sum(own[(v + 1) @ (16, 4, 1)] for v in corners if c in around[tuple(v)])
+    b = step(min(b / h, 1))
+    blends = [step(1 - abs(p - v)).prod() if len(around[tuple(v)]) > 1 else 0 for v in corners]
+    if not any(blends):
+        return own
+    joined = sum(W * plain_mvc(p, around[tuple(v)]) for v, W in zip(corners, blends, strict=True) if W)
+    return b * own + (1 - b) * joined / sum(blends)
+
+
+def test_mvc_and_cages_agree_with_their_equations_evaluated_plainly():
+    rng = np.random.default_rng(0)
+    points = [*rng.uniform(0.05, 0.95, (4, 3)), np.array([0.005, 0.4, 0.7]), np.array([0.3, 0.995, 0.002])]
+    masks = random_masks(rng, len(points))
+    masks[0] = np.isin(np.arange(27), [13, 14])  # 4 of the corners are not in B_c
+    for u, mask in zip(points, masks, strict=True):
+        np.testing.assert_allclose(weights("mvc", u, mask), plain_mvc(u, {(0, 0, 0)}), atol=1e-10)
+        for h in (1.0, 0.4):
+            np.testing.assert_allclose(weights("cages", u, mask, h), plain_cages(u, mask, h), atol=1e-10)
+
+
+def test_affine_agrees_with_least_squares_at_each_corner():
+    rng = np.random.default_rng(7)
+    for u, mask in zip(rng.random((10, 3)), random_masks(rng, 10), strict=True):
+        x, expected = rng.standard_normal(64), 0.0
+        for v in np.array(list(np.ndindex(2, 2, 2))):
+            around = mask & ((v - BLOCK >= 0) & (v - BLOCK <= 1)).all(1)
+            nodes = NODES[exists(around[None])[0]]
+            values = x[(nodes + 1) @ (16, 4, 1)] - x[(v + 1) @ (16, 4, 1)]
+            gradient = np.linalg.lstsq(nodes - v, values, rcond=None)[0]
+            z = 1 - abs(u - v)
+            expected += (z * z * (3 - 2 * z)).prod() * (x[(v + 1) @ (16, 4, 1)] + gradient @ (u - v))
+        assert weights("affine", u, mask) @ x == pytest.approx(expected, abs=1e-12)
+
+
+def test_mvc_on_a_face_is_barycentric_in_the_triangle_there():
+    # face x = 1 is cut from (1,0,0) to (1,1,1); (y,z) = (0.7,0.2) lies in the triangle with (1,1,0)
+    expected = np.zeros((4, 4, 4))
+    expected[2, 1, 1], expected[2, 2, 1], expected[2, 2, 2] = 0.3, 0.5, 0.2
+    for x in (1.0, 1 - 1e-13, 1 - 1e-10):
+        found = weights("mvc", (x, 0.7, 0.2), np.ones(27)).reshape(4, 4, 4)
+        np.testing.assert_allclose(found, expected, atol=10 * (1 - x) + 1e-15)
+
+
+def test_mvc_interpolates_at_corners():
+    corners = np.array(list(np.ndindex(2, 2, 2)))
+    found = stencil_weights("mvc", corners + 1e-13, np.ones((8, 27), bool))  # rounding beyond the cell is taken
+    np.testing.assert_allclose(found, (corners[:, None] == NODES).all(-1), atol=1e-12)
+
+
+# ---- properties of all kinds
+
+
+@ALL_KINDS
+@settings(max_examples=200, deadline=None)
+@given(u=local_points, mask=neighbour_masks, smoothing=st.sampled_from([1.0, 0.3, 1e-3]))
+def test_rows_sum_to_one_reproduce_linear_fields_and_use_only_nodes_there_are(kind, u, mask, smoothing):
+    found = weights(kind, u, mask, smoothing)
+    assert abs(found.sum() - 1) < 1e-12
+    np.testing.assert_allclose(found @ NODES, u, atol=1e-12, rtol=0)
+    assert np.all(found[~exists(np.array([mask]))[0]] == 0.0)
+    assert np.abs(found).max() < 20
+
+
+@ALL_KINDS
+def test_hard_points_in_random_sets(kind):
+    rng = np.random.default_rng(1)
+    hard = [0, 1e-15, 1e-14, 2e-14, 1e-12, 1e-9, 1e-6, 1e-3, 0.00999, 0.01001, 0.25, 0.5]
+    hard = np.array(hard + [1 - x for x in hard])
+    u = np.stack(np.meshgrid(hard, hard, hard), -1).reshape(-1, 3)
+    masks = random_masks(rng, len(u))
+    found = stencil_weights(kind, u, masks)
+    assert np.abs(found.sum(1) - 1).max() < 1e-12
+    assert np.abs(found @ NODES - u).max() < 1e-12
+    assert np.all(found[~exists(masks)] == 0.0)
+
+
+@ALL_KINDS
+def test_weights_know_no_direction(kind):
+    """A cut from low to high corner is the same after swapping axes and after point inversion."""
+    rng = np.random.default_rng(2)
+    u, masks = rng.random((50, 3)), random_masks(rng, 50)
+    found = stencil_weights(kind, u, masks).reshape(50, 4, 4, 4)
+    for order in permutations(range(3)):
+        turn = (0, *(axis + 1 for axis in order))
+        turned_masks = masks.reshape(50, 3, 3, 3).transpose(turn).reshape(50, 27)
+        turned = stencil_weights(kind, u[:, order], turned_masks).reshape(50, 4, 4, 4)
+        np.testing.assert_allclose(turned, found.transpose(turn), atol=1e-12)
+    inverted = stencil_weights(kind, 1 - u, masks[:, ::-1]).reshape(50, 4, 4, 4)
+    np.testing.assert_allclose(inverted, found[:, ::-1, ::-1, ::-1], atol=1e-12)
+
+
+@ALL_KINDS
+def test_weights_change_little_next_to_a_plane_of_the_grid(kind):
+    """In cages with reentrant edges too, where p is in the plane of a square that it does not lie on."""
+    rng = np.random.default_rng(3)
+    u, masks = rng.uniform(0.1, 0.9, (2000, 3)), random_masks(rng, 2000)
+    height = 10.0 ** rng.uniform(-13, -6, 2000)
+    row, axis = np.arange(2000), rng.integers(3, size=2000)
+    u[row, axis] = height
+    near = stencil_weights(kind, u, masks)
+    u[row, axis] = 0.0
+    there = stencil_weights(kind, u, masks)
+    assert np.all(np.abs(near - there).max(1) < 20 * height + 1e-12)
+
+
+# ---- across cells
+
+
+@ALL_KINDS
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_position_is_continuous_across_everything_that_cells_share(kind, share):
+    """Faces, edges and corners of cells that may touch only there."""
+    rng = np.random.default_rng(4)
+    valid = STUDY["random_cells"](rng, share=share)
+    assert STUDY["position_jump"](kind, valid) < 1e-10
+    first, second, u = STUDY["shared"](rng, valid, BLOCK[14:], 2000)
+    nodes = STUDY["moved_nodes"](rng, valid)
+    for cells, at in ((first, u), (second, u - (second - first))):
+        inside = at + 1e-9 * (0.5 - at)
+        moved = STUDY["place"](kind, valid, nodes, cells, inside) - STUDY["place"](kind, valid, nodes, cells, at)
+        assert np.abs(moved).max() < 1e-7
+
+
+@SMOOTH_KINDS
+def test_slope_is_continuous_across_shared_faces(kind):
+    for valid in (STUDY["block_of_cells"]((4, 3, 3)), STUDY["random_cells"](np.random.default_rng(5))):
+        assert STUDY["kinks"](kind, valid).max() < 1e-5
+
+
+def test_mean_value_coordinates_alone_have_kinks():
+    assert STUDY["kinks"]("mvc", STUDY["block_of_cells"]((4, 3, 3))).mean() > 0.1
+
+
+@ALL_KINDS
+def test_error_on_a_bent_bar_falls_with_the_square_of_the_cell_size(kind):
+    sizes = STUDY["SIZES"]
+    errors = [STUDY["rms_error"](kind, size, points=4000) for size in sizes]
+    slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    assert 1.8 < slope < 2.3
+
+
+def test_affine_is_the_most_accurate():
+    errors = {kind: STUDY["rms_error"](kind, 1 / 8, points=4000) for kind in STUDY["COMPARED"]}
+    assert errors["affine"] < 0.7 * min(errors["mvc"], errors["cages"], errors["trilinear"])
+
+
+# ---- single cells, smoothing, misuse
+
+
+def test_a_cell_without_neighbours_keeps_its_own_coordinates():
+    rng = np.random.default_rng(6)
+    u, alone = rng.random((50, 3)), np.arange(27)[None] == np.full((50, 1), 13)
+    np.testing.assert_array_equal(stencil_weights("cages", u, alone), stencil_weights("mvc", u, alone))
+    # 8 nodes fix F_v; at a corner the affine map gives the corner itself
+    np.testing.assert_allclose(weights("affine", (1, 0, 1), alone[0])[NODES.tolist().index([1, 0, 1])], 1.0)
+
+
+def test_less_smoothing_keeps_more_of_the_cells_own_coordinates():
+    one_neighbour = BLOCK.tolist().index([1, 0, 0])
+    mask = np.isin(np.arange(27), [13, one_neighbour])
+    u = (0.4, 0.5, 0.5)  # the corners shared at x = 1 weigh less than 0.6: 1 - that >= h for h = 0.4
+    np.testing.assert_array_equal(weights("cages", u, mask, 0.4), weights("mvc", u, mask))
+    assert np.abs(weights("cages", u, mask, 1.0) - weights("mvc", u, mask)).max() > 1e-3
+
+
+def test_misuse_is_named():
+    u, mask = np.full((1, 3), 0.5), np.ones((1, 27), bool)
+    with pytest.raises(InputError, match="'bspline' is not one of mvc, cages, affine"):
+        stencil_weights("bspline", u, mask)
+    for smoothing in (0.0, 1.5, np.nan):
+        with pytest.raises(InputError, match="smoothing"):
+            stencil_weights("cages", u, mask, smoothing)
+    for outside in (1.1, -0.1, np.nan):
+        with pytest.raises(ValueError, match="outside its cell"):
+            stencil_weights("mvc", u * 0 + outside, mask)
+    with pytest.raises(ValueError, match="not valid"):
+        stencil_weights("mvc", u, ~mask)

@@ -1,0 +1,322 @@
+"""Mesh files that are damaged, hostile or something else: a mesh of finite points comes out, or one line does."""
+
+import base64
+import gzip
+import json
+import lzma
+import os
+import struct
+import sys
+import tempfile
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import trimesh
+from bad_input import TRIALS, damage, damaged, refusal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mpi4py import MPI
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.prepare import repair
+from msmpetsc.geometry.surface import Surface, check_encloses, examine, read_surface
+from msmpetsc.model.build import read_body
+from msmpetsc.scene.reading import load_scene
+
+BOX = trimesh.creation.box(extents=[1, 2, 3])
+QUADS = b"""mtllib paint.mtl
+v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
+f 1 4 3 2\nf 5 6 7 8\nf 1/1 2/1 6/1 5/1\nf 2//1 3//1 7//1 6//1\nf 3 4 8 7\nf -8 -4 -1 -5\n"""
+SCENE = """
+mesh.source = "{}"
+cages.count = 50
+material = {{ density = 1e3, young_modulus = 1e5 }}
+time = {{ step = 0.01, duration = 0.1 }}
+"""
+
+
+def exported(**options) -> bytes:
+    content = BOX.export(**options)
+    return content.encode() if isinstance(content, str) else content
+
+
+def by_meshio(kind: str, **options) -> bytes:
+    """As meshio writes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"x.{kind}")
+        meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(path, **options)
+        return path.read_bytes()
+
+
+def mz3() -> bytes:
+    header = struct.pack("<HHIII", 0x5A4D, 3, len(BOX.faces), len(BOX.vertices), 0)
+    return header + BOX.faces.astype("<i4").tobytes() + BOX.vertices.astype("<f4").tobytes()
+
+
+def gltf() -> bytes:
+    """With its buffers as text in it."""
+    binary = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    tree = {
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
+        "buffers": [{"uri": uri, "byteLength": len(binary)}],
+        "bufferViews": [{"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 8},
+            {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 36},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 4}]}],
+    }  # fmt: skip
+    return json.dumps(tree).encode()
+
+
+SEEDS = [
+    ("obj", exported(file_type="obj")),
+    ("obj", QUADS),
+    ("ply", exported(file_type="ply", encoding="ascii")),
+    ("ply", exported(file_type="ply")),
+    ("stl", exported(file_type="stl")),
+    ("stl", exported(file_type="stl_ascii")),
+    ("off", exported(file_type="off")),
+    ("glb", exported(file_type="glb")),
+    ("gltf", gltf()),
+    ("mz3", mz3()),
+    ("vtk", by_meshio("vtk", binary=False)),
+    ("vtk", by_meshio("vtk")),
+    ("vtu", by_meshio("vtu", binary=False)),
+    ("vtu", by_meshio("vtu", compression=None)),
+    ("vtu", by_meshio("vtu", compression="zlib")),
+    ("vtu", by_meshio("vtu", compression="lzma")),
+    ("stl.gz", gzip.compress(exported(file_type="stl"), mtime=0)),
+]
+
+
+def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
+    """As a scene reads it; what is said."""
+    (folder / f"x.{kind}").write_bytes(content)
+    (folder / "scene.toml").write_text(SCENE.format(f"x.{kind}"))
+
+    def check() -> None:
+        body = read_body(MPI.COMM_SELF, load_scene(folder / "scene.toml", changes))
+        points, triangles = body.surface.points, body.surface.triangles
+        assert points.shape[1] == triangles.shape[1] == 3 and np.isfinite(points).all()
+        assert 0 <= triangles.min() <= triangles.max() < len(points)
+
+    return refusal(check)
+
+
+@settings(TRIALS, max_examples=400)
+@given(
+    seed=st.sampled_from(SEEDS), changes=damage, step=st.sampled_from(["[]", "['merge']", "['orient']", "['union']"])
+)
+def test_a_damaged_mesh_is_a_body_or_one_line(tmp_path, seed, changes, step):
+    kind, content = seed
+    read(tmp_path, kind, damaged(content, changes), f"mesh.prepare={step}")
+
+
+@pytest.mark.parametrize(("kind", "content"), SEEDS)
+def test_a_whole_mesh_is_read(tmp_path, kind, content):
+    assert not read(tmp_path, kind, content)
+
+
+@settings(TRIALS, max_examples=120)
+@given(
+    kind=st.sampled_from(["obj", "ply", "stl", "off", "glb", "gltf", "mz3", "vtk", "vtu", "ply.gz"]),
+    content=st.binary(max_size=300),
+)
+def test_any_bytes_are_refused(tmp_path, kind, content):
+    assert read(tmp_path, kind, content)
+
+
+PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty {} x\nproperty {} y\nproperty {} z\nelement face {}\n"
+PLY += "property list uchar int vertex_indices\nend_header\n"
+REFUSED = {
+    "10^12 points": ("ply", PLY.format("ascii", 10**12, *["float"] * 3, 1).encode(), "claims more than the file holds"),
+    "10^12 in binary": ("ply", PLY.format("binary_little_endian", 10**12, *["float"] * 3, 1).encode(), "claims more"),
+    "10^12 triangles": ("stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(50), "holds no triangles"),
+    "10^12 of OFF": ("off", b"OFF\n1000000000000 1000000000000 0\n", "not a readable OFF"),
+    "a single coordinate each": ("obj", b"v 1\nv 2\nv 3\nf 1 2 3\n", "not of three numbers each"),
+    "control characters": ("ply", b"ply\nformat ascii 1.0\n\x1b[31m 3\nend_header\n", "x.ply"),
+    "one point": ("obj", b"v 0 0 0\nf 1 1 1\n", "fewer than four points"),
+    "lists for coordinates": (
+        "ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar float x\nproperty list uchar float y\n"
+        b"property list uchar float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        b"1 0 1 0 1 0\n2 0 0 1 0 1 0\n1 0 1 0 1 0\n3 0 1 2\n", "x.ply",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_it_is_refused_in_one_line(tmp_path, name):
+    kind, content, words = REFUSED[name]
+    assert words in read(tmp_path, kind, content)
+
+
+def test_a_tiny_archive_cannot_fill_the_memory(tmp_path):
+    bomb = gzip.compress(bytes(2**28))
+    assert len(bomb) < 3e5
+    assert "times as long" in read(tmp_path, "stl.gz", bomb)
+
+
+def test_what_crashes_the_repair_library_is_refused_before():
+    points, triangles = np.array(BOX.vertices), np.array(BOX.faces, np.int64)
+    points[3, 1] = -4e27
+    with pytest.raises(InputError, match="coordinates beyond 1e[+]12"):
+        repair(Surface(points, triangles))
+
+
+def test_a_surface_of_three_points_is_flat():
+    surface = Surface(np.eye(3), np.array([[0, 1, 2]]))
+    with pytest.raises(InputError, match="fewer than four points"):
+        check_encloses(surface, examine(surface))
+
+
+@pytest.fixture(scope="module")
+def opened():
+    """Names of the files that are opened; audit hooks cannot be taken away again."""
+    names: list[str] = []
+    sys.addaudithook(lambda event, given: names.append(str(given[0])) if event == "open" else None)
+    return names
+
+
+NAMES_OTHERS = {
+    "obj": QUADS + b"usemtl x\nmap_Kd ../texture.png\n",
+    "ply": exported(file_type="ply", encoding="ascii").replace(
+        b"element vertex", b"comment TextureFile paint.mtl\nelement vertex"
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NAMES_OTHERS)
+def test_a_mesh_opens_no_other_file(tmp_path, opened, kind):
+    (tmp_path / "paint.mtl").write_text("newmtl x\nmap_Kd texture.png\n")
+    (tmp_path / f"x.{kind}").write_bytes(NAMES_OTHERS[kind])
+    opened.clear()
+    assert len(read_surface(tmp_path / f"x.{kind}").triangles) == 12
+    assert [name for name in opened if str(tmp_path) in name] == [str(tmp_path / f"x.{kind}")]
+
+
+GLTF = (
+    '{"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "buffers": [{"uri": "%s",'
+    ' "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}], "accessors": [{"bufferView": 0,'
+    ' "componentType": 5126, "type": "VEC3", "count": 3}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}'
+)
+
+
+@pytest.mark.parametrize("name", ["../secret.bin", "link.bin", "pipe.bin", "/etc/passwd", "", "."])
+def test_a_gltf_names_files_of_its_folder_only(tmp_path, opened, name):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    points = np.eye(3, dtype="<f4").tobytes()
+    (tmp_path / "secret.bin").write_bytes(points)
+    (folder / "link.bin").symlink_to("../secret.bin")
+    os.mkfifo(folder / "pipe.bin")
+    (folder / "own.bin").write_bytes(points)
+    (folder / "x.gltf").write_text(GLTF % "own.bin")
+    assert len(read_surface(folder / "x.gltf").points) == 3
+    (folder / "x.gltf").write_text(GLTF % name)
+    opened.clear()
+    assert "no file in its folder" in refusal(lambda: read_surface(folder / "x.gltf"))
+    assert not [one for one in opened if one.endswith((".bin", "passwd"))]
+
+
+def test_a_pipe_is_no_mesh(tmp_path):
+    os.mkfifo(tmp_path / "x.ply")
+    assert "is a pipe or a device" in refusal(lambda: read_surface(tmp_path / "x.ply"))
+
+
+def glb(instances: int, faces: int, parts: int = 1) -> bytes:
+    """One mesh, put in by so many nodes."""
+    points, corners = np.eye(3, dtype="<f4"), np.tile(np.arange(3, dtype="<u4"), faces)
+    binary = points.tobytes() + corners.tobytes()
+    part = {"attributes": {"POSITION": 0}, "indices": 1}
+    tree = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(instances))}],
+        "nodes": [{"mesh": 0}] * instances, "meshes": [{"primitives": [part] * parts}],
+        "buffers": [{"byteLength": len(binary)}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": points.nbytes},
+            {"buffer": 0, "byteOffset": points.nbytes, "byteLength": corners.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3, "min": [0, 0, 0], "max": [1, 1, 1]},
+            {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 3 * faces},
+        ],
+    }  # fmt: skip
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(binary))
+    return (
+        header + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x4E4942) + binary
+    )
+
+
+def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:
+    """Zeros, packed a thousandfold."""
+    pack = {"ZLib": zlib.compress, "LZMA": lzma.compress}[compressor]
+    block = pack(bytes(12 * points), **({} if compressor == "LZMA" else {"level": 9}))
+    header = np.array([blocks, 12 * points, 12 * points, *[len(block)] * blocks], "<u4").tobytes()
+    numbers = base64.b64encode(header) + base64.b64encode(block * blocks)
+    return (
+        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" compressor="vtk%sDataCompressor">'
+        b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points><DataArray type="Float32" Name="Points" '
+        b'NumberOfComponents="3" format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
+        % (compressor.encode(), points * blocks, numbers)
+    )
+
+
+def vtk(kind: str) -> bytes:
+    return f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET {kind}\nDIMENSIONS 330 330 330\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 1\n".encode()
+
+
+def shared_vtu(arrays: int) -> bytes:
+    """Arrays that are all the same appended bytes."""
+    numbers = base64.b64encode(np.uint32(3 * 10**5).tobytes() + bytes(3 * 10**5))
+    array = b'<DataArray type="Float32" Name="x" format="appended" offset="0"/>'
+    return (
+        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>'
+        b'<Piece NumberOfPoints="0" NumberOfCells="0"><PointData>%s</PointData></Piece></UnstructuredGrid>'
+        b'<AppendedData encoding="base64">_%s</AppendedData></VTKFile>' % (array * arrays, numbers)
+    )
+
+
+CLAIMS = {
+    "a grid of 36 million points": ("vtk", vtk("STRUCTURED_POINTS"), "a grid of points"),
+    "in other letters": ("vtk", vtk("structured_points"), "a grid of points"),
+    "cells of a grid": ("vtk", vtk("STRUCTURED_GRID"), "a grid of points"),
+    "axes of a grid": ("vtk", vtk("RECTILINEAR_GRID"), "a grid of points"),
+    "packed a thousandfold": ("vtu", vtu(10**7), "times as long"),
+    "in many blocks": ("vtu", vtu(10**5, blocks=1000), "times as long"),
+    "packed by lzma": ("vtu", vtu(10**7, compressor="LZMA"), "times as long"),
+    "shared bytes": ("vtu", shared_vtu(3000), "may share"),
+    "20,000 instances": ("glb", glb(20_000, 2000), "repeats its meshes"),
+    "a part again and again": ("glb", glb(1, 2000, 20_000), "repeats its meshes"),
+}
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_memory_that_a_file_claims_is_refused_before_it_is_made(tmp_path, name):
+    kind, content, words = CLAIMS[name]
+    assert len(content) < 3e6
+    path = tmp_path / f"x.{kind}"
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        said = refusal(lambda: read_surface(path))
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert words in said and most < 3e8
+
+
+def test_what_is_instanced_or_packed_as_people_do_it_is_read(tmp_path):
+    (tmp_path / "x.glb").write_bytes(glb(100, 20))
+    assert len(read_surface(tmp_path / "x.glb").triangles) == 2000
+    meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(tmp_path / "x.vtu", compression="zlib")
+    assert len(read_surface(tmp_path / "x.vtu").triangles) == 12
+    meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(tmp_path / "y.vtu", compression="lzma")
+    assert len(read_surface(tmp_path / "y.vtu").triangles) == 12

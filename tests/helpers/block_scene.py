@@ -1,0 +1,41 @@
+"""A block of a few cells: as a scene file for the command line, and stepped in this process."""
+
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+import trimesh
+from mpi4py import MPI
+
+from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.frame import Frame
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.simulate import Simulation
+
+CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long
+SIDES = np.array([0.5, 0.5, 0.25])
+YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
+STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (model.material)
+
+
+def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:
+    """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a table's place."""
+    trimesh.creation.box(bounds=[[0, 0, 0], sides]).export(folder / f"{name}.ply")
+    scene = {
+        "mesh": {"source": f"{name}.ply"},
+        "cages": {"cell_size": CELL},
+        "material": {"young_modulus": YOUNG, "density": DENSITY},
+        "solver": {"preset": "newton", "error": 1e-9},
+        "output": {"surface": False},
+    }
+    path = folder / f"{name}.toml"
+    path.write_text(tomli_w.dumps(scene | tables))
+    return path
+
+
+def play(path: Path, *overrides: str) -> tuple[Model, list[Frame]]:
+    """The frames of a scene, on one rank."""
+    scene = load_scene(path, overrides)
+    model = build_model(MPI.COMM_SELF, scene)
+    with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+        return model, list(simulation.frames())

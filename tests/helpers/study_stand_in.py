@@ -1,0 +1,93 @@
+"""Stands in for ``msmpetsc run`` in tests of studies: a lattice of 8 nodes that swings by a formula.
+
+    study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
+
+What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it, -ksp_children starts another
+process before that, -ksp_exit N ends it with that status, -ksp_kind K tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion is off by the time step.
+"""
+
+import json
+import subprocess
+import sys
+import tomllib
+from dataclasses import MISSING, fields
+from pathlib import Path
+from time import sleep
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.model.frame import Frame
+from msmpetsc.output.writer import ResultFile
+
+NODES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+MASS = np.arange(1.0, 9.0)
+
+
+def main() -> None:
+    words = sys.argv[1:]
+    out, measure = (Path(words[words.index(name) + 1]) for name in ("-o", "--measure"))
+    changes = [words[n + 1].partition("=") for n, word in enumerate(words) if word == "--set"]
+    tables = {key: tomllib.loads(f"v = {value}")["v"] for key, _, value in changes if value.startswith("{")}
+    comm = MPI.COMM_WORLD
+    calls = out.parent.parent / "calls.txt"
+    if comm.rank == 0:
+        with open(calls, "a") as file:
+            file.write(" ".join(words) + "\n")
+    count = len(calls.read_text().splitlines()) if calls.exists() else 0
+    if "-ksp_children" in words:
+        child = subprocess.Popen(["sleep", "60"])
+        (out.parent.parent / "child").write_text(str(child.pid))
+    if "-ksp_hang" in words:
+        sleep(60)
+    if "-ksp_fail" in words:
+        sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
+    write(comm, out, tables["time"], int(dict((k, v) for k, _, v in changes).get("output.every", 1)), count)
+    if comm.rank == 0:
+        kind = words[words.index("-ksp_kind") + 1] if "-ksp_kind" in words else None
+        failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
+        measure.write_text(json.dumps(told(comm.size, count, "--trace" in words) | failure))
+    if "-ksp_exit" in words:
+        sys.exit(int(words[words.index("-ksp_exit") + 1]))
+
+
+def write(comm, out: Path, table: dict, every: int, count: int) -> None:
+    """Frames off the exact motion by the time step."""
+    step, own = table["step"], slice(None) if comm.rank == 0 else slice(0)
+    count_of_frames = round(table["duration"] / step / every) + 1
+    with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, overwrite=True) as file:
+        file.write("lattice/nodes", NODES[own])
+        file.write("lattice/mass", MASS[own])
+        file.start_frames(count_of_frames, len(NODES[own]))
+        for index in range(count_of_frames):
+            time = index * step * every
+            x = NODES + (1 + step) * time * np.array([0, 0, 1.0])
+            solved = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every, wall_time=every * step * count)
+            file.append(blank_frame(index=index, time=time, position=x[own], **solved))
+
+
+def blank_frame(**given) -> Frame:
+    """A frame of zeros but for what is given."""
+    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {
+        "surface": None,
+        "momentum": np.zeros(3),
+    }
+    return Frame(**blank | given)
+
+
+def told(ranks: int, count: int, traced: bool) -> dict:
+    times = dict.fromkeys(("setup", "factor", "local", "ksp", "output", "stepping"), float(count))
+    machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
+    counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks, "memory": 1000 - count}
+    trace = {"frame": 2, "iteration": [0, 1], "ksp_its": [0, 5], "seconds": [0, 1], "position_error": [1, 0.1]}
+    return {
+        "machine": machine,
+        "versions": {"msmpetsc": "x"},
+        "time": times,
+        "trace": trace if traced else None,
+        **counts,
+    }
+
+
+if __name__ == "__main__":
+    main()

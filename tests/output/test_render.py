@@ -1,0 +1,396 @@
+"""Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as an image)."""
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ROOT
+from mpi4py import MPI
+from PIL import Image
+from scipy.sparse import csr_array
+
+from msmpetsc.cli import render as command
+from msmpetsc.errors import InputError
+from msmpetsc.model.frame import Frame
+from msmpetsc.output import overlays, render
+from msmpetsc.output.camera import YAW, place_camera
+from msmpetsc.output.writer import ResultFile, open_result
+from msmpetsc.scene.schema import Region
+
+trimesh = pytest.importorskip("trimesh")
+pytestmark = pytest.mark.timeout(60)
+BARE = """
+mesh.source = "ball"
+cages.count = 1
+material = { stiffness = 1.0, density = 1.0 }
+time = { step = 0.1, duration = 1.0 }
+"""
+SCENE = f"""
+{BARE}
+[[obstacle]]
+shape = "plane"
+point = [0, 0, 0]
+normal = [0, 0, 2]
+[gravity]
+acceleration = [0, 0, -9.81]
+"""
+# A ball of radius 0.1 m falls, touches the ground, is squashed, leaps and comes to rest: height of its middle [m].
+HEIGHTS = [0.5, 0.45, 0.3, 0.1, 0.07, 0.05, 0.08, 0.2, 0.35, 0.2, 0.1]
+KINETIC = [0, 1, 4, 8, 4, 0, 5, 3, 0, 2, 0]
+ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]
+
+
+@pytest.fixture
+def result(tmp_path) -> Path:
+    """The ball with its surface stored."""
+    return write_ball(tmp_path / "ball.h5", surface=True)
+
+
+def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
+    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
+    rows = len(ball.vertices)
+    factor = 1 if surface else 2
+    embedding = csr_array(np.eye(rows) / factor)
+    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, overwrite=True) as file:
+        file.write("surface/triangles", np.array(ball.faces))
+        file.write("surface/points", ball.vertices + [0, 0, HEIGHTS[0]])
+        file.write("lattice/cells", np.zeros((1, 8), int))
+        file.write("lattice/nodes", factor * (ball.vertices + [0, 0, HEIGHTS[0]]))
+        for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
+            file.write(f"embedding/{name}", part)
+        file.start_frames(len(HEIGHTS), rows, rows if surface else None)
+        for index, height in enumerate(HEIGHTS):
+            points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]
+            energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)
+            numbers = dict(contact=0.0, step_error=0.0, iterations=1, ksp_its=1, momentum=np.zeros(3), wall_time=0.0)
+            drawn = points if surface else None
+            place = dict(time=index / 10, position=factor * points, surface=drawn)
+            file.append(Frame(index=index, **place, **energies, **numbers))
+    return path
+
+
+def test_moments_tell_the_story(result):
+    with open_result(result) as file:
+        five = render.choose_moments(file, 5)
+        assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
+        assert list(render.choose_moments(file, 3)) == [0, 5, 10]
+        assert list(render.choose_moments(file, 1)) == [0]
+        assert list(render.choose_moments(file, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(render.choose_moments(file, 99)) == list(range(11))
+
+
+def test_surface_that_was_not_stored_is_computed(result, tmp_path):
+    bare = write_ball(tmp_path / "bare.h5", surface=False)
+    with open_result(result) as stored, open_result(bare) as file:
+        assert render.surface_points(file, 4) == pytest.approx(render.surface_points(stored, 4), abs=1e-7)
+
+
+@pytest.fixture
+def panels(tmp_path, monkeypatch):
+    """panels(scene tables, options) of a sheet that is not drawn."""
+
+    def sheet(tables: str, **options) -> list[render.Panel]:
+        drawn = []
+        monkeypatch.setattr(render, "draw", lambda panels, *_: drawn.extend(panels))
+        path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + tables)
+        render.contact_sheet(path, tmp_path / "x.png", **options)
+        return drawn
+
+    return sheet
+
+
+def test_moments_of_the_scene(panels):
+    tables = "picture.times = [0.72, 99.0, 0.26, 0.3]"
+    assert [p.caption for p in panels(tables)] == [
+        ("t = 0.000 s", "start"), ("t = 0.300 s", ""), ("t = 0.700 s", ""), ("t = 1.000 s", "")
+    ]  # fmt: skip
+    assert [p.caption[0] for p in panels(tables, frames=[4, 2])] == ["t = 0.400 s", "t = 0.200 s"]
+    assert [p.caption[1] for p in panels(tables, count=2)] == ["start", "end"]
+
+
+POINTS = np.random.default_rng(0).normal(size=(50, 3)) * [1, 9, 2]
+EYES = [None, (1, -2, 0.6), (-3, 0.5, -1), (0, 0, 1), (0, -1, 0), (3, 0, 4)]
+
+
+@pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 0, 4.0)])
+@pytest.mark.parametrize("eye", EYES)
+def test_camera_stands_upright_and_at_the_eye(gravity, eye):
+    camera = place_camera(POINTS, gravity, eye)
+    axes = np.array([camera.right, camera.away, camera.up])
+    assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
+    assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
+    assert np.cross(camera.right, camera.upward) == pytest.approx(camera.to_eye)  # the picture is no mirror image
+    assert camera.upward @ camera.up > -1e-9
+    if eye is not None:
+        assert camera.to_eye @ eye == pytest.approx(np.linalg.norm(eye))
+
+
+def test_the_longer_side_lies_across():
+    assert abs(place_camera(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
+    assert abs(place_camera(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
+
+
+def test_the_eye_chooses_the_side(tmp_path):
+    """Each side of the ball is held once: dark pixels are seen from there only."""
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
+    dark = []
+    for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
+        picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
+        ball = picture[: -render.CAPTION].astype(int)
+        dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
+    assert dark[0] > 0.5 and dark[1] < 0.1
+
+
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+LED = """
+[[anchor]]
+region = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }
+path = [{ time = 1.0, by = [0, 0, 1] }]
+stop = 0.5
+[[pin]]
+region.painted = "spots.txt"
+"""
+
+
+def test_held_parts(panels):
+    east, led = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
+    assert ((east.held == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.held.mean() < 0.5
+    assert ((led[0].held == 1) == (led[0].points[:, 2] <= 0.48)).all()
+    assert (led[1].held == led[0].held).all()
+    assert not led[2].held.any()
+
+
+def test_painted_points_mean_the_corners_of_their_cells():
+    x, y, z = np.mgrid[0:4, 0:2, 0:2].reshape(3, -1)  # three cells in a row along x
+    nodes = np.stack([x, y, z], axis=1)
+    cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(3)])
+    rest = overlays.Rest(nodes, cells, np.array([(0.9, 0.1, 0.1), (2.9, 0.9, 0.9), (1.1, 0.1, 0.9)]))
+    assert (rest.find(Region(painted=(0,))) == (x <= 1)).all()
+    assert (rest.find(Region(painted=(0, 2))) == (x <= 2)).all()
+    assert not rest.find(Region(painted="spots.txt")).any()
+
+
+FORCE = """
+[[force]]
+region = { box = [[0, -1, 0.5], [1, 1, 1]] }
+total = [0, 0, -7.0]
+start = 0.2
+stop = 0.8
+[[force]]
+region.painted = "spots.txt"
+total = [1, 0, 0]
+"""
+
+
+def test_an_arrow_for_each_force_while_it_acts(panels):
+    before, first, last, after = panels(FORCE, frames=[1, 2, 7, 8])
+    assert before.marks.arrows == after.marks.arrows == []
+    pulled = (first.points[:, 0] >= 0) & (first.points[:, 2] >= HEIGHTS[2])
+    for panel in (first, last):
+        ((tail, tip),) = panel.marks.arrows
+        assert tail == pytest.approx(panel.points[pulled].mean(axis=0), abs=1e-6)
+        assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
+
+
+def test_an_arrow_is_seen_in_front_of_the_body(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + FORCE)
+    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[2, 8]))).astype(int)
+    red = [(panel[..., 0] - panel[..., 2] > 90).sum() for panel in np.split(picture, 2, axis=1)]
+    assert red[0] > 500 and red[1] == 0
+
+
+PLATE = """
+[[obstacle]]
+shape = "box"
+box = [[-0.125, -0.1, 0.62], [0.125, 0.1, 0.64]]
+path = [{ time = 0.2, by = [0, 0, -0.2] }, { time = 0.6, by = [0.2, 0, -0.2] }]
+stop = 0.8
+"""
+
+
+def test_obstacles_stand_where_they_are_at_the_time(panels):
+    rest = np.array([(x, y, z) for x in (-0.125, 0.125) for y in (-0.1, 0.1) for z in (0.62, 0.64)])
+    start, down, aside, gone = panels(PLATE, frames=[0, 1, 3, 8])
+    for panel, by in (start, (0, 0, 0)), (down, (0, 0, -0.1)), (aside, (0.05, 0, -0.2)):
+        assert panel.marks.glass == [pytest.approx(rest + by)]
+    assert gone.marks.glass == []
+
+
+def plane(height: float, normal: str) -> str:
+    return f'[[obstacle]]\nshape = "plane"\npoint = [0, 0, {height}]\nnormal = {normal}\n'
+
+
+def test_what_would_hide_the_body_is_glass(panels):
+    above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].marks
+    assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
+    assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
+    assert panels(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []  # nothing lies on it
+    ground = plane(0.4, "[0, 0, 1]")
+    below = panels(ground, frames=[0])[0].marks
+    assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
+    assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []
+    assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].marks.corners) == 0  # over half a ball away
+
+
+def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
+    box = '[[obstacle]]\nshape = "box"\nbox = [[-50, -50, {}], [50, 50, {}]]\n'
+    (glass,) = panels(box.format(-50, 0.39), frames=[0])[0].marks.glass
+    assert np.ptp(glass, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
+    assert glass[:, 2].max() == 0.39 and glass[:, 2].min() == pytest.approx(0.4 - 0.15 * 0.2)
+    assert panels(box.format(1.0, 1.01), frames=[0])[0].marks.glass == []
+
+
+def test_glass_is_seen_at_its_place_and_through(tmp_path):
+    level = "picture.eye = [0, -1, 0]"
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + level + PLATE)
+    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -render.CAPTION]
+    panels = np.split(picture, 3, axis=1)
+    across = np.flatnonzero(is_body(panels[2]).any(axis=0))
+    left, ball = across[0] - 2, slice(across[0], across[-1] + 1)
+    _, through, alone = [is_body(panel[:, ball]).sum() for panel in panels]
+    assert through == pytest.approx(alone, rel=0.03)  # at 0.1 s the plate stands before a thirteenth of the ball
+    above, before, gone = [np.flatnonzero((panel[:, :left] < 250).any(axis=(1, 2))) for panel in panels]
+    metre = np.ptp(across) / 0.2
+    assert before[0] - above[0] == pytest.approx(0.1 * metre, abs=3)
+    assert np.ptp(before) == pytest.approx(0.02 * metre, abs=3)
+    assert len(gone) == 0
+
+
+def is_body(picture: np.ndarray) -> np.ndarray:
+    """Which pixels show the body: only it is clearly blue."""
+    return picture[..., 2].astype(int) - picture[..., 0] > 25
+
+
+def body_rows(picture: np.ndarray) -> tuple[int, int]:
+    """First and last row of pixels that show the body; it must not reach the picture's edges."""
+    blue = is_body(picture)
+    assert not blue[:, 0].any() and not blue[:, -1].any() and not blue[0].any() and not blue[-1].any()
+    rows = np.flatnonzero(blue.any(axis=1))
+    return rows[0], rows[-1]
+
+
+def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
+    render.contact_sheet(result, tmp_path / "new" / "x.png")
+    assert capfd.readouterr().err == ""
+    picture = np.array(Image.open(tmp_path / "new" / "x.png"))
+    panels = np.split(picture, 5, axis=1)
+    (top, bottom), fallen, squashed, leapt, _ = [body_rows(panel) for panel in panels]
+    metre = (bottom - top) / 0.2  # the ball is 0.2 m high
+    assert metre * 0.4 == pytest.approx(fallen[0] - top, rel=0.05)  # less the cosine of the elevation
+    assert metre * 0.15 == pytest.approx(leapt[0] - top, rel=0.06)
+    assert squashed[1] - squashed[0] < 0.75 * (bottom - top)
+    ground = (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any(axis=1)
+    last_ground = np.flatnonzero(ground)[-1]
+    ink = bottom + 9 + np.flatnonzero((panels[0][bottom + 9 :, :, :3] < 90).all(axis=2).any(axis=1))
+    assert fallen[1] < last_ground < ink.min()  # whole ball, ground, then captions (below the ball, dark itself)
+
+
+def test_no_ground_where_the_scene_has_none(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE)
+    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[3])))
+    assert not (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any()
+
+
+def test_command_draws_beside_the_result(result, capsys):
+    parser = argparse.ArgumentParser()
+    command.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["render", str(result), "--frames", "2,0,4", "--eye=-1,2,0"])
+    assert args.run(args) == 0
+    assert capsys.readouterr().out.strip() == str(result.with_suffix(".png"))
+    assert Image.open(result.with_suffix(".png")).size[0] % 3 == 0
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        (["--frames", "0,11"], "has frames 0 to 10, not 11"),
+        (["--frames", "first"], "--frames takes numbers"),
+        (["--count", "0"], "--count must be at least 1"),
+        (["--eye", "1,2"], "--eye takes three numbers"),
+        (["--eye", "0,0,0"], "--eye takes three numbers"),
+        (["--eye", "north"], "--eye takes numbers"),
+        (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told(result, options, told):
+    parser = argparse.ArgumentParser()
+    command.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["render", str(result), *options])
+    with pytest.raises(InputError, match=told):
+        args.run(args)
+
+
+def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True)
+    for key, told in ("embedding", "no surface to draw"), ("scene", "another version"):
+        with h5py.File(path, "r+") as file:
+            del (file.attrs if key == "scene" else file)[key]
+        with pytest.raises(InputError, match=told):
+            render.contact_sheet(path, tmp_path / "x.png")
+
+
+def test_without_opengl_one_line_names_the_package(result, tmp_path):
+    """EGL is made to find no driver; VTK would crash."""
+    draw = "import sys; from msmpetsc.output.render import contact_sheet; contact_sheet(*sys.argv[1:])"
+    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
+    environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
+    order = [sys.executable, "-c", draw, str(result), str(tmp_path / "x.png")]
+    done = subprocess.run(order, env=environment, capture_output=True, text=True, timeout=40)
+    assert done.returncode == 1
+    assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
+    assert "WARN" not in done.stderr
+
+
+@pytest.fixture
+def drawing(result, tmp_path, monkeypatch):
+    """What a sheet of frames 0 and 8 is drawn from: panels, triangles, camera."""
+    with monkeypatch.context() as patch:
+        patch.setattr(render, "draw", lambda *given: calls.append(given))
+        calls = []
+        render.contact_sheet(result, tmp_path / "x.png", frames=[0, 8])
+    return calls[0][:3]
+
+
+def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
+    """Wider than the 8192 pixels at which Mesa's pictures end."""
+    panels, triangles, camera = drawing
+    render.draw(13 * panels, triangles, camera, tmp_path / "x.png")
+    drawn = np.array(Image.open(tmp_path / "x.png"))
+    assert drawn.shape[1] > 8192
+    sheets = np.split(drawn, 26, axis=1)
+    for first, other in zip(sheets[:2] * 12, sheets[2:]):
+        np.testing.assert_array_equal(other, first)
+    assert body_rows(sheets[1])[0] > body_rows(sheets[0])[0] > 0
+
+
+def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
+    panels, triangles, camera = drawing
+    with pytest.raises(
+        InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"
+    ):
+        render.draw(100 * panels, triangles, camera, tmp_path / "y.png")
+    monkeypatch.setattr(render, "WIDEST", 2000)
+    monkeypatch.setattr(render, "surface_points", lambda *_: pytest.fail("a surface was read"))
+    for options in ({"count": 10**9}, {"frames": list(range(11))}):
+        with pytest.raises(
+            InputError,
+            match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000",
+        ):
+            render.contact_sheet(result, tmp_path / "y.png", **options)
+    assert not (tmp_path / "y.png").exists()
+
+
+def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
+    monkeypatch.setattr(render.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(InputError, match="y.png cannot be drawn: the graphics library gives a black picture"):
+        render.draw(*drawing, tmp_path / "y.png")
+    assert not (tmp_path / "y.png").exists()

@@ -1,0 +1,160 @@
+"""Damaged and hostile result files given to run --resume: it goes on, or says in one line why not."""
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from bad_input import TRIALS, damage, damaged, limits
+from conftest import ENVIRONMENT, WORKERS
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from test_signals import hanging, signal_after
+
+from msmpetsc.cli.main import main
+
+NAMES = [f"checkpoint/{name}" for name in ("step", "q", "q_previous", "numbers", "correction", "new\nline")]
+NAMES += ["frames/time", "frames/position", "frames/kinetic", "lattice/nodes", "lattice/mass"]
+VALUES = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 3.0, 12.0, 1e308])
+SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 75, 10**12]), max_size=4).map(tuple)
+KINDS = st.sampled_from(["f8", "f4", ">f8", "i8", "S3", h5py.string_dtype()])
+ATTRIBUTES = st.sampled_from(
+    ["scene", "scene_file", "petsc_options", "true_error", "msmpetsc_version", "format_version"]
+)
+TEXTS = st.sampled_from(
+    ["", "x", "-", "-snes_type", "-pc_type 'x", "-ksp_type none", "/etc/passwd", "\x1b[31m\n", "-1"]
+)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stopped")
+    with pytest.MonkeyPatch.context() as patch:
+        signal_after(patch, 4, signal.SIGUSR1)
+        assert main(["run", str(hanging(folder, steps=6)), "-o", str(folder / "x.h5")]) == 0
+    return folder / "x.h5"
+
+
+def change(file: h5py.File, kind: str, name: str, what) -> None:
+    if kind == "attribute":
+        file.attrs[name] = what
+    elif kind == "scene":
+        file.attrs["scene"] = damaged(file.attrs["scene"].encode(), what).decode(errors="replace").replace("\0", "0")
+    elif kind == "value" and name in file and file[name].size and file[name].dtype.kind in "if":
+        rows = file[name][...]
+        with np.errstate(all="ignore"):
+            rows.flat[-1] = np.array(what).astype(rows.dtype)
+        file[name][...] = rows
+    elif kind == "dataset":
+        file.pop(name, None)
+        file.create_dataset(name, *what, chunks=True if all(what[0]) and what[0] else None)
+
+
+edit = st.one_of(
+    st.tuples(st.just("attribute"), ATTRIBUTES, st.one_of(TEXTS, st.sampled_from([7, -1, 2.5, np.arange(3)]))),
+    st.tuples(st.just("scene"), st.none(), damage),
+    st.tuples(st.just("value"), st.sampled_from(NAMES), VALUES),
+    st.tuples(st.just("dataset"), st.sampled_from(NAMES), st.tuples(SHAPES, KINDS)),
+)
+
+
+@settings(TRIALS, max_examples=40)
+@given(edits=st.lists(edit, min_size=1, max_size=2))
+@example(edits=[("attribute", "petsc_options", "-pc_type 'x")])  # what no shell would take apart
+@example(edits=[("attribute", "true_error", "x")])
+@example(edits=[("dataset", "checkpoint/step", ((2,), "f8"))])
+@example(edits=[("value", "checkpoint/q", np.nan)])
+@example(edits=[("value", "checkpoint/step", 12.0)])  # beyond the end
+def test_it_goes_on_or_says_in_one_line_why_not(stopped, tmp_path, capsys, edits):
+    path = tmp_path / "x.h5"
+    path.write_bytes(stopped.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for one in edits:
+            change(file, *one)
+    capsys.readouterr()
+    with limits():
+        status = main(["run", "--resume", str(path)])
+    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+    assert status in (0, 2, 3) and (status == 0) == (not told)
+    assert all(line.isprintable() for line in told) and not any(re.search("Error|Traceback", line) for line in told)
+
+
+def without(file: h5py.File, name: str) -> None:
+    del file[name]
+
+
+def a_group(file: h5py.File, name: str) -> None:
+    del file[name]
+    file.create_group(name)
+
+
+def dangling(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = h5py.SoftLink("/nowhere")
+
+
+def a_loop(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = h5py.SoftLink(f"/{name}")
+
+
+def text(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = np.array([b"1", b"2", b"3"])
+
+
+def short(file: h5py.File, name: str) -> None:
+    rows = file[name][...]
+    del file[name]
+    file[name] = rows[:, :1] if rows.ndim > 1 else rows[:1]
+
+
+def number(value: float):
+    def change(file: h5py.File, name: str) -> None:
+        numbers = file["checkpoint/numbers"]
+        at = numbers.attrs["names"].split().index(name)
+        numbers[:, at] = value
+
+    return change
+
+
+DAMAGE = [
+    (a_group, "frames/iterations"), (dangling, "frames/substeps"), (a_loop, "frames/kinetic"), (text, "frames/ksp_its"),
+    (short, "frames/momentum"), (without, "checkpoint/correction"), (a_group, "checkpoint/correction"),
+    (short, "checkpoint/correction_before"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
+    (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"), (short, "lattice/springs"),
+    (without, "lattice/cells"), (dangling, "embedding/weights"), (text, "lattice/cell_kind"), (a_group, "frames/surface"),
+    (number(np.nan), "corrections"), (number(5), "corrections"), (number(np.inf), "iterations"), (number(np.nan), "put_in"), (number(-1), "frames_inverted"), (number(np.nan), "ratio"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("how", "name"), DAMAGE)
+def test_a_damaged_part_is_named_in_one_line(stopped, tmp_path, capsys, how, name):
+    path = tmp_path / "x.h5"
+    path.write_bytes(stopped.read_bytes())
+    with h5py.File(path, "r+") as file:
+        how(file, name)
+    before = path.read_bytes()
+    assert main(["run", "--resume", str(path)]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+    assert len(told) == 1 and name.rpartition("/")[2] in told[0]
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
+def test_whatever_is_damaged_ends_in_a_line(stopped, tmp_path, monkeypatch, integrator):
+    """In forks of a worker: more of it by a larger number."""
+    source = stopped
+    if integrator == "verlet":
+        with monkeypatch.context() as patch:
+            signal_after(patch, 4, signal.SIGUSR1)
+            scene, source = hanging(tmp_path, steps=6), tmp_path / "source.h5"
+            assert main(["run", str(scene), "-o", str(source), "--set", "time.integrator=verlet"]) == 0
+    worker = WORKERS / "resume_worker.py"
+    command = [sys.executable, str(worker), str(source), str(tmp_path / "x.h5"), "25", "1"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0 and done.stdout.endswith(" faults: 0\n"), done.stdout + done.stderr

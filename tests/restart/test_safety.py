@@ -1,0 +1,224 @@
+"""What a run notices about its steps, and what it does about one that fails."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import CELL, block_scene, play
+
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.frame import Frame
+from msmpetsc.solve import recovery
+from msmpetsc.solve.nonlinear.step import Stepper
+
+STEP, STEPS = 1 / 60, 6
+TIME = {"step": STEP, "duration": STEPS * STEP}
+CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
+GRAVITY = {"acceleration": [0, 0, -9.81]}
+
+
+def beam(folder: Path, **tables) -> Path:
+    """A clamped beam of 32 cells that begins to swing under its weight."""
+    return block_scene(
+        folder, np.array([1.0, 0.25, 0.25]), **{"time": TIME, "pin": CLAMPED, "gravity": GRAVITY} | tables
+    )
+
+
+def of(frames: list[Frame], name: str) -> np.ndarray:
+    return np.array([getattr(frame, name) for frame in frames])
+
+
+class Failing:
+    """Makes the stepper fail at the calls named, as a step that does not converge."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, calls: set[int]):
+        self.calls, self.count, self.prefixes, step = calls, 0, [], Stepper.step
+
+        def failing(stepper: Stepper, *given, **named):
+            self.count += 1
+            self.prefixes.append(stepper.prefix)
+            if self.count in self.calls:
+                raise StepFailed("did not converge: as the test has it; try nothing", "line search")
+            return step(stepper, *given, **named)
+
+        monkeypatch.setattr(Stepper, "step", failing)
+
+
+# ---- energy
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
+def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
+    """Implicit Euler only loses; explicit substeps and BDF2 swing about what is there by a few percent."""
+    _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
+    worked = of(frames, "potential")[0] - of(frames, "potential").min()  # [J] that the weight put in
+    assert worked > 0
+    assert of(frames, "energy_gained").sum() <= (1e-9 if integrator == "implicit-euler" else 0.2) * worked
+
+
+def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path):
+    """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in and pulled away."""
+    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8}
+    floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
+    lead = {"region": CLAMPED[0]["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
+    for more in ({"obstacle": [floor], "gravity": GRAVITY}, {"anchor": [lead]}):
+        _, frames = play(block_scene(tmp_path, time=TIME, **more))
+        assert of(frames, "elastic").max() > 1e-4
+        assert of(frames, "energy_gained").sum() <= 1e-6 * of(frames, "elastic").max()
+
+
+class Overshooting:
+    """Makes whole steps of the usual solver go too far by a share, from the first on: what is wrong grows."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float):
+        step = Stepper.step
+
+        def overshooting(stepper: Stepper, q: np.ndarray, y: np.ndarray, *given, **named):
+            result = step(stepper, q, y, *given, **named)
+            if stepper.prefix or not np.isclose(stepper.t2, STEP**2):
+                return result
+            return replace(result, position=result.position + share * (result.position - y))
+
+        monkeypatch.setattr(Stepper, "step", overshooting)
+
+
+def test_a_run_that_gains_energy_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Forces that act three times as long as they should, at steps far beyond the explicit limit."""
+    Overshooting(monkeypatch, 2.0)
+    told = r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, at rest at \("
+    with pytest.raises(StepFailed, match=told) as caught:
+        play(beam(tmp_path, time={"step": STEP, "duration": 1.0}))
+    assert caught.value.kind == "energy" and 1 < caught.value.frame < 60
+
+
+@pytest.mark.parametrize("way", ["fallback", "substep"])
+def test_rescue_carries_such_a_run_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str):
+    """The steps that gained too much are taken again, and the beam stays together."""
+    Overshooting(monkeypatch, 2.0)
+    _, frames = play(beam(tmp_path, time={"step": STEP, "duration": 0.5}), f"safety.on_failure={way}")
+    assert len(frames) == 31 and of(frames, f"{way}s").sum() > 0
+    assert np.abs(frames[-1].position).max() < 1.5  # the beam is 1 m long
+
+
+# ---- cells inside out
+
+
+def test_inverted_cells_are_counted_and_told_with_their_place(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """A mirrored block is at rest for its springs: all 32 cells stay inside out, and it says so once."""
+    scene = block_scene(tmp_path, time=TIME, start={"scale": [-1.0, 1.0, 1.0]})
+    _, frames = play(scene)
+    assert of(frames, "inverted").tolist() == [32] * (STEPS + 1)
+    told = [record.getMessage() for record in caplog.records if "inside out" in record.getMessage()]
+    assert len(told) == 2 and "frame 0 (t = 0 s): 32 cells are inside out, the worst at rest at (" in told[0]
+    assert 'material.law = "stiffening"' in told[0] and "in 7 frames, at most 32; 32 still are" in told[1]
+
+
+def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """One corner of a block is led through its cell, to the far side of the opposite corner."""
+    corner = {"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}
+    corner["path"] = [{"time": STEP, "by": [1.2 * CELL] * 3}]
+    model, frames = play(
+        block_scene(tmp_path, time=TIME, anchor=[corner], material={"young_modulus": 1e5, "density": 1e6})
+    )
+    assert frames[0].inverted == 0 and frames[1].inverted == 1
+    place = ", ".join(f"{CELL / 2:.4g}" for _ in range(3))
+    assert any(
+        f"frame 1 (t = 0.0166667 s): 1 cell is inside out, the worst at rest at ({place}) m" in r.getMessage()
+        for r in caplog.records
+    )
+
+
+# ---- budgets
+
+
+def test_a_budget_that_ends_far_off_is_told_once_and_summed_up(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    scene = beam(tmp_path, material={"young_modulus": 1e8, "density": 1000.0})
+    _, frames = play(scene, "solver={preset='fast-msm', max_iterations=1}")
+    far = [frame.index for frame in frames if frame.step_error > 0.3]
+    told = [
+        record.getMessage()
+        for record in caplog.records
+        if "off their solution" in record.getMessage() or "off its" in record.getMessage()
+    ]
+    assert len(far) >= 2 and len(told) == 2
+    assert told[0].startswith(f"frame {far[0]} (") and f"in {len(far)} frames" in told[1]
+
+
+# ---- rescue
+
+
+def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    Failing(monkeypatch, {3})
+    with pytest.raises(StepFailed, match=r"frame 3 \(t = 0.05 s\) did not converge") as caught:
+        play(beam(tmp_path))
+    assert (caught.value.kind, caught.value.frame) == ("line search", 3)
+
+
+def test_a_failed_step_is_halved_and_whole_steps_follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: 2 quarters, 1 half; then step 4
+    in quarters, step 5 in halves, and whole steps again."""
+    failing = Failing(monkeypatch, {3, 4})
+    _, frames = play(beam(tmp_path), "safety.on_failure=substep")
+    assert of(frames, "substeps").tolist() == [0, 0, 0, 3, 4, 2, 0] and not of(frames, "fallbacks").any()
+    assert failing.count == 2 + 1 + 1 + 3 + 4 + 2 + 1
+
+
+def test_steps_in_halves_are_those_of_half_the_time_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A rescued first step is two steps of t / 2 of another run, to the solver's error; and so is its velocity."""
+    scene = beam(tmp_path)
+    _, half = play(scene, f"time.step={STEP / 2}")
+    Failing(monkeypatch, {1})
+    _, frames = play(scene, "safety.on_failure=substep")
+    moved = np.abs(half[2].position - half[0].position).max()
+    np.testing.assert_allclose(frames[1].position, half[2].position, atol=1e-8 * moved)
+    assert frames[1].kinetic == pytest.approx(half[2].kinetic, rel=1e-7)
+
+
+def test_the_robust_method_finds_the_same_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scene = beam(tmp_path)
+    _, usual = play(scene)
+    failing = Failing(monkeypatch, {3})
+    _, frames = play(scene, "safety.on_failure=fallback")
+    assert of(frames, "fallbacks").tolist() == [0, 0, 0, 1, 0, 0, 0]
+    assert failing.prefixes[3] == recovery.PREFIX and set(failing.prefixes[4:]) == {""}
+    moved = np.abs(usual[-1].position - usual[0].position).max()
+    np.testing.assert_allclose(frames[-1].position, usual[-1].position, atol=1e-7 * moved)
+
+
+def test_what_no_halving_mends_stops_with_the_number_of_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    Failing(monkeypatch, set(range(2, 100)))
+    with pytest.raises(StepFailed, match=r"frame 2 .*\(and failed in 1024 pieces\)"):
+        play(beam(tmp_path), "safety.on_failure=substep")
+
+
+def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """BDF2 begins anew after it: still within what a step of first order may be off."""
+    scene = beam(tmp_path, time=TIME | {"integrator": "bdf2"})
+    _, usual = play(scene)
+    Failing(monkeypatch, {4})
+    _, frames = play(scene, "safety.on_failure=substep")
+    assert of(frames, "substeps").sum() == 2
+    moved = np.abs(usual[-1].position - usual[0].position).max()
+    assert 1e-6 * moved < np.abs(frames[-1].position - usual[-1].position).max() < 0.1 * moved
+
+
+def test_off_makes_no_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recovery.Rescue, "_new", lambda *_: pytest.fail("a spare solver was made"))
+    for way in ("stop", "substep", "fallback"):
+        play(beam(tmp_path), f"safety.on_failure={way}")
+
+
+def test_two_ranks_rescue_as_one(tmp_path: Path, msmpetsc):
+    """As a user starts it; the file says what was done. One iteration is not enough for the usual solver."""
+    scene, found = beam(tmp_path, time={"step": 0.1, "duration": 0.3}), []
+    for ranks in (1, 2):
+        words = ["--set", "safety.on_failure=fallback", "-snes_max_it", "1", "-fallback_ksp_rtol", "1e-3"]
+        done = msmpetsc(ranks, "run", scene, "-o", tmp_path / f"{ranks}.h5", *words)
+        assert done.returncode == 0, done.stderr
+        assert "3 steps were solved by newton-projected" in done.stderr
+        with h5py.File(tmp_path / f"{ranks}.h5") as file:
+            found.append((file["frames/fallbacks"][:], file["frames/position"][-1]))
+    assert found[0][0].tolist() == found[1][0].tolist() == [0, 1, 1, 1]
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-6)

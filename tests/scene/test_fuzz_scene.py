@@ -1,0 +1,174 @@
+"""Scene files, study files and --set values that are wrong or hostile; under mpiexec too."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from bad_input import TRIALS, damage, damaged, refusal
+from block_scene import block_scene
+from conftest import ROOT
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.study.reading import load_study
+from msmpetsc.study.sweep import cases
+
+SCENES = [path.read_bytes() for path in sorted((ROOT / "scenes").rglob("*.toml"))]
+ONCE = {"step": 0.01, "duration": 0.02}
+
+
+@settings(TRIALS, max_examples=60)
+@given(content=st.sampled_from(SCENES), changes=damage, study=st.booleans())
+def test_a_damaged_scene_or_study_is_read_or_refused(tmp_path, content, changes, study):
+    (tmp_path / "x.toml").write_bytes(damaged(content, changes))
+    refusal(lambda: (load_study if study else load_scene)(tmp_path / "x.toml"), lines=True)
+
+
+@settings(TRIALS, max_examples=60)
+@given(key=st.sampled_from(["mesh.source", "title", "pin.0", "cages", ""]), value=st.text(st.characters(), max_size=8))
+def test_any_override_is_read_or_refused(tmp_path, key, value):
+    path = tmp_path / "scene.toml"
+    if not path.exists():
+        block_scene(tmp_path, time=ONCE)
+    refusal(lambda: load_scene(path, [f"{key}={value}"]).text.encode(), lines=True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a scene, beside what it must not reach."""
+    (tmp_path / "own" / "below").mkdir(parents=True)
+    block_scene(tmp_path / "own", time=ONCE)
+    for name in ("out.ply", "own/below/in.ply"):
+        (tmp_path / name).write_bytes((tmp_path / "own" / "scene.ply").read_bytes())
+    (tmp_path / "own" / "link.ply").symlink_to("../out.ply")
+    (tmp_path / "own" / "loop.ply").symlink_to("loop.ply")
+    return tmp_path / "own"
+
+
+def naming(folder: Path, name: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(path.read_text().replace("scene.ply", name))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["../out.ply", "link.ply", "loop.ply", "loop.ply/in.ply", "below/../../out.ply", "/etc/hostname"]
+)
+def test_a_scene_names_no_file_outside_its_folder(folder, name):
+    path = naming(folder, name)
+    said = refusal(lambda: load_scene(path))
+    assert "mesh.source" in said and "--set mesh.source=PATH allows it" in said
+    assert load_scene(path, [f"mesh.source={name}"]).mesh.source == name  # the user's own word
+    assert refusal(lambda: load_scene(path, [f"mesh.source={name}"], by_user=False))
+
+
+def test_what_lies_below_is_the_scenes_own(folder):
+    assert load_scene(naming(folder, "below/in.ply")).mesh.source == "below/in.ply"
+
+
+def test_painted_points_come_from_the_folder_too(folder):
+    path = folder / "scene.toml"
+    path.write_text(path.read_text() + '\n[[pin]]\nregion = { painted = "../numbers.txt" }\n')
+    assert "pin.0.region.painted" in refusal(lambda: load_scene(path))
+    load_scene(path, ["pin.0.region.painted=../numbers.txt"])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("mesh.source", '"a\\nb.ply"'), ("mesh.source", '"\\u001b[31m"'), ("title", "\udcff")]
+)
+def test_names_are_printable_text(folder, key, value):
+    assert refusal(lambda: load_scene(folder / "scene.toml", [f"{key}={value}"]))
+
+
+def test_a_pipe_is_no_scene(folder):
+    os.mkfifo(folder / "pipe.toml")
+    assert "is a pipe or a device" in refusal(lambda: load_scene(folder / "pipe.toml"))
+
+
+STUDY = '[[scene]]\nname = "a"\nfile = "scene.toml"\nset = ["{}"]\n[[sweep]]\noptions = ["{}"]\n'
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "-pc_type python -pc_python_type evil.Solver", "-ksp_type python", "-dll_append evil.so", "-options_file x",
+        "-ksp_view :stolen.txt", "-log_view :x", "-o important.h5", "--overwrite", "-ksp_monitor", "-debug_terminal xterm",
+        "-ksp_rtol ../x", "-on_error_attach_debugger", "-mat_view binary", "evil.py",
+    ],
+)  # fmt: skip
+def test_a_study_chooses_solvers_and_no_more(folder, options):
+    (folder / "study.toml").write_text(STUDY.format("time.step=0.01", options))
+    if options == "evil.py":
+        load_study(folder / "study.toml")  # a value of no option: nothing PETSc would load
+    else:
+        assert "only options of solvers" in refusal(lambda: load_study(folder / "study.toml"))
+
+
+def test_a_study_names_no_mesh_outside(folder):
+    (folder / "study.toml").write_text(STUDY.format("mesh.source=../out.ply", "-pc_type jacobi -ksp_rtol 1e-2"))
+    with pytest.raises(InputError, match="mesh.source"):
+        cases(load_study(folder / "study.toml"), folder, False)
+
+
+def test_the_own_scenes_and_studies_name_what_they_may():
+    for path in (ROOT / "scenes").rglob("*.toml"):
+        if "[mesh]" in path.read_text():
+            load_scene(path)
+        else:
+            load_study(path)
+
+
+@pytest.mark.parametrize("name", ["huge.ply", "../out.ply"])
+def test_all_ranks_say_the_same_once(folder, msmpetsc, name):
+    (folder / "huge.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"
+    )
+    done = msmpetsc(2, "run", naming(folder, name), "-o", folder / "x.h5", timeout=60)
+    told = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: error")]
+    assert done.returncode == 2 and len(told) == 1 and "Traceback" not in done.stderr
+    assert not (folder / "x.h5").exists()
+
+
+DEEP = {
+    "a key of many parts": b"a" + b".a" * 20_000 + b" = 1\n",
+    "quoted ones": b'"a"' + b" . 'a b'" * 20_000 + b" = 1\n",
+    "a table of many parts": b"[ a" + b".a" * 20_000 + b"]\n",
+    "in a table that is a value": b"x = [{ y = 1, a" + b".a" * 20_000 + b" = 1 }]\n",
+    "brackets": b"x = " + b"[" * 20_000 + b"\n",
+}
+MANY = {
+    "unknown keys": (b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
+    "unknown keys of a table": (b"[cages]\n" + b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
+    "a long line and many others": (
+        b"x = [" + b"1, " * 100_000 + b"]\n" + b"".join(b"y%d = 1\n" % i for i in range(200)),
+        "unknown key",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEEP)
+def test_a_key_of_many_parts_takes_no_time(tmp_path, name):
+    path = tmp_path / "x.toml"
+    path.write_bytes(DEEP[name])
+    for load in (load_scene, load_study):
+        begun = time.process_time()
+        assert refusal(lambda load=load: load(path)) == f"{path}: is nested too deeply"
+        assert time.process_time() - begun < 1
+    assert "is nested too deeply" in refusal(lambda: load_scene(block_scene(tmp_path), ["a" + ".a" * 20_000 + "=1"]))
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_many_mistakes_take_no_time(tmp_path, name):
+    path, (content, words) = tmp_path / "x.toml", MANY[name]
+    path.write_bytes(content)
+    begun = time.process_time()
+    said = refusal(lambda: load_scene(path), lines=True)
+    assert words in said and said.count("\n") < 110 and time.process_time() - begun < 5
+
+
+def test_a_key_of_fifty_parts_is_unknown(tmp_path):
+    (tmp_path / "x.toml").write_bytes(b"a" + b".a" * 49 + b" = 1\n")
+    assert "unknown key" in refusal(lambda: load_scene(tmp_path / "x.toml"), lines=True)

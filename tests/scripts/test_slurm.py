@@ -1,0 +1,153 @@
+"""The job scripts, carried out under mpirun with stand-ins for srun, scontrol and the program."""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from conftest import AS_ROOT, ROOT
+
+SCRIPTS = sorted((ROOT / "scripts" / "slurm").glob("*.sbatch"))
+RUNS = [path for path in SCRIPTS if path.stem != "array"]
+STAND_INS = {
+    # the options of srun aside; mpirun, too, hands USR1 to its ranks
+    "srun": """while [[ $1 == --* ]]; do shift; done
+        exec mpirun --oversubscribe -n 2 "$@" """,
+    "scontrol": 'echo "$@" >> requeued',
+    # keeps the contract of msmpetsc run and msmpetsc study: what a signal does, what --resume says
+    "msmpetsc": """echo "$@ threads=$OMP_NUM_THREADS" >> "told-$$"
+        trap 'touch "$4"; exit 0' USR1
+        trap 'exit 130' TERM
+        if [[ $2 == --resume ]]; then echo "nothing left to do"; exit 0; fi
+        if [[ -e done ]]; then exit "$(cat done)"; fi
+        touch "ready-$$"
+        for _ in {1..600}; do sleep 0.05; done
+        exit 1""",
+}
+
+
+def test_there_are_three():
+    assert [path.name for path in SCRIPTS] == ["array.sbatch", "cpu.sbatch", "gpu.sbatch"]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_bash_can_read_it_and_two_lines_are_to_be_edited(script: Path):
+    subprocess.run(["bash", "-n", script], check=True)
+    text = script.read_text()
+    assert sum("# EDIT" in line for line in text.splitlines()) == 2
+    assert "#SBATCH --signal=B:USR1@120\n" in text and "#SBATCH --requeue\n" in text
+    assert "export OMP_NUM_THREADS=1" in text
+    directives = [number for number, line in enumerate(text.splitlines()) if line.startswith("#SBATCH")]
+    assert max(directives) < text.splitlines().index("set -euo pipefail")  # sbatch stops looking at the first command
+
+
+@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
+def test_shellcheck_finds_nothing():
+    done = subprocess.run(["shellcheck", *SCRIPTS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_gpu_script_says_what_it_asks_and_what_was_not_tried():
+    (script,) = (path for path in SCRIPTS if path.stem == "gpu")
+    text = script.read_text()
+    for words in ("options=(-mat_type aijcusparse)", "--gpus-per-task=1", "--gpu-bind=single:1", "NOT TRIED ON A GPU"):
+        assert words in text
+
+
+class Job:
+    """A script in a folder of its own, its two lines edited."""
+
+    def __init__(self, script: Path, folder: Path):
+        self.folder = folder
+        for name, body in STAND_INS.items():
+            (folder / "bin").mkdir(exist_ok=True)
+            (folder / "bin" / name).write_text(f"#!/usr/bin/env bash\n{body}\n")
+            (folder / "bin" / name).chmod(0o755)
+        (folder / "setup.sh").write_text(f'PATH={folder}/bin:$PATH; : "$NOT_SET_ANYWHERE"\n')
+        lines = script.read_text().splitlines()
+        edited = {"scene": "fall.toml", "study": "growth.toml", "setup": f"{folder}/setup.sh"}
+        for number, line in enumerate(lines):
+            if "# EDIT" in line:
+                name = line.partition("=")[0]
+                lines[number] = f"{name}={edited[name]}"
+        self.script = folder / "job.sh"
+        self.script.write_text("\n".join(lines))
+
+    def start(self) -> subprocess.Popen:
+        """As Slurm starts it, first or again."""
+        array = {"SLURM_ARRAY_JOB_ID": "70", "SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_MAX": "16"}
+        environment = {**os.environ, **AS_ROOT, "SLURM_JOB_ID": "77", **array}
+        environment = {name: value for name, value in environment.items() if not name.startswith(("OMPI_COMM", "PMIX"))}
+        environment.pop("OMP_NUM_THREADS", None)
+        return subprocess.Popen(
+            ["bash", self.script], cwd=self.folder, env=environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+
+    def wait_for(self, pattern: str, count: int) -> None:
+        deadline = time.monotonic() + 30
+        while len(list(self.folder.glob(pattern))) < count and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert len(list(self.folder.glob(pattern))) >= count, pattern
+
+    def told(self) -> list[str]:
+        """What the program was called with, each rank of each call; forgotten afterwards."""
+        calls = sorted(self.folder.glob("told-*"))
+        lines = [line for call in calls for line in call.read_text().splitlines()]
+        for call in calls:
+            call.unlink()
+        return lines
+
+    @property
+    def requeued(self) -> list[str]:
+        path = self.folder / "requeued"
+        return path.read_text().splitlines() if path.exists() else []
+
+
+@pytest.mark.parametrize("script", RUNS, ids=lambda path: path.stem)
+def test_a_run_out_of_time_is_queued_again_and_goes_on(script: Path, tmp_path: Path):
+    job, result = Job(script, tmp_path), "out/fall-77.h5"
+    petsc = " -mat_type aijcusparse" if script.stem == "gpu" else ""
+    first = job.start()
+    job.wait_for("ready-*", 2)
+    first.send_signal(signal.SIGUSR1)
+    output, _ = first.communicate(timeout=30)
+    assert first.returncode == 0, output
+    assert job.told() == [f"run fall.toml -o {result}{petsc} threads=1"] * 2
+    assert job.requeued == ["requeue 77"] and (tmp_path / result).exists()
+    again = job.start()
+    output, _ = again.communicate(timeout=30)
+    assert again.returncode == 0 and "nothing left to do" in output
+    assert job.told() == [f"run --resume {result}{petsc} threads=1"] * 2
+    assert job.requeued == ["requeue 77"]  # not again
+
+
+def test_a_run_that_fails_is_not_queued_again(tmp_path: Path):
+    (script,) = (path for path in SCRIPTS if path.stem == "cpu")
+    job = Job(script, tmp_path)
+    (tmp_path / "done").write_text("3")
+    process = job.start()
+    process.communicate(timeout=30)
+    assert process.returncode == 3 and job.requeued == []
+
+
+def test_a_task_of_an_array_is_queued_again_until_its_part_is_done(tmp_path: Path):
+    (script,) = (path for path in SCRIPTS if path.stem == "array")
+    job = Job(script, tmp_path)
+    first = job.start()
+    job.wait_for("ready-*", 1)
+    first.send_signal(signal.SIGUSR1)
+    output, _ = first.communicate(timeout=30)
+    assert first.returncode == 0 and "queued again" in output, output
+    assert job.told() == ["study growth.toml --part 3/16 threads=1"] and job.requeued == ["requeue 70_3"]
+    (tmp_path / "done").write_text("0")
+    again = job.start()
+    again.communicate(timeout=30)
+    assert again.returncode == 0 and job.requeued == ["requeue 70_3"]
+    (tmp_path / "done").write_text("2")
+    wrong = job.start()
+    wrong.communicate(timeout=30)
+    assert wrong.returncode == 2 and job.requeued == ["requeue 70_3"]

@@ -1,0 +1,83 @@
+"""The order of the integrators in time, and what they lose of a free oscillation."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import block_scene, play
+
+DURATION = 0.03  # [s]: about a period
+SWING = {"start": {"scale": [1.2, 1.0, 0.9]}, "output": {"surface": False, "every": 1000}}  # let go, far from at rest
+
+
+def bar(folder: Path, **tables) -> Path:
+    """Two cells, so that no mode is much faster than another: the motion is smooth at the steps tried."""
+    return block_scene(folder, np.array([0.25, 0.125, 0.125]), **SWING | tables)
+
+
+def end(folder: Path, integrator: str, step: float, **solver) -> np.ndarray:
+    """Positions (n, 3) [m] at DURATION."""
+    time = {"step": step, "duration": DURATION, "integrator": integrator}
+    return play(bar(folder, time=time, solver={"preset": "newton", "error": 1e-8} | solver))[1][-1].position
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """By explicit substeps of which 60 make the shortest step tried: their own error is of second order."""
+    time = {"step": DURATION / 8, "duration": DURATION, "integrator": "verlet", "substep": DURATION / 20000}
+    return play(bar(tmp_path_factory.mktemp("exact"), time=time))[1][-1].position
+
+
+ORDERS = [("implicit-euler", 1, (256, 512)), ("bdf2", 2, (128, 256)), ("verlet", 2, (64, 128))]
+
+
+@pytest.mark.parametrize("integrator, order, parts", ORDERS)
+def test_order_in_time(tmp_path: Path, exact: np.ndarray, integrator: str, order: int, parts: tuple[int, int]):
+    """The slope of the error over the time step."""
+    errors = []
+    for part in parts:
+        extra = {"substep": DURATION / part} if integrator == "verlet" else {}
+        time = {"step": DURATION / part, "duration": DURATION, "integrator": integrator} | extra
+        errors.append(np.linalg.norm(play(bar(tmp_path, time=time))[1][-1].position - exact))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
+
+
+def test_bdf2_is_far_nearer_for_the_same_steps(tmp_path: Path, exact: np.ndarray):
+    first, second = (np.linalg.norm(end(tmp_path, name, DURATION / 64) - exact) for name in ("implicit-euler", "bdf2"))
+    assert second < first / 5
+
+
+@pytest.mark.parametrize("steps", [4, 8, 16])
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
+    """A spinless mode of frequency w loses as the scheme's own roots say: implicit Euler 1 / (1 + w^2 t^2) a step.
+
+    One cell whose shape is blown up evenly is that mode: by the forces of its springs, all in step, at small strain;
+    w^2 from the run's own elastic energy, 1/2 w^2 sum m |u|^2.
+    """
+    small = 1e-5
+    scene = block_scene(
+        tmp_path, np.full(3, 0.125), start={"scale": [1 + small] * 3}, solver={"preset": "newton", "error": 1e-10}
+    )
+    model, frames = play(scene, "time={step=1e-6, duration=1e-6}")
+    moved = model.start[0] - model.lattice.nodes
+    w = np.sqrt(2 * frames[0].elastic / (model.lattice.mass @ (moved**2).sum(axis=1)))
+    t = float(2 * np.pi / w / 32)
+    _, frames = play(scene, f"time={{step={t!r}, duration={steps * t!r}, integrator='{integrator}'}}")
+    left = (frames[-1].elastic + frames[-1].kinetic) / frames[0].elastic
+    assert left == pytest.approx(energy_left(integrator, w * t, steps), rel=1e-4)
+
+
+def energy_left(integrator: str, wt: float, steps: int) -> float:
+    """Of x'' = -w^2 x from x = 1, x' = 0, by the scheme itself on z = x + i x' / w, whose rate is -i w z; BDF2 with
+    the history that an implicit Euler step of two thirds makes up (solve.integrators.implicit.Bdf2)."""
+    matrix = wt * np.array([[0, 1], [-1, 0]])  # t d/dt of (x, x' / w)
+    one = np.array([1.0, 0.0])
+    if integrator == "implicit-euler":
+        return float((1 + wt**2) ** -steps)
+    begun = np.linalg.solve(np.eye(2) - 2 / 3 * matrix, one)
+    a = -wt * begun[0]  # t x'' / w at the end of that step
+    before, now = np.array([one[0] - wt * one[1] + wt * a / 2, one[1] - a]), one
+    for _ in range(steps):
+        before, now = now, np.linalg.solve(np.eye(2) - 2 / 3 * matrix, (4 * now - before) / 3)
+    return float(now @ now)

@@ -1,0 +1,365 @@
+"""PETSc's options are obeyed, or refused in one line before anything is built; the matrices they ask for are written."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import block_scene
+from conftest import run
+from mpi4py import MPI
+from test_step import beam, petsc_options, swing, weight  # noqa: F401 (petsc_options is a fixture)
+
+from msmpetsc.cli import compare, fetch, inspect, plan, render, study
+from msmpetsc.cli.main import main
+from msmpetsc.cli.run import add_parser
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset, shown_options
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.petsc.errors import refusal
+from msmpetsc.solve.petsc.initialise import _check_files
+from msmpetsc.solve.petsc.options import _is_in_library, refuse_bad_values, refuse_early
+
+T = 1 / 60
+COMM = MPI.COMM_SELF
+SCENE = {  # that moves
+    "time": {"step": 0.01, "duration": 0.02},
+    "gravity": {"acceleration": [0, 0, -9.81]},
+    "pin": [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}],
+}
+COMMAND = ("-m", "msmpetsc.cli.main", "run")
+
+
+# What is refused before anything is built
+
+NO_USE = {
+    "ts_monitor": ("", "time.step"),
+    "ts_dt": ("0.1", "time.step"),
+    "ts_max_steps": ("3", "--frames"),
+    "ts_adapt_monitor": ("", "time.integrator"),
+    "dm_view": ("", "cages.count"),
+    "da_grid_x": ("5", "cages.count"),
+    "tao_monitor": ("", "solver.preset"),
+    "snes_rtol": ("1e-3", "solver.error"),
+    "snes_atol": ("1e300", "solver.error"),
+    "snes_stol": ("1e-8", "solver.error"),
+    "reference_snes_rtol": ("1e-3", "solver.error"),
+    "fallback_snes_stol": ("1", "solver.error"),
+    "snes_convergence_test": ("skip", "solver.error"),
+    "snes_norm_schedule": ("none", "solver.error"),
+    "snes_divergence_tolerance": ("2", "solver.max_iterations"),
+    "snes_max_funcs": ("2", "solver.max_iterations"),
+    "snes_force_iteration": ("", "solver.error"),
+    "snes_lag_jacobian": ("2", "A is constant"),
+    "snes_lag_preconditioner_persists": ("1", "A is constant"),
+    "snes_mf": ("", "spring by spring"),
+    "snes_mf_operator": ("", "spring by spring"),
+    "snes_fd": ("", "spring by spring"),
+    "snes_fd_color": ("", "spring by spring"),
+    "snes_type": ("newtontr", "newtonls"),
+    "three_columns_pc_type": ("bjacobi", "-pc_"),
+    "ksp_error_if_not_converged": ("", "status 3"),
+    "ksp_monitor": ("binary:f.dat", "ascii:FILE"),
+    "ksp_view_diagonal_scale": ("", "not scaled"),
+    "ksp_tpye": ("cg", "did you mean 'ksp_type'"),
+    "ksp_vieww": ("", "did you mean 'ksp_view'"),
+    "mg_levels_ksp_typ": ("cg", "no part of this run"),
+    "presett": ("newton", "did you mean '--preset'"),
+    "options_left": ("abc", "abc"),
+    "log_view": ("foo:bar", "foo"),
+}
+
+
+@pytest.mark.parametrize("name", NO_USE)
+def test_what_cannot_be_of_use_is_one_line_that_says_what_is(petsc_options, name: str):  # noqa: F811
+    value, word = NO_USE[name]
+    petsc_options(**{name: value})
+    with pytest.raises(InputError) as refused:
+        refuse_early(COMM, ["--preset", "--frames"])
+    assert str(refused.value).startswith(f"-{name}") and word in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ksp_rtol", "ksp_monitor_true_residual", "ksp_view_mat", "mat_view", "mat_mumps_icntl_14", "snes_python_type",
+        "pc_hypre_boomeramg_max_iter", "mg_levels_3_ksp_max_it", "mg_coarse_sub_pc_type", "pc_fieldsplit_12_fields",
+        "npc_snes_linesearch_type", "reference_pc_type", "log_view", "malloc_debug",
+    ],
+)  # fmt: skip
+def test_what_petsc_knows_is_let_through(name: str):
+    assert _is_in_library(name)
+
+
+def test_a_size_of_0_below_which_no_step_ends_is_what_presets_say(petsc_options):  # noqa: F811
+    petsc_options(snes_stol="0")
+    refuse_early(COMM, [])
+
+
+@pytest.mark.parametrize("name", ["ksp_rtol", "pc_type", "mat_type", "snes_type", "snes_max_it", "fallback_ksp_type"])
+def test_values_are_tried_before_there_is_anything_to_solve(petsc_options, name: str):  # noqa: F811
+    petsc_options(**{name: "nonsense"})
+    solvers = {"": (find_preset("newton"), 0), "fallback_": (find_preset("newton-projected"), 0)}
+    with pytest.raises(InputError, match="nonsense"):
+        refuse_bad_values(solvers)
+
+
+LINES = {  # of an options file -> whether PETSc can read it
+    "-ksp_type cg": True,
+    "  -ksp_type cg # and more": True,
+    "": True,
+    "# -ksp_type": True,
+    '-log_view "a b"': True,
+    "-shift -0.5": True,
+    "alias -a -b": True,
+    "ksp_type cg": False,
+    "% ksp_type cg": False,
+    "-ksp_type cg -pc_type none": False,
+    "-ksp_view -pc_type": False,
+    "-ksp_type cg jacobi": False,
+    "-3 4": False,
+    "-options_file gone": False,
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
+    """For rank 0 alone reads it, and the others would wait for ever."""
+    file = tmp_path / "options"
+    file.write_text(f"-pc_type jacobi\n{line}\n")
+    words = ["-options_file", str(file)]
+    if LINES[line]:
+        _check_files(words)
+        return
+    with pytest.raises(InputError, match="line 2|gone: cannot be read"):
+        _check_files(words)
+
+
+@pytest.mark.parametrize("words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]])
+def test_an_options_file_is_a_file(words: list[str]):
+    with pytest.raises(InputError, match="-options_file"):
+        _check_files(words)
+
+
+BEFORE_THE_MESH = {
+    "-ts_monitor": "time.step",
+    "-ksp_tpye cg": "'ksp_type'",
+    "-ksp_rtol abc": "abc",
+    "-pc_type nonsense": "nonsense",
+    "-options_file gone": "gone",
+    "-malloc_debug abc": "abc",
+    "-log_view :/no/such/file": "/no/such/file",
+    "--set time.integrator=verlet -ksp_type cg": "-ksp_type",
+}
+
+
+@pytest.mark.parametrize(
+    ("ranks", "options"),
+    [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone"), (2, "-ts_monitor")],
+)
+def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options: str):
+    """Which is not there."""
+    scene = block_scene(tmp_path, **SCENE, mesh={"source": "gone.ply"})
+    before = sorted(tmp_path.iterdir())
+    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split(), timeout=60)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: error:")]
+    assert done.returncode == 2 and len(errors) == 1 and BEFORE_THE_MESH[options] in errors[0], done.stderr
+    assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "gone.ply"))
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_option_of_ours_with_one_dash_is_told_its_name(capsys):
+    import argparse
+
+    found = 0
+    for module in (compare, fetch, inspect, plan, render, study, None):
+        name = module.__name__.rpartition(".")[2] if module else "run"
+        commands = argparse.ArgumentParser().add_subparsers()
+        (module.add_parser if module else add_parser)(commands)
+        for option in commands.choices[name]._option_string_actions:
+            if option.startswith("--") and (name, option) not in {("run", "--help"), ("inspect", "--help")}:
+                assert main([name, option[1:], "3"]) == 2
+                assert f"did you mean '{option}'?" in capsys.readouterr().err
+                found += 1
+    assert found > 40
+    assert main(["compare", "a.h5", "b.h5", "-ksp_type", "cg"]) == 2
+    assert "takes no PETSc options" in capsys.readouterr().err
+
+
+# What is obeyed
+
+
+def test_a_solver_that_is_to_fail_where_it_does_not_converge_fails_the_step():
+    """As of an inner solver: -mg_coarse_ksp_error_if_not_converged."""
+    from petsc4py import PETSc
+
+    with pytest.raises(StepFailed, match="did not converge"), refusal("PETSc cannot"):
+        raise PETSc.Error(91)
+
+
+def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(tmp_path: Path):
+    """The dense block that was being worked on could not be destroyed."""
+    done = run(
+        1, *COMMAND, block_scene(tmp_path, **SCENE), "-o", tmp_path / "o.h5", "-pc_type", "composite", timeout=60
+    )
+    assert done.returncode == 2 and "composite" in done.stderr, done.stderr
+    assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV"))
+
+
+@pytest.mark.parametrize("preset", ["newton", "anderson", "chebyshev", "lbfgs"])
+def test_the_reason_says_which_rule_ended_the_step(preset: str):
+    """A correction that is short enough, or |F| alone; or the budget."""
+    from petsc4py import PETSc
+
+    reasons, seen = PETSc.SNES.ConvergedReason, set()
+    lattice = beam()
+    for error, budget in ((1e-1, None), (1e-3, None), (1e-6, None), (1e-12, 2)):
+        stepper = Stepper(COMM, lattice, T, find_preset(preset), error, budget)
+        stepper.step(lattice.nodes, lattice.nodes, weight(lattice))
+        reason, corrected = stepper.snes.reason, stepper.corrected
+        stepper.destroy()
+        rule = reasons.CONVERGED_SNORM_RELATIVE if corrected else reasons.CONVERGED_FNORM_RELATIVE
+        assert reason == (reasons.CONVERGED_ITS if budget else rule)
+        seen.add(reason)
+    assert seen >= {reasons.CONVERGED_SNORM_RELATIVE, reasons.CONVERGED_ITS}
+
+
+def test_newton_starts_its_solves_where_the_user_says(petsc_options):  # noqa: F811
+    petsc_options(ksp_initial_guess_nonzero="1")
+    lattice = beam()
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-6)
+    stepper.step(lattice.nodes, lattice.nodes, weight(lattice))
+    assert stepper.ksp.getInitialGuessNonzero()
+    stepper.destroy()
+
+
+def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):  # noqa: F811
+    petsc_options(ksp_type="chebyshev")
+    assert all(result.error <= 1e-3 for result in swing("newton", 2, error=1e-3))
+
+
+def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):  # noqa: F811
+    petsc_options(snes_monitor_python="gone.monitor")
+    with pytest.raises(InputError, match="gone"):
+        refuse_bad_values({"": (find_preset("newton"), 0)})
+
+
+# Matrices
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """The first matrix of a PETSc binary file, dense."""
+    from petsc4py import PETSc
+
+    viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSC_SELF())
+    matrix = PETSc.Mat().load(viewer)
+    dense = matrix.convert("dense").getDenseArray().copy()
+    viewer.destroy()
+    matrix.destroy()
+    return dense
+
+
+def PETSC_SELF():
+    from petsc4py import PETSc
+
+    return PETSc.COMM_SELF
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_matrices_are_written_whole(petsc_options, tmp_path: Path, preset: str):  # noqa: F811
+    """A alone by -mat_view, whatever solvers assemble beside it; what is preconditioned with, and the operator."""
+    names = ("mat_view", "ksp_view_pmat", "ksp_view_mat")
+    petsc_options(**{name: f"binary:{tmp_path / name}" for name in names})
+    lattice = beam()
+    stepper = Stepper(COMM, lattice, T, find_preset(preset), 1e-3)
+    rows = np.arange(stepper.unknowns.size, dtype=np.int32)
+    A = stepper.matrix.getValues(rows, rows)
+    q = lattice.nodes + 1e-3 * np.random.default_rng(0).normal(size=lattice.nodes.shape) * ~lattice.pinned[:, None]
+    stepper.step(q, q, weight(lattice))
+    stepper.destroy()
+    three = np.kron(np.eye(3), A)
+    np.testing.assert_array_equal(read_matrix(tmp_path / "mat_view"), A)
+    np.testing.assert_array_equal(read_matrix(tmp_path / "ksp_view_pmat"), three if "kronecker" in preset else A)
+    written = read_matrix(tmp_path / "ksp_view_mat")
+    if not PRESETS[preset].true_hessian:
+        np.testing.assert_allclose(written, three, rtol=1e-13, atol=1e-15)
+        return
+    assert written.shape == three.shape and np.abs(written - three).max() > 1e-3  # springs pull along themselves only
+    np.testing.assert_allclose(written, written.T, atol=1e-12)
+    assert np.linalg.eigvalsh(three - written).min() > -1e-2 * np.abs(three).max()
+
+
+def test_the_written_hessian_is_the_one_that_is_applied(tmp_path: Path):
+    """Under a stiffening law, with cells that resist, against products with it."""
+    from petsc4py import PETSc
+
+    from msmpetsc.solve.petsc.explicit import explicit
+
+    lattice = replace(beam(), stiffening=2.0)
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-3)
+    q = lattice.nodes * [1, 1, 0.3]
+    stepper.hessian.linearise(q, None)
+    matrix = explicit(stepper.operator, stepper.unknowns)
+    x, y = stepper.operator.createVecs()
+    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
+    stepper.operator.mult(x, y)
+    found = y.duplicate()
+    matrix.mult(x, found)
+    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
+    for owned in (matrix, x, y, found):
+        owned.destroy()
+    stepper.destroy()
+    assert isinstance(matrix, PETSc.Mat)
+
+
+def test_matrices_of_two_ranks_are_those_of_one(tmp_path: Path):
+    scene = block_scene(tmp_path, **SCENE)
+    for ranks in (1, 2):
+        views = [f"-mat_view binary:A{ranks}", f"-ksp_view_pmat binary:P{ranks}", f"-ksp_view_mat binary:K{ranks}"]
+        words = " ".join(views).replace("binary:", f"binary:{tmp_path}/").split()
+        options = ("--preset", "newton-multigrid", "--frames", "1", *words)
+        done = run(ranks, *COMMAND, scene, "-o", tmp_path / f"{ranks}.h5", *options, timeout=60)
+        assert done.returncode == 0, done.stderr
+    for name in "AP":
+        one, two = (np.sort(np.linalg.eigvalsh(read_matrix(tmp_path / f"{name}{ranks}"))) for ranks in (1, 2))
+        np.testing.assert_allclose(one, two, rtol=1e-10)
+    one, two = (np.linalg.eigvalsh(read_matrix(tmp_path / f"K{ranks}")) for ranks in (1, 2))
+    np.testing.assert_allclose(one, two, rtol=1e-6)
+
+
+# What is shown
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_shown_options_given_back_change_nothing(petsc_options, preset: str):  # noqa: F811
+    before = swing(preset, 2)
+    lines = shown_options({"": (find_preset(preset), 0)})
+    given = dict(line[1:].split() if " " in line else (line[1:], "") for line in lines if line.startswith("-"))
+    assert {f"-{name} {value}".strip() for name, value in PRESETS[preset].options.items()} <= {
+        line.removeprefix("# ").partition("    ")[0] for line in lines
+    }
+    petsc_options(**given)
+    refuse_early(COMM, [])
+    after = swing(preset, 2)
+    np.testing.assert_array_equal(after[-1].position, before[-1].position)
+    assert [result.ksp_its for result in after] == [result.ksp_its for result in before]
+
+
+def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: Path):
+    shown = run(2, *COMMAND, "--show-options", "--preset", "anderson", "-ksp_max_it", "77", timeout=60)
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.splitlines().count("-snes_type anderson") == 1
+    assert "-ksp_max_it 77" in shown.stdout and "# -ksp_rtol 1e-1" in shown.stdout
+    (tmp_path / "options").write_text(shown.stdout)
+    scene = block_scene(
+        tmp_path, **SCENE, mesh={"source": "gone.ply"}, solver={"preset": "paper", "max_iterations": 2000}
+    )
+    other = ("--show-options", scene, "--true-error", "1", "-pc_type", "sor")
+    shown = run(1, *COMMAND, *other, timeout=60)
+    assert "-reference_pc_type gamg" in shown.stdout and "-snes_max_it 2000" in shown.stdout, shown.stderr
+    assert "-pc_type sor" in shown.stdout and "-pc_type none" not in shown.stdout
+    scene = block_scene(tmp_path, **SCENE)
+    given = ("--preset", "anderson", "--frames", "1", "-options_file", tmp_path / "options")
+    done = run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", *given, timeout=60)
+    assert done.returncode == 0, done.stderr

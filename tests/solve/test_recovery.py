@@ -1,0 +1,349 @@
+"""Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good or bad, and why."""
+
+import runpy
+import tomllib
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from block_scene import block_scene
+from conftest import ROOT
+from mpi4py import MPI
+
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.frame import Frame
+from msmpetsc.model.inversion import least_volumes
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
+from msmpetsc.solve.nonlinear.failure import REASON
+from msmpetsc.solve.simulate import Simulation
+
+STUDIES = ROOT / "scenes" / "studies"
+MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
+CASES = {case["name"]: case for of in MAPS for case in of.get("case", ()) if case["file"].startswith("hard/")}
+shape_error = runpy.run_path(str(ROOT / "scripts" / "press_study.py"))["shape_error"]
+
+
+@dataclass(frozen=True)
+class Played:
+    """The frames until the end, or until a step failed: ``words`` then say how."""
+
+    scene: Scene
+    model: Model
+    frames: list[Frame]
+    words: str
+
+    @property
+    def lattice(self) -> Lattice:
+        return self.model.lattice
+
+    @property
+    def last(self) -> Frame:
+        return self.frames[-1]
+
+    @property
+    def size(self) -> float:
+        return np.ptp(self.lattice.nodes, axis=0).max()
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(n, 3) in lengths of the body."""
+        return (self.last.position - self.lattice.nodes) / self.size
+
+    def inverted(self, frame: Frame) -> int:
+        return int((least_volumes(frame.position, self.lattice.cells) <= 0).sum())
+
+    def shape_error(self, mirror: tuple = (1, 1, 1)) -> float:
+        return shape_error(self.lattice.nodes * mirror, self.last.position, self.lattice.mass) / self.size
+
+    def energy(self, frame: Frame) -> float:
+        """All but what the obstacles hold [J]."""
+        return frame.elastic + frame.potential + frame.kinetic
+
+
+@cache
+def play(name: str, *changes: str) -> Played:
+    """A case, in this process; by newton, to 1e-3, if nothing else is said."""
+    case = CASES[name]
+    path, changes = STUDIES / case["file"], [*case.get("set", ()), *changes]
+    if "steps" in case and not any(change.startswith("time.duration") for change in changes):
+        changes.append(f"time.duration={case['steps'] * load_scene(path, changes).time.step!r}")
+    scene, frames, words = load_scene(path, changes), [], ""
+    model = build_model(MPI.COMM_SELF, scene)
+    with np.errstate(all="ignore"), Simulation(MPI.COMM_SELF, scene, model) as simulation:
+        try:
+            frames.extend(simulation.frames())
+        except StepFailed as failed:
+            words = str(failed)
+    return Played(scene, model, frames, words)
+
+
+# ---- newton, the default, survives them all
+
+# to the end it takes them 5 to 10 s: so many steps of them are enough to show
+FIRST_STEPS = {"mirrored, stiffening": 1, "cloud, stiffening": 1, "through, stiffening": 10}
+
+
+def first_steps(name: str) -> Played:
+    """All of them, where that is soon done."""
+    if name not in FIRST_STEPS:
+        return play(name)
+    scene = load_scene(STUDIES / CASES[name]["file"], CASES[name].get("set", ()))
+    return play(name, f"time.duration={FIRST_STEPS[name] * scene.time.step!r}")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_newton_survives(name: str):
+    played = first_steps(name)
+    assert not played.words
+    assert len(played.frames) == 1 + played.scene.time.steps
+    assert all(np.isfinite(frame.position).all() for frame in played.frames)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in CASES if CASES[name]["file"] in ("hard/free.toml", "hard/clamped.toml")]
+)
+def test_no_energy_comes_from_nowhere(name: str):
+    """g(x_(n+1)) <= g(q_n) makes E_(n+1) <= E_n + K_n, the loads' potential counted in."""
+    frames = first_steps(name).frames
+    for before, after in zip(frames, frames[1:], strict=False):
+        rounding = 1e-9 * max(abs(f.potential) + f.elastic for f in frames)
+        assert after.elastic + after.potential <= before.elastic + before.potential + before.kinetic * 1.001 + rounding
+
+
+# ---- bodies that come back to their rest shape
+
+BACK = {
+    "stretched": 1e-6,
+    "squeezed": 1e-6,
+    "squeezed far, stiffening": 1e-6,
+    "twisted": 1e-6,
+    "flat, stiffening": 1e-6,
+    "nearly flat": 1e-6,
+    "shaken": 1e-4,
+    "stiff half, stretched": 1e-6,
+    "stiff half, twisted": 1e-6,
+    "one cell, free": 1e-6,
+    "sheet, crumpled": 1e-4,
+    "far away": 1e-6,
+    "tiny": 1e-6,
+    "tiny, slowly": 1e-6,
+    "huge": 1e-6,
+    "pressed, stiffening": 1e-3,
+    "pressed flat, stiffening": 1e-3,
+}
+
+
+@pytest.mark.parametrize("name", BACK)
+def test_it_comes_back_to_its_rest_shape(name: str):
+    """Somewhere in space, within a part of its length; no cell stays inverted."""
+    played = play(name)
+    assert played.shape_error() < BACK[name]
+    assert played.inverted(played.last) == 0
+    assert played.last.elastic < 1e-6 * max(frame.elastic for frame in played.frames)
+
+
+# ---- bodies that hang
+
+
+@pytest.mark.parametrize("name", ["beam", "light half", "stiff half", "one cell", "sheet", "by a node", "by an edge"])
+def test_it_hangs_at_rest(name: str):
+    played = play(name)
+    assert played.last.kinetic < 0.03 * played.last.elastic and played.inverted(played.last) == 0
+    far = played.lattice.nodes[:, 0] == played.lattice.nodes[:, 0].max()
+    assert played.moved[far, 2].max() < -1e-3
+
+
+def test_the_beam_sags_less_than_a_thin_one_would():
+    """rho g L^4 / (8 E I) = 0.24 m by small deflections; the load turns the tip, which shortens its arm."""
+    played = play("beam")
+    far = played.lattice.nodes[:, 0] == 1
+    assert -0.24 < played.moved[far, 2].mean() < -0.15
+
+
+def test_a_heavy_half_falls_and_draws_the_other_along():
+    """Nearly freely: the light half weighs nothing against it."""
+    played = play("heavy half")
+    time, step = played.scene.time.duration, played.scene.time.step
+    far = played.lattice.nodes[:, 0] > 0.75
+    fallen = -0.5 * time * (time + step)  # implicit Euler's
+    assert played.last.position[far, 2].mean() == pytest.approx(fallen, rel=0.05)
+
+
+def test_bodies_apart_fall_on_their_own():
+    played = play("apart")
+    time, step, x = played.scene.time.duration, played.scene.time.step, played.lattice.nodes[:, 0]
+    np.testing.assert_allclose(played.last.position[x > 0.3] - played.lattice.nodes[x > 0.3],
+                               np.tile([0, 0, -0.5 * time * (time + step)], ((x > 0.3).sum(), 1)), atol=1e-6)  # fmt: skip
+    assert np.abs(played.last.position - played.lattice.nodes)[x < 0.3].max() < 0.02
+
+
+def test_the_joint_of_two_bodies_does_not_come_apart():
+    for name in ("by a node", "by an edge"):
+        lattice, q = play(name).lattice, play(name).last.position
+        length = np.linalg.norm(q[lattice.springs[:, 0]] - q[lattice.springs[:, 1]], axis=1)
+        assert np.abs(length / lattice.rest_length - 1).max() < 0.2
+
+
+# ---- columns
+
+
+@pytest.mark.parametrize("name", ["column", "column, stiffening"])
+def test_a_column_bows_aside(name: str):
+    """The middle goes aside by w, by itself: all of the way that is not squeezed would be pi^2 w^2 / 4 L. With springs
+    alone it twists as well where it folds, 15% lower in energy than the hinge in one plane that it was, with w = 0.20."""
+    played = play(name)
+    middle = np.abs(played.lattice.nodes[:, 0] - 0.5) < 0.01
+    assert 0.15 < np.linalg.norm(played.moved[middle].mean(axis=0)[1:]) < 0.41
+    assert (played.inverted(played.last) == 0) == (name == "column, stiffening")  # springs alone fold into a hinge
+
+
+# ---- what springs cannot see
+
+
+def test_a_point_swells():
+    """Zero lengths have no direction, in step with all the others: nothing pulls, but any way leads down."""
+    played = play("point")
+    assert played.last.elastic < 0.05 * played.frames[0].elastic
+    assert max(frame.step_error for frame in played.frames) < 1e-2  # the first comes down to rounding before 1e-3
+
+
+def test_a_flat_body_leaves_its_plane():
+    """No spring pulls out of it, but in it a step is at a saddle."""
+    played = play("flat")
+    assert np.ptp(played.last.position[:, 2]) > 0.1 * np.ptp(played.lattice.nodes[:, 2])
+    assert played.last.elastic < 0.6 * played.frames[0].elastic
+    assert played.last.kinetic < 1e-6 * played.last.elastic
+
+
+def test_a_mirrored_body_stays_mirrored():
+    played = play("mirrored")
+    assert played.inverted(played.last) == len(played.lattice.cells)
+    assert played.last.elastic < 1e-20 and played.shape_error(mirror=(-1, 1, 1)) < 1e-6 < 0.1 < played.shape_error()
+
+
+@pytest.mark.parametrize("name", ["squeezed far", "pressed"])
+def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str):
+    """At rest, without a spring strained much, some cells inside out. The same with law = "stiffening" comes back."""
+    played = play(name)
+    assert 0 < played.inverted(played.last) < len(played.lattice.cells)
+    assert played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames) and played.shape_error() > 0.05
+
+
+def test_faces_led_through_each_other_leave_a_body_turned_over():
+    played = play("through")
+    assert played.inverted(played.last) == len(played.lattice.cells)
+    assert played.shape_error(mirror=(1, 1, -1)) < 1e-6
+
+
+def test_springs_pass_through_no_length_exactly():
+    """Those upright in the half that is led, 9 x 17 of them; let go, the half is turned over, but for a crease."""
+    played = play("through, sheet")
+    lattice, flat = played.lattice, played.frames[8].position
+    length = np.linalg.norm(flat[lattice.springs[:, 0]] - flat[lattice.springs[:, 1]], axis=1)
+    assert (length == 0).sum() == 9 * 17
+    turned = played.inverted(played.last)
+    assert 7 * 16 <= turned <= 9 * 16 and played.last.kinetic < 1e-3 * played.last.elastic
+
+
+# ---- scale
+
+
+def test_lengths_and_times_a_million_times_as_long_or_short_are_the_same_motion():
+    same = [play(name) for name in ("stretched", "tiny", "huge")]
+    one, *others = [[(f.position - f.position.mean(axis=0)) / p.size for f in p.frames] for p in same]
+    for other in others:
+        assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 5e-3  # the error of the steps
+
+
+# ---- other methods
+
+OTHERS = {
+    "newton-multigrid": ["solver.preset=newton-multigrid"],
+    "anderson": ["solver.preset=anderson"],
+    "fast-msm": ["solver.preset=fast-msm", "solver.error=1e-2"],
+    "verlet": ["time.integrator=verlet"],
+}
+COMES_BACK = [
+    ("newton-multigrid", "stretched"), ("newton-multigrid", "squeezed"), ("newton-multigrid", "flat, stiffening"),
+    ("anderson", "stretched"), ("anderson", "squeezed"),
+    ("fast-msm", "stretched"), ("fast-msm", "squeezed"), ("fast-msm", "one cell, free"),
+]  # fmt: skip
+NOT_FINITE = REASON[-4]  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
+DIVERGES = [
+    # A is no less than the Hessian of springs, but far from it where all are pressed: steps are small, or too long
+    ("anderson", "flat", "DIVERGED_MAX_IT after 300 iterations"),
+    ("anderson", "cloud", "DIVERGED_MAX_IT after 300 iterations"),
+    ("anderson", "through", "DIVERGED_MAX_IT after 300 iterations"),
+    ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
+    (
+        "anderson",
+        "pressed, stiffening",
+        "DIVERGED_MAX_IT after 300 iterations",
+    ),  # once it has left the saddle: it buckles
+    # A knows nothing of cells that resist or of stiffening springs, and no line search holds the steps back
+    ("anderson", "flat, stiffening", "DIVERGED_"),  # numbers that are not finite, or in PETSc 3.26 too many iterations
+    ("anderson", "mirrored, stiffening", "DIVERGED_"),
+    ("fast-msm", "flat, stiffening", NOT_FINITE),
+    ("fast-msm", "pressed, stiffening", NOT_FINITE),
+]
+
+
+@pytest.mark.parametrize(("method", "name"), COMES_BACK)
+def test_other_presets_bring_it_back_too(method: str, name: str):
+    played = play(name, *OTHERS[method])
+    assert not played.words
+    assert played.shape_error() < 1e-3 and played.inverted(played.last) == 0
+
+
+@pytest.mark.parametrize(("method", "name", "words"), DIVERGES)
+def test_other_presets_fail_and_say_so(method: str, name: str, words: str):
+    """In one line, with the frame and what to try."""
+    told = play(name, *OTHERS[method]).words
+    assert told.startswith("frame ") and words in told and "try a smaller time.step" in told and "\n" not in told
+
+
+@pytest.mark.parametrize(("how", "name"), [("substep", "pressed, stiffening"), ("fallback", "flat, stiffening")])
+def test_what_anderson_cannot_do_is_rescued(how: str, name: str):
+    """Inertia holds nodes where they are in shorter steps; newton-projected sees the cells that resist."""
+    anderson = OTHERS["anderson"]
+    assert "DIVERGED" in play(name, *anderson).words
+    played = play(name, *anderson, f"safety.on_failure={how}")
+    assert not played.words and played.shape_error() < 1e-4 and played.inverted(played.last) == 0  # it still swings
+    rescued = [getattr(frame, f"{how}s") for frame in played.frames]
+    assert max(rescued) > rescued[-1]  # less and less
+
+
+def test_the_robust_method_is_as_good():
+    """It comes to other minima of the cloud, and to the same where there is one."""
+    for name in ("cloud", "stiff half, stretched"):
+        played = play(name, "solver.preset=newton-projected", "time.duration=0.2")
+        assert not played.words and played.last.elastic < 0.01 * played.frames[0].elastic
+
+
+def test_verlet_keeps_the_energy_of_what_swings():
+    played = play("beam", *OTHERS["verlet"])
+    energies = np.array([played.energy(frame) for frame in played.frames])
+    assert np.abs(energies - energies[0]).max() < 0.01 * max(frame.elastic for frame in played.frames)
+
+
+def test_verlet_gains_energy_where_cells_fold_over_each_other_unless_its_substeps_are_short():
+    """A spring that is nearly of no length turns about within a substep: the limit of stability, which is that of small
+    swings, does not know of it. Substeps of a fifth of the limit keep the energy within a part in a hundred."""
+    alone, short = (play("stretched", *OTHERS["verlet"], *more) for more in ([], ["time.substep=1e-3"]))
+    assert "from nowhere" in alone.words and len(alone.frames) < len(short.frames)
+    assert not short.words and short.energy(short.last) == pytest.approx(short.frames[0].elastic, rel=0.02)
+
+
+def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
+    """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
+    path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]})
+    scene = load_scene(path)
+    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        saved = simulation.saved()
+        saved.numbers |= {"level": 3, "rescued": 2}
+        simulation.restore(saved)
+        assert len(list(simulation.advance())) == 3

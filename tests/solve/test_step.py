@@ -1,0 +1,333 @@
+"""One step: against closed forms, against dense linear algebra, and preset against preset."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from test_lattice import block, cages_of
+
+from msmpetsc.comm import SortedKeys
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.petsc.errors import refusal
+
+T = 1 / 60
+GRAVITY = np.array([0, 0, -9.81])
+COMM = MPI.COMM_SELF
+
+
+def beam(young_modulus: float = 2e5) -> Lattice:
+    """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
+    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), 1000.0, young_modulus=young_modulus)
+    return lattice.pin(lattice.nodes[:, 0] < 1.01)
+
+
+def weight(lattice: Lattice) -> np.ndarray:
+    return lattice.mass[:, None] * GRAVITY
+
+
+def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -> list:
+    """The steps of a beam let go under its weight."""
+    lattice = lattice or beam()
+    stepper = Stepper(COMM, lattice, T, find_preset(preset), **settings)
+    stepper.set_up()
+    q, before, results = lattice.nodes.copy(), lattice.nodes.copy(), []
+    try:
+        for _ in range(steps):
+            result = stepper.step(q, 2 * q - before, weight(lattice))
+            q, before = result.position, q
+            results.append(result)
+    finally:
+        stepper.destroy()
+    return results
+
+
+def residual(lattice: Lattice, x: np.ndarray, q: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """F(x) by numpy alone, at the free nodes."""
+    ends = x[lattice.springs]
+    along = ends[:, 0] - ends[:, 1]
+    length = np.linalg.norm(along, axis=1)
+    force = (lattice.stiffness * (1 - lattice.rest_length / length))[:, None] * along
+    gradient = np.zeros_like(x)
+    np.add.at(gradient, lattice.springs[:, 0], force)
+    np.add.at(gradient, lattice.springs[:, 1], -force)
+    F = lattice.mass[:, None] * (x - 2 * q + before) + T**2 * (gradient - weight(lattice))
+    return F[~lattice.pinned]
+
+
+@pytest.fixture(scope="module")
+def reference() -> list:
+    return swing("newton", 6, error=1e-12)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_free_fall_is_the_schemes_own(preset: str):
+    """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for ``paper``."""
+    lattice = build_lattice(cages_of(block(3, 2, 2), 0.1), 1000.0, young_modulus=2e5)
+    fallen = swing(preset, 5, lattice)[-1].position - lattice.nodes
+    tolerance = {"paper": 1e-8}.get(preset, 1e-12)
+    np.testing.assert_allclose(fallen, np.tile(GRAVITY * T**2 * 15, (len(fallen), 1)), atol=tolerance)
+
+
+def test_a_lattice_at_rest_stays_at_rest():
+    lattice = beam()
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
+    q = lattice.nodes.copy()
+    for _ in range(3):
+        q = stepper.step(q, q, np.zeros((lattice.owned, 3))).position
+    stepper.destroy()
+    np.testing.assert_allclose(q, lattice.nodes, atol=1e-14)
+
+
+def test_newton_solves_the_step_to_rounding(reference: list):
+    lattice = beam()
+    path = [lattice.nodes, lattice.nodes, *(result.position for result in reference)]
+    scale = np.linalg.norm(T**2 * weight(lattice))
+    for before, q, x in zip(path, path[1:], path[2:], strict=False):
+        assert np.linalg.norm(residual(lattice, x, q, before)) < 1e-10 * scale
+
+
+def one_spring(m: float, k: float, r: float) -> Lattice:
+    """A mass on a spring along z from a pinned end."""
+    return Lattice(
+        table=SortedKeys(COMM, np.arange(2)),
+        cell_size=r,
+        nodes=np.array([[0.0, 0, 0], [0, 0, r]]),
+        ghosts=np.empty(0, np.int64),
+        mass=np.full(2, m),
+        cells=np.empty((0, 8), np.int64),
+        cell_kind=np.empty(0, np.uint8),
+        springs=np.array([[0, 1]]),
+        springs_owned=1,
+        rest_length=np.array([r]),
+        stiffness=np.array([k]),
+        pinned=np.array([True, False]),
+    )
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
+    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k r."""
+    m, k, r = 0.3, 40.0, 1.0
+    lattice = one_spring(m, k, r)
+    stepper = Stepper(COMM, lattice, T, find_preset(preset), error=1e-7)
+    x = before = r + 0.2
+    q = q_before = np.array([[0.0, 0, 0], [0, 0, x]])
+    for _ in range(10):
+        x, before = (m * (2 * x - before) + T**2 * k * r) / (m + T**2 * k), x
+        q, q_before = stepper.step(q, 2 * q - q_before, np.zeros((2, 3))).position, q
+        np.testing.assert_allclose(q[1], [0, 0, x], atol=1e-8)
+    stepper.destroy()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("error", [1e-2, 1e-4])
+def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
+    """The stated error is the true one of the step, |x - x*|_M / |x* - y|_M, within a factor of 3 where it was
+    estimated; where the bound did already, it may be further below."""
+    lattice = beam()
+    q = swing("newton", 3, error=1e-12)
+    q, before = q[-1].position, q[-2].position
+
+    def one_step(name: str, error: float):
+        stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
+        try:
+            return stepper.step(q, 2 * q - before, weight(lattice)), stepper.corrected
+        finally:
+            stepper.destroy()
+
+    result, estimated = one_step(preset, error)
+    exact = one_step("newton", 1e-12)[0].position
+    norm = lambda v: np.sqrt((v**2).sum(axis=1) @ lattice.mass)  # noqa: E731
+    true = norm(result.position - exact) / norm(exact - (2 * q - before))
+    assert true <= 1.5 * result.error and result.error <= error
+    assert not estimated or result.error <= 3 * true
+
+
+def test_too_loose_a_solve_is_told():
+    with pytest.raises(StepFailed, match="relative error .* try"):
+        swing("paper", 3, error=1e-9)
+
+
+def test_published_presets_take_ten_iterations_and_say_their_error():
+    for result in swing("fast-msm", 3):
+        # each iteration is one solve; the rest is CG that estimates the error
+        assert result.iterations == 10 and 10 < result.ksp_its <= 20 and 0 < result.error < 1
+
+
+def test_a_budget_is_kept_and_the_error_reported():
+    results = swing("anderson", 3, error=1e-12, max_iterations=4)
+    assert all(result.iterations <= 4 for result in results) and results[-1].error > 1e-12
+
+
+def test_a_budget_may_be_more_than_a_preset_allows_itself(petsc_options):
+    """A -snes_max_it of the user's stays what it is."""
+
+    def most(budget: int) -> int:
+        stepper = Stepper(COMM, beam(), T, find_preset("anderson"), max_iterations=budget)
+        found = stepper.snes.getTolerances()[3]
+        stepper.destroy()
+        return found
+
+    allowed = int(PRESETS["anderson"].options["snes_max_it"])
+    assert [most(budget) for budget in (1, allowed + 7)] == [allowed, allowed + 7]
+    petsc_options(snes_max_it="3")
+    assert most(allowed + 7) == 3
+
+
+def test_cg_and_cholesky_give_the_same_step(petsc_options):
+    direct = swing("fast-msm", 4, error=1e-10)[-1].position
+    petsc_options(ksp_type="cg", pc_type="icc", ksp_rtol="1e-12")
+    np.testing.assert_allclose(swing("fast-msm", 4, error=1e-10)[-1].position, direct, atol=1e-11)
+
+
+@pytest.fixture
+def petsc_options():
+    """Set options as the user would, and take them out again."""
+    from petsc4py import PETSc
+
+    database, names = PETSc.Options(), []
+
+    def set_options(**options: str) -> None:
+        for name, value in options.items():
+            database.setValue(name, value)
+            names.append(name)
+
+    yield set_options
+    for name in names:
+        database.delValue(name)
+
+
+@pytest.mark.parametrize(
+    ("preset", "options"),
+    [
+        ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),  # which takes no start for its solves
+        ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
+        ("ngmres", {"snes_type": "newtontr"}),
+    ],
+)
+def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: dict[str, str]):
+    petsc_options(**options)
+    assert all(result.error <= 1e-3 for result in swing(preset, 2, error=1e-3))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"snes_type": "shell"}, "PETSc cannot take a step with these options: .*SNESShellSetSolve"),
+        ({"snes_type": "python", "snes_python_type": "gone.Gone"}, "PETSc refuses its options: No module named 'gone'"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(petsc_options, options: dict[str, str], said: str):
+    petsc_options(**options)
+    with pytest.raises(InputError, match=said) as refused:
+        swing("newton", 1)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_fault_of_ours_within_petsc_is_no_bad_option():
+    """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own error."""
+    from petsc4py import PETSc
+
+    def fault(*_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), refusal("PETSc refuses"):
+        snes = PETSc.SNES().create(COMM)
+        x = PETSc.Vec().createMPI(2, comm=COMM)
+        snes.setFunction(fault, x.duplicate())
+        snes.solve(None, x)
+
+
+def test_a_preset_leaves_no_options_behind():
+    from petsc4py import PETSc
+
+    before = PETSc.Options().getAll()
+    for preset in PRESETS:
+        swing(preset, 1)
+    assert PETSc.Options().getAll() == before
+
+
+def test_pinned_nodes_do_not_move_and_are_no_unknowns(reference: list):
+    lattice = beam()
+    assert lattice.pinned.sum() == 9
+    for result in reference:
+        np.testing.assert_array_equal(result.position[lattice.pinned], lattice.nodes[lattice.pinned])
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
+    assert stepper.matrix.getSize()[0] == lattice.owned - 9
+    stepper.destroy()
+
+
+def test_A_is_M_plus_t2_L():
+    """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass without pins."""
+    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), 1000.0, young_modulus=2e5)
+    stepper = Stepper(COMM, lattice, T, find_preset("anderson"))
+    rows = np.arange(lattice.owned, dtype=np.int32)
+    A = stepper.matrix.getValues(rows, rows)
+    stepper.destroy()
+    dense = np.diag(lattice.mass)
+    for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
+        dense[[a, b], [a, b]] += T**2 * k
+        dense[[a, b], [b, a]] -= T**2 * k
+    np.testing.assert_allclose(A, dense, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(A.sum(axis=1), lattice.mass, rtol=1e-10)
+
+
+def test_a_plain_iteration_is_the_papers_global_step():
+    """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense here."""
+    lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), 1000.0, young_modulus=2e5)
+    lattice = replace(lattice, rest_length=0.95 * lattice.rest_length)
+    stepper = Stepper(COMM, lattice, T, find_preset("fast-msm"), max_iterations=1)
+    rows = np.arange(lattice.owned, dtype=np.int32)
+    A = stepper.matrix.getValues(rows, rows)
+    y = lattice.nodes
+    x = stepper.step(y, y, weight(lattice)).position
+    stepper.destroy()
+    along = y[lattice.springs[:, 0]] - y[lattice.springs[:, 1]]
+    d = lattice.rest_length[:, None] * along / np.linalg.norm(along, axis=1)[:, None]
+    Jd = np.zeros_like(y)
+    np.add.at(Jd, lattice.springs[:, 0], lattice.stiffness[:, None] * d)
+    np.add.at(Jd, lattice.springs[:, 1], -lattice.stiffness[:, None] * d)
+    b = T**2 * Jd + lattice.mass[:, None] * y + T**2 * weight(lattice)
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), atol=1e-12)
+
+
+def test_a_strut_that_buckles_under_its_load():
+    """A spring pressed to half by a load in balance with it: the only force left is across, with negative
+    curvature, and CG goes up. It must come to F = 0 all the same (which may be a saddle)."""
+    m, k, r, length = 0.3, 4000.0, 1.0, 0.5
+    lattice = one_spring(m, k, r)
+    load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
+    q = np.array([[0.0, 0, 0], [1e-3, 0, length]])
+    stepper = Stepper(COMM, lattice, T, replace(find_preset("newton"), extrapolate=False), error=1e-9)
+    x = stepper.step(q, q, load).position[1]
+    stepper.destroy()
+    stretch = np.linalg.norm(x) - r
+    F = m * (x - q[1]) + T**2 * (k * stretch * x / np.linalg.norm(x) - load[1])
+    assert np.linalg.norm(F) < 1e-8 * T**2 * k * r
+
+
+def test_a_body_pressed_to_half_still_gives_a_descent():
+    """Springs under compression make the true Hessian indefinite; newton must come through."""
+    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), 1000.0, young_modulus=2e6)
+    pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(size=lattice.nodes.shape)
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-6)
+    x = stepper.step(pressed, pressed, weight(lattice)).position
+    stepper.destroy()
+    g = np.zeros_like(x)
+    Elasticity(MPI.COMM_SELF, lattice).add_gradient(x, g)
+    F = lattice.mass[:, None] * (x - pressed) + T**2 * (g - weight(lattice))
+    away = np.sqrt(((x - pressed) ** 2).sum(axis=1) @ lattice.mass)
+    # the bound on the error, which was to be 1e-6: it may be too large by the root of H over M, 20 here
+    assert np.sqrt((F**2).sum(axis=1) @ (1 / lattice.mass)) <= 20 * 1e-6 * away
+    energy = Elasticity(MPI.COMM_SELF, lattice).energy
+    assert energy(x) < energy(pressed)
+
+
+def test_unknown_preset_names_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'newton'"):
+        find_preset("neuton")

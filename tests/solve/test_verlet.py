@@ -1,0 +1,366 @@
+"""The explicit integrator: against the leapfrog's closed forms, numpy's eigenvalues, implicit Euler, Coulomb's law."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import CELL, G, block_scene, play
+from mpi4py import MPI
+from test_lattice import block, cages_of
+from test_step import one_spring
+
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.frame import Frame
+from msmpetsc.model.initial_state import at_rest
+from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.output.reader import read_checkpoint
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.solve.integrators import verlet
+from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.verlet import Verlet
+from msmpetsc.solve.simulate import Simulation
+
+T = 1 / 60
+COMM = MPI.COMM_SELF
+EXPLICIT = {"integrator": "verlet"}
+
+
+def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
+    model = Model(None, lattice, None, [], [], [], [], at_rest(lattice))
+    return Verlet(COMM, model, Surroundings(model), Time(step=T, duration=1.0, substep=substep, **EXPLICIT), Solver())
+
+
+def fly(lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None) -> list[State]:
+    """States of a body that nothing acts on, at the start and after each step."""
+    stepper, states = integrator(lattice, substep), [State(q, q - T * v)]
+    try:
+        for index in range(1, steps + 1):
+            states.append(stepper.advance(states[-1], index * T)[1])
+    finally:
+        stepper.destroy()
+    return states
+
+
+def velocity(state: State) -> np.ndarray:
+    return (state.q - state.q_previous) / T
+
+
+def cube(**settings: float) -> Lattice:
+    """2 x 2 x 2 cells of 0.1 m."""
+    return build_lattice(cages_of(block(2, 2, 2), 0.1), 1000.0, **{"young_modulus": 2e4} | settings)
+
+
+def shaken(lattice: Lattice, size: float) -> np.ndarray:
+    return lattice.nodes + size * np.random.default_rng(5).normal(size=lattice.nodes.shape)
+
+
+# ---- closed forms
+
+
+def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
+    """x_n = cos(w n dt), v_n = -sin(w dt) / dt sin(w n dt) with w = 2 / dt asin(omega dt / 2), omega^2 = k / m."""
+    m, k, r, size, count = 0.3, 400.0, 1.0, 0.2, 4
+    dt = T / count
+    w = 2 / dt * np.arcsin(np.sqrt(k / m) * dt / 2)
+    start = np.array([[0, 0, 0], [0, 0, r + size]])
+    for n, state in enumerate(fly(one_spring(m, k, r), start, np.zeros((2, 3)), 50, substep=dt)):
+        assert state.q[1, 2] - r == pytest.approx(size * np.cos(w * n * T), abs=1e-12)
+        expected = -size * np.sin(w * dt) / dt * np.sin(w * n * T)
+        assert velocity(state)[1, 2] == pytest.approx(expected, abs=1e-10)
+
+
+def test_free_fall_is_exact(tmp_path: Path):
+    time = {"step": T, "duration": 30 * T} | EXPLICIT
+    model, frames = play(block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -G]}))
+    weight = G * model.lattice.mass.sum()
+    for frame in frames:
+        fallen = np.zeros_like(model.lattice.nodes) - [0, 0, 0.5 * G * frame.time**2]
+        np.testing.assert_allclose(frame.position - model.lattice.nodes, fallen, atol=1e-12)
+        np.testing.assert_allclose(frame.momentum, [0, 0, -weight * frame.time], atol=1e-10)
+        assert frame.step_error == frame.ksp_its == 0
+    assert all(frame.iterations > 1 for frame in frames[1:])
+
+
+def test_free_flight_keeps_momentum_and_angular_momentum():
+    """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit Euler does not."""
+    lattice = cube()
+    v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(size=lattice.nodes.shape)
+    states = fly(lattice, shaken(lattice, 0.01), v, 60)
+    m = lattice.mass
+    moments = np.array([(m @ velocity(s), m @ np.cross(s.q, velocity(s))) for s in states])
+    np.testing.assert_allclose(moments, np.broadcast_to(moments[0], moments.shape), atol=1e-11 * np.abs(moments).max())
+    assert np.abs(states[-1].q - states[0].q).max() > 0.1
+
+
+def test_order_two_in_the_substep():
+    """Of position and velocity at the end of a step."""
+    lattice = cube()
+    q, v = shaken(lattice, 0.005), np.zeros_like(lattice.nodes)
+    counts = np.array([8, 16, 32])
+    ends = [fly(lattice, q, v, 2, substep=T / n)[-1] for n in (*counts, 512)]
+    for of in (lambda state: state.q, velocity):
+        errors = [np.abs(of(end) - of(ends[-1])).max() for end in ends[:-1]]
+        assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
+
+
+# ---- a beam
+
+BEAM = {
+    "sides": CELL * np.array([8, 2, 2]),
+    "gravity": {"acceleration": [0, 0, -G]},
+    "pin": [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}],
+}
+
+
+def swing(folder: Path, step: float, duration: float, *overrides: str) -> tuple[Model, list[Frame]]:
+    scene = block_scene(folder, **BEAM, time={"step": step, "duration": duration})
+    return play(scene, *overrides)
+
+
+VERLET = 'time.integrator="verlet"'
+
+
+def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_path: Path):
+    def lost(frames: list[Frame]) -> tuple[float, float]:
+        """How far the energy is from the start's at the end and at most, of the greatest kinetic energy."""
+        total = np.array([f.kinetic + f.elastic + f.potential for f in frames])
+        away = np.abs(total - total[0]) / max(f.kinetic for f in frames)
+        return away[-1], away.max()
+
+    _, explicit = swing(tmp_path, T, 4.0, VERLET)
+    _, fine = swing(tmp_path, T, 4.0, VERLET, "time.substep=1e-3")  # of 8.3e-3: 1/70 of the square
+    _, implicit = swing(tmp_path, T, 0.5)
+    assert lost(implicit)[0] > 0.2
+    assert lost(explicit)[1] < 0.05 and lost(fine)[1] < 0.05 / 40
+    late = [f.kinetic for f in explicit if f.time > 3]
+    assert max(late) > 0.5 * max(f.kinetic for f in explicit)  # still swinging
+
+
+def test_implicit_euler_comes_to_it_with_first_order(tmp_path: Path):
+    duration, steps = 0.1, np.array([4e-3, 2e-3, 1e-3])
+    true = swing(tmp_path, duration / 5, duration, VERLET, "time.substep=1e-4")[1][-1].position
+    errors = [np.abs(swing(tmp_path, t, duration, "solver.error=1e-6")[1][-1].position - true).max() for t in steps]
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(1, abs=0.15)
+    coarse = swing(tmp_path, duration / 5, duration, VERLET)[1][-1].position
+    assert np.abs(coarse - true).max() < 0.2 * errors[-1]  # the longest stable substep against a millisecond
+
+
+# ---- the stability limit
+
+
+def greatest(lattice: Lattice, q: np.ndarray, projected: bool = False) -> float:
+    """Of M^(-1) (Hessian of E) over the free nodes, by numpy."""
+    elasticity, free = Elasticity(COMM, lattice), np.flatnonzero(~lattice.pinned)
+    H = np.empty((3 * len(free), 3 * len(free)))
+    for column in range(len(H)):
+        v, product = np.zeros_like(q), np.zeros_like(q)
+        v[free[column // 3], column % 3] = 1
+        elasticity.hessian_at(q, projected).add_product(v, product)
+        H[:, column] = product[free].ravel()
+    scale = 1 / np.sqrt(np.repeat(lattice.mass[free], 3))
+    return np.linalg.eigvalsh(scale[:, None] * H * scale)[-1]
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 10.0])
+@pytest.mark.parametrize("held", [False, True])
+def test_the_limit_is_that_of_the_greatest_eigenvalue(stiffening: float, held: bool):
+    lattice = cube(stiffening=stiffening)
+    if held:
+        lattice = lattice.pin(lattice.nodes[:, 0] < 1.01)
+    q = shaken(lattice, 0.02)
+    stepper = integrator(lattice)
+    stepper.position.values[:] = q
+    stepper._hold(0.0)
+    found, exact = stepper._elastic_squared(), greatest(lattice, q)
+    stepper.destroy()
+    assert 0.97 * exact < found <= greatest(lattice, q, projected=True) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(("share", "retries", "stable"), [(0.98, 0, True), (1.04, 0, False), (1.04, 2, True)])
+def test_it_fails_above_the_limit_and_not_below(monkeypatch, share: float, retries: int, stable: bool):
+    """With an estimate of omega that is wrong by so much that the substep is this share of the limit."""
+    lattice = cube(young_modulus=2e9)  # some hundred substeps: their whole number is near what was asked for
+    estimate = greatest(lattice, lattice.nodes) * (verlet.SAFETY / share) ** 2
+    monkeypatch.setattr(Verlet, "_elastic_squared", lambda _: estimate)
+    monkeypatch.setattr(verlet, "RETRIES", retries)
+    q = shaken(lattice, 1e-5)
+    if stable:
+        assert np.abs(fly(lattice, q, np.zeros_like(q), 20)[-1].q - lattice.nodes).max() < 1e-3
+    else:
+        with pytest.raises(StepFailed, match="became unstable: elastic energy .* try a smaller time.step"):
+            fly(lattice, q, np.zeros_like(q), 20)
+
+
+def test_a_substep_beyond_the_limit_is_shortened_and_a_shorter_one_kept(tmp_path: Path, caplog):
+    scene = block_scene(tmp_path, time={"step": T, "duration": 3 * T} | EXPLICIT)
+    counts = {s: [f.iterations for f in play(scene, f"time.substep={s}")[1][1:]] for s in (1.0, 1e-4)}
+    usual = [f.iterations for f in play(scene)[1][1:]]
+    assert counts[1.0] == usual and counts[1e-4] == [167] * 3
+    told = [record.getMessage() for record in caplog.records if "time.substep" in record.getMessage()]
+    assert len(told) == 1 and "beyond the stability limit" in told[0]
+
+
+def test_a_failure_names_the_frame_in_one_line(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(verlet, "SAFETY", 3.0)
+    monkeypatch.setattr(verlet, "RETRIES", 0)
+    scene = block_scene(tmp_path, **BEAM, time={"step": T, "duration": 1.0} | EXPLICIT)
+    with pytest.raises(StepFailed, match=r"^frame \d+ \(t = [^)]* s\) became unstable: [^\n]*$"):
+        play(scene)
+
+
+@pytest.mark.parametrize("response", ["reflect", "penalty"])
+def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Path, monkeypatch, response: str):
+    """A soft block of a stiffening law, thrown down: omega at the impact is some times that of the flight."""
+    floor = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": response}
+    material = {"young_modulus": 1e4, "density": 1000.0, "law": "stiffening"}
+    time = {"step": T, "duration": 0.4} | EXPLICIT
+    scene = block_scene(
+        tmp_path, time=time, material=material, gravity={"acceleration": [0, 0, -2 * G]}, obstacle=[floor],
+        cages={"cell_size": CELL / 2},
+    )  # fmt: skip
+    _, frames = play(scene)
+    energy = np.array([f.kinetic + f.elastic + f.potential + f.contact for f in frames])
+    steps = [f.iterations for f in frames[1:]]
+    assert max(steps) > 3 * steps[0]
+    assert np.abs(energy - energy[0]).max() < 0.15 * max(f.kinetic for f in frames)
+    monkeypatch.setattr(verlet, "RETRIES", 0)
+    with pytest.raises(StepFailed):
+        play(scene)
+
+
+# ---- obstacles
+
+
+def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp_path: Path):
+    left = {"box": [[-1, -1, -1], [0.01, 1, 1]]}
+    path = [{"time": 1.0, "by": [0, 0, 0.5]}]
+    anchors = [{"region": r, "path": path, "stop": 6.5 * T} for r in (left, {"box": [[0.1, -1, -1], [1, 1, 0.2]]})]
+    model, frames = play(block_scene(tmp_path, time={"step": T, "duration": 12 * T} | EXPLICIT, anchor=anchors))
+    led = model.lattice.nodes[:, 0] == 0
+    for frame in frames[:7]:
+        place = model.lattice.nodes[led] + [0, 0, 0.5 * frame.time]
+        np.testing.assert_allclose(frame.position[led], place, atol=1e-14)
+    np.testing.assert_allclose(frames[-1].momentum, frames[7].momentum, atol=1e-10)
+    assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)  # the rest sways
+
+
+def test_a_block_leaps_back_from_a_mirror(tmp_path: Path):
+    """Restitution 1: the body's middle goes up with most of its speed, the rest shakes the block."""
+    floor = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1]}
+    time = {"step": T, "duration": 16 * T} | EXPLICIT
+    _, frames = play(block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -G]}, obstacle=[floor]))
+    momentum = np.array([f.momentum[2] for f in frames])
+    energy = np.array([f.kinetic + f.elastic + f.potential for f in frames])
+    down = momentum.min()
+    np.testing.assert_allclose(energy, energy[0], rtol=0.05)
+    assert momentum.max() > -0.5 * down
+    assert min(f.position[:, 2].min() for f in frames) > -0.05 - 0.1 * CELL  # the way of a substep
+
+
+TILT = 0.3  # [rad] of the slope
+
+
+def on_a_slope(folder: Path, friction: float, **time) -> Path:
+    """A block on a plane, with gravity tilted."""
+    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": friction}
+    gravity = {"acceleration": [G * np.sin(TILT), 0, -G * np.cos(TILT)]}
+    return block_scene(folder, gravity=gravity, obstacle=[floor], time=time)
+
+
+def settled(folder: Path, friction: float) -> tuple[Path, State]:
+    """At rest on the slope, by implicit Euler, which damps."""
+    scene = on_a_slope(folder, friction, step=0.1, duration=5.0)
+    q = play(scene, "solver.error=1e-6", "output.every=1000")[1][-1].position
+    return scene, State(q, q)
+
+
+def go_on(scene: Path, state: State, steps: int) -> tuple[Model, list[Frame]]:
+    scene = load_scene(scene, (VERLET, f"time.step={T}", f"time.duration={steps * T}"))
+    model = build_model(COMM, scene)
+    with Simulation(COMM, scene, model) as simulation:
+        simulation.state = state
+        return model, list(simulation.frames())
+
+
+def test_a_block_sticks_to_a_slope_below_the_angle_of_friction(tmp_path: Path):
+    """Not a creep: half a second at rest, though the substep is no smaller than without friction."""
+    scene, state = settled(tmp_path, 2 * np.tan(TILT))
+    _, frames = go_on(scene, state, 30)
+    assert np.abs(frames[-1].position - state.q).max() < 1e-7
+
+
+def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
+    """p_x = m g sin t - mu (p_z + m g cos t), whatever the push does in between: it is p_z + m g cos t in all."""
+    mu, start = 0.5 * np.tan(TILT), settled(tmp_path, 0.5 * np.tan(TILT))[1]
+    scene = on_a_slope(tmp_path, mu, step=T, duration=1.0)
+    model, frames = go_on(scene, State(start.q, start.q), 30)
+    m, last = model.lattice.mass.sum(), frames[-1]
+    expected = m * G * np.sin(TILT) * last.time - mu * (last.momentum[2] + m * G * np.cos(TILT) * last.time)
+    assert last.momentum[0] == pytest.approx(expected, rel=1e-6)
+    assert last.momentum[0] == pytest.approx(m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6)
+
+
+def test_friction_on_what_moves_carries_it_along(tmp_path: Path):
+    """A belt that starts to run: the block comes to its speed at mu g, and no faster."""
+    mu, speed = 0.3, 0.5
+    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": mu}
+    belt = floor | {"path": [{"time": 10.0, "by": [10 * speed, 0, 0]}]}
+    scene = block_scene(
+        tmp_path, gravity={"acceleration": [0, 0, -G]}, obstacle=[belt], time={"step": T, "duration": 30 * T} | EXPLICIT
+    )
+    model, frames = play(scene)
+    v = np.array([f.momentum[0] for f in frames]) / model.lattice.mass.sum()
+    assert v.max() < 1.1 * speed and v[-1] == pytest.approx(speed, rel=0.1)
+
+
+# ---- ranks and the schema
+
+
+def test_two_ranks_give_the_same(tmp_path: Path, msmpetsc):
+    """With pins, anchors that let go, both kinds of obstacle, friction, and a law that stiffens."""
+    floor = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}
+    wall = {"shape": "plane", "point": [0.55, 0, 0], "normal": [-1, 0, 0], "path": [{"time": 0.1, "by": [-0.06, 0, 0]}]}
+    hold = {"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}, "path": [{"time": 0.1, "by": [0, 0, 0.05]}], "stop": 0.12}
+    scene = block_scene(
+        tmp_path,
+        time={"step": T, "duration": 12 * T} | EXPLICIT,
+        gravity={"acceleration": [3, 0, -G]},
+        obstacle=[floor, wall],
+        anchor=[hold],
+        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
+    )
+    files = []
+    for ranks in (1, 2):
+        done = msmpetsc(ranks, "run", scene, "-o", tmp_path / f"{ranks}.h5", "-log_view")  # no option of a solver
+        assert done.returncode == 0, done.stderr
+        files.append(h5py.File(tmp_path / f"{ranks}.h5"))
+    one, two = files
+    assert one["frames/contact"][:].max() > 0
+    np.testing.assert_array_equal(two["frames/iterations"], one["frames/iterations"])
+    np.testing.assert_allclose(two["frames/position"], one["frames/position"], atol=1e-9)
+    for mine, other in zip(read_checkpoint(two), read_checkpoint(one), strict=True):  # step, q, q_previous
+        np.testing.assert_allclose(mine, other, atol=1e-9)
+
+
+def test_petsc_options_of_a_solver_that_is_not_there_are_refused(tmp_path: Path, msmpetsc):
+    scene = block_scene(tmp_path, time={"step": T, "duration": T} | EXPLICIT)
+    done = msmpetsc(1, "run", scene, "-o", tmp_path / "x.h5", "-ksp_rtol", "1e-3")
+    assert done.returncode == 2 and "-ksp_rtol: no part of this run uses this PETSc option" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        ({"integrator": "leapfrog"}, 'time.integrator: unknown value "leapfrog", valid: implicit-euler, bdf2, verlet'),
+        ({"substep": 1e-4}, 'time.substep: is for integrator = "verlet" only'),
+        ({"substep": 0.0} | EXPLICIT, "time.substep: must be > 0"),
+    ],
+)
+def test_what_the_schema_refuses(tmp_path: Path, time: dict, message: str):
+    with pytest.raises(InputError, match=message):
+        load_scene(block_scene(tmp_path, time={"step": T, "duration": 1.0} | time))

@@ -1,0 +1,348 @@
+"""Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are stand-ins."""
+
+import csv
+import math
+import re
+import tomllib
+from logging import INFO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from mpi4py import MPI
+from scipy.spatial.transform import Rotation
+from study_stand_in import blank_frame
+from test_report import Balance, svgs, tooltips
+from test_report import case as row_of
+from test_report import write_table as write_rows
+from test_study import carry_out, stand_in, study_file  # noqa: F401 (stand_in is a fixture)
+
+from msmpetsc.cli.study import tell_of
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError
+from msmpetsc.output.writer import ResultFile
+from msmpetsc.study.case import shown_command
+from msmpetsc.study.charts.order import closed_form, order
+from msmpetsc.study.charts.stability import COLORS, LIMIT, MARKS, Scale, stability_charts, worded
+from msmpetsc.study.metrics import of_frames
+from msmpetsc.study.outcome import MEANING, OUTCOMES, counted, outcome
+from msmpetsc.study.reading import load_study
+from msmpetsc.study.report import write_report
+from msmpetsc.study.rows import read_rows, typed
+from msmpetsc.study.shape import distance_of_shapes
+from msmpetsc.study.sweep import cases
+from msmpetsc.study.table import COLUMNS, read_table
+
+METHODS = """
+[[method]]
+label = "newton"
+error = 1e-2
+options = "-pc_type icc"
+
+[[method]]
+label = "explicit"
+integrator = "verlet"
+"""
+X = 'x = { name = "time step", key = "time.step", unit = "s", values = [0.001, 5] }\n'
+CHANGES = '["material.density={value}", "gravity.acceleration=[0, 0, -{value}]"]'
+Y = f'y = {{ name = "density", template = {CHANGES}, values = [10, 20] }}\n'
+GRID = '[[map]]\nname = "g"\nfile = "scene.toml"\nsteps = 4\n'
+NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nsteps = 4\n'
+
+
+def all_cases(folder: Path, text: str) -> list:
+    return cases(load_study(study_file(folder, text)), folder, False)
+
+
+# The cases
+
+
+def test_a_map_is_each_method_at_each_place(tmp_path: Path):
+    found = all_cases(tmp_path, METHODS + GRID + X + Y)
+    assert [(one.label, one.place.x, one.place.y) for one in found] == [
+        (label, x, y) for y in (10.0, 20.0) for x in (0.001, 5.0) for label in ("newton", "explicit")
+    ]
+    assert len({one.id for one in found}) == 8
+    long = shown_command(found[2])  # a step longer than the scene
+    assert "material.density=10.0" in long and "gravity.acceleration=[0, 0, -10.0]" in long
+    assert "step = 5.0, duration = 20.0" in long and 'preset = "newton", error = 0.01' in long
+    assert long.endswith("-pc_type icc")
+    explicit = shown_command(found[1])
+    assert 'integrator = "verlet"' in explicit and "solver" not in explicit and "icc" not in explicit
+
+
+def test_a_duration_holds_as_many_steps_as_fit(tmp_path: Path):
+    text = METHODS + GRID.replace("steps = 4", "duration = 0.5") + X + Y
+    found = ["duration = 0.5" in shown_command(one) for one in all_cases(tmp_path, text)[:4]]
+    assert found == [True, True, False, False]
+
+
+def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
+    newton, explicit = all_cases(tmp_path, METHODS + NAMED + 'options = "-ksp_max_it 1"\nrecovers = true')
+    assert newton.options == "-pc_type icc -ksp_max_it 1" and explicit.options == ""
+    assert (newton.place.x, newton.place.y, newton.place.recovers) == ("newton", "a", True)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GRID + X + Y, ["method"]),
+        (METHODS + GRID + X, ["map.0", "needs x and y"]),
+        (METHODS + NAMED + '[[map.case]]\nname = "a"\nfile = "x"', ["map.0", "two cases", "'a'"]),
+        (METHODS + GRID + 'methods = ["newtom"]\n' + X + Y, ["map", "'newtom'", "'newton'"]),
+        (METHODS * 2 + GRID + X + Y, ["method", "two methods", "'newton'"]),
+        (METHODS + GRID + X.replace("key", "kez") + Y, ["map.0.x.kez", "'key'"]),
+        (METHODS + GRID + X + Y + "duration = 1", ["map.0.duration", "beside steps"]),
+        (METHODS + GRID + X + Y + '[[order]]\nscene = "b"', ["order", "'b'"]),
+    ],
+)
+def test_a_mistake_in_a_map_is_told(tmp_path: Path, text: str, words: list[str]):
+    with pytest.raises(InputError) as told:
+        load_study(study_file(tmp_path, text))
+    assert all(word in str(told.value) for word in words), str(told.value)
+
+
+def test_the_atlas_shipped_is_sound():
+    path = ROOT / "scenes" / "studies" / "stability.toml"
+    found = cases(load_study(path), path.parent, False)
+    assert 500 < len(found) < 1000 and {one.place.map for one in found if one.place} >= {"beam", "press", "cases"}
+
+
+# How a run is judged
+
+FINE = {"frames": 3, "shape_error": 0.0, "iterations": 30.0, "inverted": 0.0, "integrator": "implicit-euler"}
+
+
+@pytest.mark.parametrize(
+    ("status", "kind", "figures", "recovers", "expected"),
+    [
+        (0, "", {}, True, "ok"),
+        (0, "", {"inverted": None}, False, "ok"),
+        (0, "", {"iterations": 30.1}, False, "slow"),
+        (0, "", {"iterations": 300.0, "integrator": "verlet"}, False, "ok"),
+        (0, "", {"iterations": 31.0, "inverted": 1.0}, False, "inverted"),
+        (0, "", {"shape_error": 0.021, "inverted": 1.0}, True, "not recovered"),
+        (0, "", {"shape_error": 0.021}, False, "ok"),
+        (0, "", {"shape_error": None}, False, "not finite"),
+        (3, "iterations", {}, False, "diverged"),
+        (3, "line search", {}, False, "diverged"),
+        (3, "linear solve", {}, False, "diverged"),
+        (3, "unstable", {}, False, "diverged"),
+        (3, "", {}, False, "diverged"),
+        (3, "energy", {}, False, "energy"),
+        (3, "not finite", {"inverted": 1.0}, True, "not finite"),
+        (3, "refused", {}, False, "refused"),
+        (2, "", {}, False, "refused"),
+        (None, "", {}, False, "timeout"),
+        (1, "", {}, False, "crashed"),
+        (-11, "energy", {}, False, "crashed"),
+        (0, "", {"frames": None}, False, "crashed"),
+    ],
+)
+def test_the_worst_that_befell_a_run_is_its_outcome(status, kind, figures, recovers, expected):
+    assert outcome(status, kind, FINE | figures, recovers) == expected
+
+
+def test_every_outcome_has_a_meaning_a_colour_and_a_mark():
+    assert len(OUTCOMES) == len(set(COLORS.values())) == 10
+    assert set(OUTCOMES) == set(MEANING) == set(COLORS) == {*MARKS, "slow", "ok"}
+    assert len(set(MARKS.values())) == len(MARKS)
+
+
+def block(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform([0, 0, 0], [4, 2, 1], (50, 3)), rng.uniform(1, 3, 50)
+
+
+def test_a_rigid_motion_is_no_error_of_shape():
+    rest, mass = block()
+    moved = Rotation.from_rotvec([1, 2, -2]).apply(rest) + [5, -7, 100]
+    assert distance_of_shapes(moved, rest, mass) < 1e-12
+
+
+def test_the_error_of_a_swollen_body_by_hand():
+    """All grows by 10% about the centre of mass: a tenth of the root mean square distance from it."""
+    rest, mass = block()
+    centre = mass @ rest / mass.sum()
+    spread = math.sqrt(mass @ ((rest - centre) ** 2).sum(axis=1) / mass.sum())
+    expected = 0.1 * spread / np.ptp(rest, axis=0).max()
+    assert distance_of_shapes(1.1 * rest, rest, mass) == pytest.approx(expected)
+
+
+def test_a_mirrored_body_is_not_in_its_rest_shape():
+    """Mirrored through the thinnest side, at best: two masses at +-a along it are 2 a off."""
+    rest = np.array([[2.0, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.5], [0, 0, -0.5], [1, 0.5, 0.3]])
+    assert distance_of_shapes(rest * [1, 1, -1], rest, np.ones(7)) > 0.02
+
+
+def result(path: Path, shift: float, **series) -> Path:
+    rest, mass = block()
+    with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
+        file.write("lattice/nodes", rest)
+        file.write("lattice/mass", mass)
+        file.start_frames(4, len(rest))
+        for index in range(4):
+            values = {name: column[index] for name, column in series.items()}
+            file.append(blank_frame(index=index, time=0.1 * index, position=rest + shift * index, **values))
+    return path
+
+
+def test_figures_of_a_file_that_lacks_what_came_later(tmp_path: Path):
+    series = {"iterations": [0, 5, 9, 1], "kinetic": [4, 4, 2, 1], "elastic": [0, 0, 0, 2]}
+    row = of_frames(result(tmp_path / "x.h5", 3.0, **series), 0.1)
+    assert row["most_iterations"] == 9 and row["shape_error"] < 1e-12
+    assert row["energy_left"] == pytest.approx(3 / 4)
+
+
+def test_energy_is_not_compared_where_a_load_acts_and_a_number_that_is_none_has_no_shape(tmp_path: Path):
+    row = of_frames(result(tmp_path / "x.h5", math.nan, kinetic=[1] * 4, potential=[0, 0, 0, -1]), 0.1)
+    assert row["energy_left"] is None and row["shape_error"] is None
+
+
+# What is run and told
+
+
+def method(label: str, options: str = "") -> str:
+    return f'[[method]]\nlabel = "{label}"\noptions = "{options}"\n'
+
+
+def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noqa: F811
+    methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
+    text = "".join(method(*one) for one in methods.items()) + NAMED
+    rows = carry_out(tmp_path, text, jobs=2)
+    assert [(row["x"], row["outcome"], row["status"]) for row in rows] == [
+        ("good", "ok", "ok"),
+        ("bad", "energy", "failed"),
+        ("worse", "refused", "failed"),
+        ("worst", "crashed", "failed"),
+    ]
+    assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
+    assert counted(rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
+    with caplog.at_level(INFO, log.name):
+        tell_of(rows)
+    assert [record.levelno for record in caplog.records if "map n: 1 ok" in record.message] == [INFO]
+    assert not any("without figures" in record.message for record in caplog.records)
+    page = write_report(tmp_path / "out").read_text()
+    assert "Failed cases" not in page and "4: 1 ok, 1 energy, 1 refused, 1 crashed" in page
+
+
+def test_a_table_of_before_is_continued(tmp_path: Path, stand_in):  # noqa: F811
+    text = '[[scene]]\nname = "a"\nfile = "scene.toml"\n[[sweep]]\npresets = ["newton"]'
+    (before,) = carry_out(tmp_path, text)
+    table = tmp_path / "out" / "table.csv"
+    new = ("map", "x", "y", "outcome", "energy_left", "inverted")
+    kept = [index for index, name in enumerate(COLUMNS) if name not in new]
+    with open(table, newline="") as file:
+        records = [[record[index] for index in kept] for record in csv.reader(file)]
+    with open(table, "w", newline="") as file:
+        csv.writer(file).writerows(records)
+    (after,) = read_table(tmp_path / "out")
+    assert after | dict.fromkeys(new) == before | dict.fromkeys(new) and after["energy_left"] is None
+
+
+# The charts
+
+
+def place(label: str, x: float, y: float, outcome: str, **given) -> dict:
+    status = "ok" if outcome in OUTCOMES[-4:] else "failed"
+    return row_of(label, map="g", x=float(x), y=float(y), outcome=outcome, status=status, scene="g", **given)
+
+
+STUDY = """
+[[map]]
+name = "g"
+title = "A map"
+x = { name = "time step", key = "time.step", unit = "s", values = [1e-4, 1e-2, 1] }
+y = { name = "modulus", key = "m", unit = "Pa", values = [1e3, 1e5] }
+"""
+PLACES = [
+    place("newton", x, y, "ok" if x < 1 else "slow", iterations=4.2, explicit_limit=limit)
+    for y, limit in ((1e3, 1e-2), (1e5, 1e-3))
+    for x in (1e-4, 1e-2, 1)
+] + [
+    place("verlet", x, y, "ok" if x < 1 else "diverged", explicit_limit=limit, reason="" if x < 1 else "ran away")
+    for y, limit in ((1e3, 1e-2), (1e5, 1e-3))
+    for x in (1e-4, 1e-2, 1)
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = write_rows(tmp_path_factory.mktemp("atlas"), PLACES)
+    (folder / "study.toml").write_text(STUDY)
+    write_report(folder)
+    return folder
+
+
+def test_a_number_lies_between_its_neighbours_by_its_logarithm():
+    scale = Scale("t", ("0.0001", "0.01", "1.0"), ("", "", ""))
+    assert scale.at(1e-3) == pytest.approx(0.5) and scale.at(1.0) == pytest.approx(2)
+    assert scale.at(10 ** (-4.5)) == pytest.approx(-0.25)
+    assert scale.at(1e-8) is None and scale.at(100) is None
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"), [(0.2, "%", "20%"), (1e-5, "s", "10 µs"), (1e5, "Pa", "100 kPa"), (3, "", "3")]
+)
+def test_places_are_worded(value: float, unit: str, text: str):
+    assert worded(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
+
+
+def test_the_explicit_limit_crosses_the_map(folder: Path):
+    (chart,) = stability_charts(read_rows(folder), tomllib.loads(STUDY))
+    axes = chart.figure.axes[0]
+    (line,) = (line for line in axes.lines if line.get_label() == LIMIT)
+    drawn = [point for point in zip(*line.get_data()) if not math.isnan(point[0])]
+    # the cells of 1e-2 s lie around 1.5; 1e-3 s is half way between the first two, so at their common edge
+    assert np.allclose(drawn, [(1.5, 0), (1.5, 1), (1.0, 1), (1.0, 2)])
+
+
+def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
+    text = (folder / "report.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
+    assert Balance(text).open == [] and len(svgs(text)) == 1
+    tips = tooltips(text)
+    assert len(tips) == 12
+    assert any(tip.startswith("verlet\ntime step: 1 s\nmodulus: 100 kPa\noutcome: diverged\n") for tip in tips)
+    marks = re.findall(r"<text[^>]*>([^<]*)</text>", text)
+    assert marks.count("D") == 2 and marks.count("4") == 6
+    assert "Failed cases" not in text and "12: 8 ok, 2 slow, 2 diverged" in text
+
+
+def test_the_findings_say_where(folder: Path):
+    text = re.sub("<[^>]*>", "", (folder / "report.html").read_text()).replace("\N{NO-BREAK SPACE}", " ")
+    assert "newton: all 6 ok, 2 of them slowly." in text
+    assert "verlet: 4 of 6 ok, diverged in 2 (time step 1 s; modulus 1 kPa to 100 kPa)." in text
+
+
+def test_a_map_without_its_study_file_is_drawn(tmp_path: Path):
+    text = write_report(write_rows(tmp_path, PLACES)).read_text()
+    assert len(svgs(text)) == 1 and "0.0001" not in svgs(text)[0].get("aria-label")
+
+
+# The order in time
+
+
+def timed(step: float, error: float, **given) -> dict:
+    return typed(row_of("m", time_step=step, trajectory_error=error, **given))
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_the_slope_is_that_of_the_short_steps(power: int):
+    """The two longest steps are off the line."""
+    steps = [0.1, 0.05, 0.02, 0.01]
+    rows = [timed(step, (5 if step > 0.03 else 1) * step**power) for step in steps]
+    assert order(rows) == pytest.approx(power)
+    assert order(rows[:1]) is None
+
+
+def test_verlet_steps_by_its_substep():
+    rows = [timed(0.1, s**2, integrator="verlet", substep=s) for s in (1e-3, 5e-4)]
+    assert order(rows) == pytest.approx(2)
+
+
+def test_the_closed_form_of_what_implicit_euler_leaves():
+    """omega t = 1 and 4 steps: (1 + 1)^-4; and a quarter of the step has (1 + 1/16)^-16."""
+    rows = [timed(0.1, 0.1, steps=4), timed(0.025, 0.1, steps=16)]
+    t, left = closed_form(rows, 10 / (2 * math.pi))
+    assert left[-1] == pytest.approx(1 / 16) and left[0] == pytest.approx((17 / 16) ** -16)

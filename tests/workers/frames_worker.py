@@ -1,0 +1,119 @@
+"""Writes result files for test_frames.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
+
+import os
+import sys
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.errors import InputError
+from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.frame import Frame
+from msmpetsc.output import writer
+from msmpetsc.output.writer import ResultFile
+
+NODES, POINTS, STEPS = 23, 17, 9
+
+
+def positions(index: int, rows: int) -> np.ndarray:
+    """(rows, 3): values that tell frame, row and axis."""
+    return index + np.arange(3.0 * rows).reshape(rows, 3) / 1000
+
+
+def frame(index: int, nodes: slice = slice(None), points: slice | None = slice(None)) -> Frame:
+    """Frame `index` of a body of NODES nodes and POINTS surface points, the rows of one rank."""
+    surface = None if points is None else -positions(index, POINTS)[points]
+    numbers = dict(step_error=index / 7, iterations=index + 1, ksp_its=index + 2, wall_time=index / 3)
+    energies = dict(kinetic=index + 0.1, elastic=index + 0.2, potential=index + 0.3, contact=index + 0.4)
+    momentum = np.array([index, 1.0, 2.0])
+    position = positions(index, NODES)[nodes]
+    arrays = dict(position=position, surface=surface, momentum=momentum)
+    return Frame(index=index, time=index / 60, **arrays, **numbers, **energies)
+
+
+def share(rows: int) -> slice:
+    """This rank's rows; the last rank of several has none."""
+    size, rank = MPI.COMM_WORLD.size, MPI.COMM_WORLD.rank
+    cuts = np.linspace(0, rows, max(size - 1, 1) + 1).astype(int)
+    return slice(cuts[rank], cuts[rank + 1]) if rank < len(cuts) - 1 else slice(rows, rows)
+
+
+def write_all(path: str, gathers: bool = False) -> None:
+    writer.PIECE_BYTES, writer.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
+    nodes, points = share(NODES), share(POINTS)
+    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}) as file:
+        file.gathers = gathers
+        file.write("lattice/nodes", positions(0, NODES)[nodes])
+        file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
+        file.write("lattice/pinned", np.zeros(0, int))
+        file.start_frames(STEPS + 1, nodes.stop - nodes.start, points.stop - points.start)
+        for index in range(STEPS + 1):
+            file.append(frame(index, nodes, points))
+            file.write_checkpoint(
+                Saved(index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]})
+            )
+
+
+def write_forever(path: str) -> None:
+    """Prints each frame's index once it is stored, until killed."""
+    with ResultFile(path, MPI.COMM_WORLD, {}) as file:
+        file.start_frames(100_000, NODES, POINTS)
+        for index in range(100_000):
+            file.append(frame(index))
+            print(index, flush=True)
+            file.write_checkpoint(
+                Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+            )
+
+
+def refuse(path: str) -> None:
+    """Prints the InputError that each rank gets."""
+    try:
+        with ResultFile(path, MPI.COMM_WORLD, {}):
+            pass
+    except InputError as error:
+        sys.stdout.write(f"refused: {error}\n")
+
+
+def fill_disk(path: str, gathers: bool = True) -> None:
+    """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
+    in the midst of its rows."""
+    writer.PIECE_BYTES = 100
+    nodes = share(NODES)
+    store = writer.h5py.Dataset.__setitem__
+
+    def half(file: int, data: memoryview, place: int) -> int:
+        if MPI.COMM_WORLD.rank != 1:
+            return write(file, data, place)
+        if len(data) < 100:
+            raise OSError(28, "No space left on device")
+        return write(file, data[:100], place)
+
+    def full(dataset, key, value):
+        if dataset.name == "/frames/position":
+            raise OSError(28, "No space left on device")
+        store(dataset, key, value)
+
+    try:
+        with ResultFile(path, MPI.COMM_WORLD, {}) as file:
+            file.gathers = gathers
+            file.start_frames(STEPS + 1, nodes.stop - nodes.start)
+            for index in range(STEPS + 1):
+                if index == 2 and gathers:
+                    writer.h5py.Dataset.__setitem__ = full
+                elif index == 2:
+                    write, os.pwrite = os.pwrite, half
+                file.append(frame(index, nodes, None))
+    except InputError as error:
+        sys.stdout.write(f"refused: {error}\n")
+
+
+if __name__ == "__main__":
+    {
+        "all": write_all,
+        "gathered": lambda path: write_all(path, gathers=True),
+        "forever": write_forever,
+        "refuse": refuse,
+        "full": fill_disk,
+        "full for one": lambda path: fill_disk(path, gathers=False),
+    }[sys.argv[1]](sys.argv[2])

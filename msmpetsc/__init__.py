@@ -15,7 +15,7 @@ def _kernel_folder() -> Path:
     """
     here = Path(__file__).parent
     sources = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
-    kernels = b"".join(source for source in sources if b"njit" in source or b"@each" in source)
+    kernels = b"".join(source for source in sources if b"njit" in source or b"@kernel" in source)
     return here / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
 
 

@@ -29,7 +29,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend import arrays, cuda
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.profile import machine, versions
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.to_device import placed
@@ -120,7 +120,7 @@ def compared(args: argparse.Namespace, folder: Path) -> Iterator[dict]:
 # ---- parts
 
 
-@each
+@kernel
 def laplacian_around(first, count, step, v, other, stiffness, product):
     """L v by a kernel of our own: what cuSPARSE's product with a block of three columns is held against."""
     for i in range(first, count, step):
@@ -136,7 +136,7 @@ def laplacian_around(first, count, step, v, other, stiffness, product):
         product[i, 0], product[i, 1], product[i, 2] = x, y, z
 
 
-@each
+@kernel
 def nothing(first, count, step, array, a, b, c, d, x, y, z):
     """With about as many arguments as others have, for each takes its time."""
     for i in range(first, count, step):
@@ -184,7 +184,7 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
         "CG iteration": iteration(stepper),
         "bound of one": bound(model) / bandwidth(q),
     }
-    if not arrays.is_here(q):
+    if not arrays.on_host(q):
         around = elasticity.springs
         tables = around.other, around.stiffness
         found["A, by a kernel"] = seconds_of(lambda: laplacian_around(len(q), q, *tables, gradient))
@@ -239,17 +239,17 @@ def launches(positions: np.ndarray) -> dict[str, float]:
     def launch() -> None:
         nothing(len(array), *[array] * 5, 0.0, 0, False)
 
-    alone, transfer = seconds_of(launch, 1000), seconds_of(lambda: arrays.fetch(positions))
+    alone, transfer = seconds_of(launch, 1000), seconds_of(lambda: arrays.to_host(positions))
     return {"a launch": alone, "a launch in a graph": in_a_graph(launch, 100), "a transfer": transfer}
 
 
 @contextmanager
 def counting() -> Iterator[dict]:
     """How many kernels of ours are launched, and how often and how much is carried, while this lasts."""
-    from msmpetsc.backend import launcher
+    from msmpetsc.backend import launcher as launching
 
     told = {"launches": 0, "to the CPU": 0, "bytes to the CPU": 0, "to the GPU": 0, "bytes to the GPU": 0}
-    launcher, fetch, beside = launcher.launcher, arrays.fetch, arrays.beside
+    launcher, to_host, like = launching.launcher, arrays.to_host, arrays.like
 
     def counted_launcher(body):
         launch = launcher(body)
@@ -260,23 +260,23 @@ def counting() -> Iterator[dict]:
 
         return counted
 
-    def counted_fetch(array):
-        if not arrays.is_here(array):
+    def counted_to_host(array):
+        if not arrays.on_host(array):
             told["to the CPU"] += 1
             told["bytes to the CPU"] += array.nbytes
-        return fetch(array)
+        return to_host(array)
 
-    def counted_beside(array, values):
-        if arrays.is_here(values) and not arrays.is_here(array):
+    def counted_like(array, values):
+        if arrays.on_host(values) and not arrays.on_host(array):
             told["to the GPU"] += 1
             told["bytes to the GPU"] += values.nbytes
-        return beside(array, values)
+        return like(array, values)
 
     ours = [module for name, module in sys.modules.items() if name.startswith("msmpetsc.")]
     counted = {
         "launcher": (launcher, counted_launcher),
-        "fetch": (fetch, counted_fetch),
-        "beside": (beside, counted_beside),
+        "to_host": (to_host, counted_to_host),
+        "like": (like, counted_like),
     }
     places = [(m, name, *pair) for m in ours for name, pair in counted.items() if vars(m).get(name) is pair[0]]
     for module, name, _, replacement in places:

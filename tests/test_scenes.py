@@ -194,11 +194,11 @@ def test_pressed_to_30_percent_the_linear_law_inverts_cells_for_good_and_the_sti
 def test_the_heart_follows_the_pull_and_returns(result):
     run = result("heart_pull")
     (anchor,) = run.scene.anchor
-    led, held = run.region(anchor), np.searchsorted(run.time, anchor.stop - 1e-9)
+    prescribed, held = run.region(anchor), np.searchsorted(run.time, anchor.stop - 1e-9)
     pull = np.linalg.norm(anchor.path[-1].by)
-    away = run.q[held - 1][led] - run.nodes[led]
+    away = run.q[held - 1][prescribed] - run.nodes[prescribed]
     np.testing.assert_allclose(away, np.broadcast_to(anchor.path[-1].by, away.shape), atol=1e-12)
-    assert np.linalg.norm(run.q[held][led] - run.q[held - 1][led], axis=1).min() > 0.1 * pull  # let go
+    assert np.linalg.norm(run.q[held][prescribed] - run.q[held - 1][prescribed], axis=1).min() > 0.1 * pull  # let go
     assert np.linalg.norm(run.q[-1] - run.nodes, axis=1).max() < 0.01 * pull
     assert run.inverted(held - 1) == 0
 

@@ -5,12 +5,12 @@ from functools import wraps
 
 import numba
 
-from msmpetsc.backend.arrays import is_here
+from msmpetsc.backend.arrays import on_host
 
 
-def each(body: Callable[..., None]) -> Callable[..., None]:
+def kernel(body: Callable[..., None]) -> Callable[..., None]:
     """``body(first, count, step, *arguments)``, which does something for every i in range(first, count, step), as
-    ``each(body)(count, *arguments)``, which does it for all i below a count, in any order.
+    ``kernel(body)(count, *arguments)``, which does it for all i below a count, in any order.
 
     The first argument is an array, whose type tells where. What the body calls is compiled by numba.njit and takes
     its roots from ``math``; no two indices write to the same place. The loop stands in the body, and not here, so
@@ -20,7 +20,7 @@ def each(body: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(body)
     def everywhere(count, *arguments):
-        if is_here(arguments[0]):
+        if on_host(arguments[0]):
             compiled(0, count, 1, *arguments)
         else:
             from msmpetsc.backend.launcher import launcher  # and CuPy: a CPU's run needs neither

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 
 from msmpetsc import __version__
-from msmpetsc.backend.arrays import is_here
+from msmpetsc.backend.arrays import on_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 
@@ -42,7 +42,7 @@ class Cost:
         from msmpetsc.solve.integrators.stability_limit import explicit_limit
 
         comm, simulation = self.comm, self.simulation
-        device = "cpu" if is_here(simulation.model.lattice.nodes) else "cuda"
+        device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
         told = {"machine": machine(), "device": device, "versions": versions(), "ranks": comm.size}
         told |= {"command": shlex.join(["msmpetsc", *sys.argv[1:]]), **self.counts}
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}

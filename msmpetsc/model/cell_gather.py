@@ -10,8 +10,8 @@ from functools import partial
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import beside, fetch
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.inversion import (
     FRAMES,
     cofactors,
@@ -50,14 +50,14 @@ class CellsAround:
     @classmethod
     def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellsAround":
         """Beside the lattice's nodes."""
-        nodes, owned = fetch(lattice.local_cells).ravel(), lattice.owned
+        nodes, owned = to_host(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")
         by_node = by_node[: np.searchsorted(nodes[by_node], owned)]
         node = nodes[by_node]
         slot = np.arange(len(node)) - np.searchsorted(node, node)
         around, corner = np.full((8, owned), -1, np.int32), np.zeros((8, owned), np.uint8)
         around[slot, node], corner[slot, node] = by_node // 8, by_node % 8
-        resistance, around, corner = (beside(lattice.nodes, a) for a in (resistance, around, corner))
+        resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
 
     def energy(self, q: np.ndarray) -> float:
@@ -92,7 +92,7 @@ def share_of(role, vectors):
     return b if role == 2 else c
 
 
-@each
+@kernel
 def slope_around(first, count, step, q, cells, resistance, volume, around, corner, gradient):
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
@@ -116,7 +116,7 @@ def slope_around(first, count, step, q, cells, resistance, volume, around, corne
         gradient[i, 2] += gz
 
 
-@each
+@kernel
 def turn_around(first, count, step, q, cells, resistance, volume, around, corner, projected, v, product):
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0

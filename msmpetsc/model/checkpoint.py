@@ -15,7 +15,7 @@ from msmpetsc.errors import InputError
 
 
 @dataclass
-class Saved:
+class Checkpoint:
     """After ``step`` steps. Empty, it is what a run begins with.
 
     rows    : by name, what there is of each node, this rank's owned ones: (owned, 3) or (owned,); q and q_previous
@@ -44,7 +44,7 @@ class Saved:
         """A whole number, 0 if there is none. Raises InputError likewise."""
         return int(self.number(name, 0, 0, most))
 
-    def refuse_rows_unlike(self, comm: MPI.Comm, like: "Saved") -> None:
+    def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
         """Raise InputError for rows that are not of the shape of those in ``like``, or not finite (collective)."""
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():

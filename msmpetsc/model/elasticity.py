@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import is_here
+from msmpetsc.backend.arrays import on_host
 from msmpetsc.model.cell_gather import CellsAround
 from msmpetsc.model.inversion import (
     add_resistance_gradient,
@@ -43,10 +43,10 @@ class Elasticity:
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.owned = lattice.owned
-        self.springs, self.cells = (Springs if is_here(lattice.nodes) else Neighbours).of(lattice), None
+        self.springs, self.cells = (Springs if on_host(lattice.nodes) else Neighbours).of(lattice), None
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
-            kind = Cells if is_here(lattice.nodes) else CellsAround
+            kind = Cells if on_host(lattice.nodes) else CellsAround
             self.cells = kind.of(lattice, RESISTANCE * resistance, ONSET * volume)
         self.parts = [part for part in (self.springs, self.cells) if part]
 

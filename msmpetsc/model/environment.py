@@ -5,14 +5,14 @@ from itertools import compress
 
 import numpy as np
 
-from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle, depths
-from msmpetsc.model.contact.penalty import Contact, Penalty, Press, rub
+from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 
 
-class Surroundings:
+class Environment:
     """Of one model. An implicit step asks once for its end, an explicit one in each substep.
 
     Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
@@ -39,21 +39,21 @@ class Surroundings:
                 self._load += load.force
         return self._load
 
-    def held_at(self, time: float) -> list[Anchor]:
+    def anchors_at(self, time: float) -> list[Anchor]:
         """The anchors that have not let go."""
         return [anchor for anchor in self.anchors if anchor.holds_at(time)]
 
-    def pinned_at(self, time: float) -> np.ndarray:
+    def fixed_at(self, time: float) -> np.ndarray:
         """(l,) bool: the nodes that are no unknowns, pinned or held by an anchor."""
-        return reduce(np.logical_or, (anchor.where for anchor in self.held_at(time)), self.lattice.pinned)
+        return reduce(np.logical_or, (anchor.where for anchor in self.anchors_at(time)), self.lattice.pinned)
 
-    def led(self, q: np.ndarray, time: float) -> np.ndarray | None:
+    def prescribed(self, q: np.ndarray, time: float) -> np.ndarray | None:
         """q with the anchored nodes where they will be; None if there are none."""
-        held = self.held_at(time)
+        held = self.anchors_at(time)
         if not held:
             return None
         for anchor in held:
-            place = self.lattice.nodes + beside(q, anchor.path.at(time))
+            place = self.lattice.nodes + like(q, anchor.path.at(time))
             q = np.where(anchor.where[:, None], place, q)
         return q
 
@@ -97,10 +97,10 @@ class Surroundings:
         presses = self._presses(time, sides)
         return Contact(presses, self.lattice.owned) if presses else None
 
-    def _presses(self, time: float, sides: np.ndarray) -> list[Press]:
+    def _presses(self, time: float, sides: np.ndarray) -> list[ContactState]:
         return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
-    def rub(
+    def apply_friction(
         self,
         q: np.ndarray,
         v: np.ndarray,
@@ -120,8 +120,8 @@ class Surroundings:
         for p, side in self._pressing(time, sides):
             if p.friction > 0:
                 path = p.obstacle.path
-                carried = beside(q, (path.at(end) - path.at(begin)) / (end - begin))
-                rub(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
+                carried = like(q, (path.at(end) - path.at(begin)) / (end - begin))
+                apply_friction(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
 
     def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray) -> np.ndarray:
         """(owned,) [N/m]: no less than what obstacles add to a node's stiffness from start to ``time``.
@@ -146,7 +146,7 @@ class Surroundings:
             way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
             if way.any():
                 inside, face = p.at(time, side).depths(q)
-                along = beside(q, fetch(p.obstacle.normals) @ way)[face]
+                along = like(q, to_host(p.obstacle.normals) @ way)[face]
                 power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
         return power
 
@@ -231,4 +231,4 @@ class Surroundings:
             return 0.0
         way = obstacle.path.at(time) - obstacle.path.at(time - time_step)
         mass = self.lattice.mass
-        return float(fetch(mass @ change[: len(mass)]) @ way) / time_step**2
+        return float(to_host(mass @ change[: len(mass)]) @ way) / time_step**2

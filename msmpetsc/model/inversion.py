@@ -12,7 +12,7 @@ what one corner does is a function of its own (a GPU's loops are in model.cell_g
 import numba
 import numpy as np
 
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.kernel import kernel
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
 FRAMES = np.array(
@@ -147,13 +147,13 @@ def least_volume(q: np.ndarray, c: np.ndarray) -> float:
     return min(volume, _volume(x2, y2, z0), _volume(x2, y3, z1), _volume(x3, y3, z2), _volume(x3, y2, z3))
 
 
-@each
+@kernel
 def _least_volume_of(first, count, step, q, cells, least):
     for i in range(first, count, step):
         least[i] = least_volume(q, cells[i])
 
 
-@each
+@kernel
 def _energy_of(first, count, step, q, cells, resistance, least, parts):
     for i in range(first, count, step):
         energy = 0.0
@@ -164,7 +164,7 @@ def _energy_of(first, count, step, q, cells, resistance, least, parts):
         parts[i] = energy
 
 
-@each
+@kernel
 def _change_of(first, count, step, q, base, cells, resistance, least, parts):
     for i in range(first, count, step):
         change = 0.0

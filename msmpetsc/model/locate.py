@@ -3,18 +3,18 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import fetch
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.model.inversion import inverted_cells
 from msmpetsc.model.lattice import Lattice
 
 
 def place_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray, measure: np.ndarray) -> str:
     """The node among the local ``rows`` (k,) where ``measure`` (k,) is greatest, or not a number (collective)."""
-    rows, measure = fetch(rows), np.nan_to_num(fetch(measure), nan=np.inf)
+    rows, measure = to_host(rows), np.nan_to_num(to_host(measure), nan=np.inf)
     best = int(np.argmax(measure)) if len(rows) else 0
     told = (-1.0, 0, None)
     if len(rows):
-        told = measure[best], lattice.global_numbers[rows[best]], fetch(lattice.nodes[int(rows[best])])
+        told = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
     _, number, place = max(comm.allgather(told), key=lambda one: one[0])
     return f"node {number}, {at_rest(place)}"
 
@@ -26,7 +26,7 @@ def inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int, str]
     total = comm.allreduce(count)
     if not total:
         return 0, ""
-    place = fetch(lattice.nodes[cells[worst]].mean(axis=0)) if worst >= 0 else None
+    place = to_host(lattice.nodes[cells[worst]].mean(axis=0)) if worst >= 0 else None
     return total, at_rest(min(comm.allgather((least, place)), key=lambda one: one[0])[1])
 
 

@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from msmpetsc.backend.arrays import beside, fetch
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.springs import block_product, spring_block, spring_change, spring_energy, spring_pull
 
@@ -37,18 +37,18 @@ class Neighbours:
     @classmethod
     def of(cls, lattice: Lattice) -> "Neighbours":
         """Beside the lattice's nodes."""
-        springs, owned = fetch(lattice.springs), lattice.owned
+        springs, owned = to_host(lattice.springs), lattice.owned
         ends = np.concatenate([springs, springs[:, ::-1]])
         by_node = np.argsort(ends[:, 0], kind="stable")
         by_node = by_node[: np.searchsorted(ends[by_node, 0], owned)]
         node, spring = ends[by_node, 0], by_node % max(len(springs), 1)
         slot = np.arange(len(node)) - np.searchsorted(node, node)
-        lengths, kind = np.unique(fetch(lattice.rest_length), return_inverse=True)
+        lengths, kind = np.unique(to_host(lattice.rest_length), return_inverse=True)
         shape = (int(slot.max(initial=0)) + 1, owned)
         other, kinds, stiffness = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape)
         other[slot, node], kinds[slot, node] = ends[by_node, 1], kind[spring]
-        stiffness[slot, node] = fetch(lattice.stiffness)[spring]
-        return cls(*(beside(lattice.nodes, a) for a in (other, kinds, stiffness, lengths)), lattice.stiffening)
+        stiffness[slot, node] = to_host(lattice.stiffness)[spring]
+        return cls(*(like(lattice.nodes, a) for a in (other, kinds, stiffness, lengths)), lattice.stiffening)
 
     @property
     def all(self) -> tuple:
@@ -79,7 +79,7 @@ class Neighbours:
         return partial(product_around, self.other.shape[1], q.copy(), *self.all, projected)
 
 
-@each
+@kernel
 def energy_around(first, count, step, q, other, kind, stiffness, lengths, stiffening, parts):
     for i in range(first, count, step):
         energy = 0.0
@@ -92,7 +92,7 @@ def energy_around(first, count, step, q, other, kind, stiffness, lengths, stiffe
         parts[i] = 0.5 * energy
 
 
-@each
+@kernel
 def change_around(first, count, step, q, base, other, kind, stiffness, lengths, stiffening, parts):
     for i in range(first, count, step):
         mx, my, mz = q[i, 0] - base[i, 0], q[i, 1] - base[i, 1], q[i, 2] - base[i, 2]
@@ -107,7 +107,7 @@ def change_around(first, count, step, q, base, other, kind, stiffness, lengths, 
         parts[i] = 0.5 * change
 
 
-@each
+@kernel
 def gradient_around(first, count, step, q, other, kind, stiffness, lengths, stiffening, gradient):
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
@@ -125,7 +125,7 @@ def gradient_around(first, count, step, q, other, kind, stiffness, lengths, stif
         gradient[i, 2] += gz
 
 
-@each
+@kernel
 def concavity_around(first, count, step, q, other, kind, stiffness, lengths, stiffening, concavity):
     for i in range(first, count, step):
         total = 0.0
@@ -138,7 +138,7 @@ def concavity_around(first, count, step, q, other, kind, stiffness, lengths, sti
         concavity[i] += total
 
 
-@each
+@kernel
 def product_around(first, count, step, q, other, kind, stiffness, lengths, stiffening, projected, v, product):
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.output.reader import checked_dataset, damage_told, finished, open_result
 from msmpetsc.output.writer import ResultFile, open_again, refuse_small_disk
 
@@ -74,6 +74,6 @@ class Anew(ResultFile):
                     self._file["frames"][name][index] = row
         self.finished = self._frames
 
-    def _take_over(self, saved: Saved | None) -> None:
+    def _take_over(self, saved: Checkpoint | None) -> None:
         if saved is not None:
             self.write_checkpoint(saved)

@@ -9,7 +9,7 @@ import numpy as np
 
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.output.reader import (
     Result,
     checked_checkpoint,
@@ -62,7 +62,7 @@ def refuse_other_series(path: Path, file: h5py.File) -> None:
                     raise InputError(f"{path} is damaged: frames/{name} has shape {dataset.shape}")
 
 
-def read_saved(comm, path: Path, owned: int) -> Saved | None:
+def read_saved(comm, path: Path, owned: int) -> Checkpoint | None:
     """The last checkpoint, this rank's rows of it; None if there is none (collective).
 
     owned : nodes of this rank; the ranks' follow each other
@@ -75,7 +75,7 @@ def read_saved(comm, path: Path, owned: int) -> Saved | None:
         rows = {name: source.rows(f"checkpoint/{name}", owned, slot) for name in source.row_names()}
         names, numbers = source.names(), source.value("checkpoint/numbers")
         numbers = numbers[slot].tolist() if names else []
-        return Saved(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
+        return Checkpoint(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
 
 
 def refuse_other_lattice(comm, path: Path, found: dict[str, np.ndarray]) -> None:

@@ -32,7 +32,7 @@ import numpy as np
 
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.frame import Frame
 from msmpetsc.output.direct import chunk_places, reach, write_rows
 from msmpetsc.output.reader import FORMAT, FORMAT_VERSION, finished, open_result, read_checkpoint  # noqa: F401
@@ -132,7 +132,7 @@ class ResultFile:
         nodes: int,
         surface_points: int | None = None,
         surface_dtype: str = "f4",
-        saved: Saved | None = None,
+        saved: Checkpoint | None = None,
     ) -> None:
         """Plan `count` frames, frame 0 included, of this rank's `nodes` and `surface_points` (None: not stored), and
         checkpoints like this one; of q and q_previous alone if None."""
@@ -171,7 +171,7 @@ class ResultFile:
                 self._file.flush()
         self.finished += 1
 
-    def write_checkpoint(self, saved: Saved) -> None:
+    def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
         if (saved.rows.keys(), list(saved.numbers)) != (self._rows.keys(), self._numbers):
             raise ValueError(f"planned were checkpoints of {list(self._rows)} and {self._numbers}")
@@ -290,7 +290,7 @@ class ResultFile:
             self._failed = True
             raise
 
-    def _take_over(self, _: Saved | None) -> None:
+    def _take_over(self, _: Checkpoint | None) -> None:
         """Nothing was there before."""
 
     def _check(self, frame: Frame) -> None:

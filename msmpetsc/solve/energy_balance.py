@@ -22,9 +22,9 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import inside_out, place_of_greatest
 from msmpetsc.solve.integrators.state import State
@@ -77,12 +77,12 @@ class EnergyBalance:
         self,
         comm: MPI.Comm,
         lattice: Lattice,
-        surroundings: Surroundings,
+        environment: Environment,
         elasticity: Elasticity,
         swings: bool = False,
     ):
         self.credit = CREDIT if swings else 0.0
-        self.comm, self.lattice, self.around, self.elasticity = comm, lattice, surroundings, elasticity
+        self.comm, self.lattice, self.around, self.elasticity = comm, lattice, environment, elasticity
         self.ledger, self.known = Ledger(), None
         springs = slice(lattice.springs_owned)
         self.floor = FLOOR * comm.allreduce(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
@@ -92,7 +92,7 @@ class EnergyBalance:
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
         at, contact, v = q[owned], around.push(time, sides), v[owned]
-        momenta, free = lattice.mass[:, None] * v, ~around.pinned_at(time)[owned]
+        momenta, free = lattice.mass[:, None] * v, ~around.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
             0.5 * np.vdot(momenta * free[:, None], v),
@@ -139,10 +139,10 @@ class EnergyBalance:
         """The step is taken."""
         self.known, self.ledger = (after.q, ended.elastic), ledger
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         saved.numbers |= vars(self.ledger)
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         most = np.finfo(float).max
         self.ledger = Ledger(**{name: saved.number(name, 0.0, -most, most) for name in vars(Ledger())})
 
@@ -158,9 +158,9 @@ class EnergyBalance:
         drag, and that which the step counted itself; and its swing [J] (collective)."""
         lattice, around = self.lattice, self.around
         owned = slice(lattice.owned)
-        led = around.led(before.q, time)
-        q, v = before.q if led is None else led, before.velocity(time_step)[owned]
-        free = ~around.pinned_at(time)[owned]
+        prescribed = around.prescribed(before.q, time)
+        q, v = before.q if prescribed is None else prescribed, before.velocity(time_step)[owned]
+        free = ~around.fixed_at(time)[owned]
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = around.push(when, sides)
         sides = around.no_sides if sides is None else sides

@@ -5,9 +5,9 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.overlap import overlap
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import inverted
 from msmpetsc.solve.energy_balance import MUCH, Ledger
@@ -52,11 +52,11 @@ class Watch:
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
-    def overlaps(self, index: int, around: Surroundings, q: np.ndarray, time: float, time_step: float) -> None:
+    def overlaps(self, index: int, around: Environment, q: np.ndarray, time: float, time_step: float) -> None:
         """Where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
         new = [o for o in around.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
-            found = overlap(self.comm, self.lattice, obstacle, q, around.pinned_at(time), time)
+            found = overlap(self.comm, self.lattice, obstacle, q, around.fixed_at(time), time)
             if found:
                 log.warning(
                     "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",
@@ -75,12 +75,12 @@ class Watch:
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         saved.numbers |= {"frames_inverted": self.frames, "most_inverted": self.most, "now_inverted": self.now}
         saved.numbers |= {"frames_far": self.far, "worst_error": self.worst_error}
         saved.numbers |= {"frames_gaining": self.gaining, "worst_gain": self.worst_gain}
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")
         self.frames, self.most, self.now, self.far, self.gaining = (saved.count(name) for name in names)
         self.worst_error, self.worst_gain = (saved.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain"))

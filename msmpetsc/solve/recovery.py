@@ -8,8 +8,8 @@ from mpi4py import MPI
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Saved
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.environment import Environment
 from msmpetsc.scene import schema as scene
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.state import State
@@ -46,8 +46,8 @@ class Rescue:
     attempt : (integrator, state, time, time step) -> result and state of a step that ends at ``time``, or StepFailed
     """
 
-    def __init__(self, comm: MPI.Comm, model: Model, surroundings: Surroundings, wanted: scene.Scene, attempt: Attempt):
-        self.comm, self.model, self.around, self.scene, self.attempt = comm, model, surroundings, wanted, attempt
+    def __init__(self, comm: MPI.Comm, model: Model, environment: Environment, wanted: scene.Scene, attempt: Attempt):
+        self.comm, self.model, self.around, self.scene, self.attempt = comm, model, environment, wanted, attempt
         self.on_failure, self.time_step = wanted.safety.on_failure, wanted.time.step
         self.spare: dict[int, ImplicitEuler | Verlet] = {}  # by how often the step is halved
         self.rescued = 0  # steps
@@ -82,10 +82,10 @@ class Rescue:
         result = replace(result, error=done.error, iterations=done.iterations, ksp_its=done.ksp_its)
         return result, after, done
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         saved.numbers |= {"level": self.level, "rescued": self.rescued}
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         if self.on_failure == "substep":
             self.level = saved.count("level", DEEPEST)
         if self.on_failure != "stop":  # else it was another scene that asked for it

@@ -7,13 +7,13 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import fetch
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.to_device import placed
 from msmpetsc.scene.schema import Scene
@@ -93,16 +93,16 @@ class Simulation:
         model = placed(model, sender(comm))
         self.comm, self.model, self.time_step = comm, model, scene.time.step
         self.steps, self.every, self.measured, self.trace = scene.time.steps, scene.output.every, measured, None
-        self.surroundings, self.elasticity = Surroundings(model), Elasticity(comm, model.lattice)
+        self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
         integrator = INTEGRATORS[scene.time.integrator]
-        self.integrator = integrator(comm, model, self.surroundings, scene.time, scene.solver, measured)
+        self.integrator = integrator(comm, model, self.environment, scene.time, scene.solver, measured)
         swings = scene.time.integrator != "implicit-euler"
-        self.balance = EnergyBalance(comm, model.lattice, self.surroundings, self.elasticity, swings)
-        self.rescue = Rescue(comm, model, self.surroundings, scene, self._attempt)
+        self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings)
+        self.rescue = Rescue(comm, model, self.environment, scene, self._attempt)
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        sides = self.surroundings.met(q, q, 0.0, 0.0, None, self.surroundings.pinned_at(0.0))
+        sides = self.environment.met(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.step = 0  # steps taken
         self.stored, self.stored_until = scene.stored, scene.stored_until  # numbers of frames
@@ -119,13 +119,13 @@ class Simulation:
         """The same, with None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
             state = self.state
-            self.watch.overlaps(0, self.surroundings, state.q, 0.0, self.time_step)
+            self.watch.overlaps(0, self.environment, state.q, 0.0, self.time_step)
             self.energies = self.balance.energies(state.q, state.velocity(self.time_step), 0.0, state.sides)
             yield self._frame(0, self.state.q)
         for index in range(self.step + 1, self.steps + 1):
             if index == self.measured.trace:
                 self.integrator.follow()
-            self.watch.overlaps(index, self.surroundings, self.state.q, index * self.time_step, self.time_step)
+            self.watch.overlaps(index, self.environment, self.state.q, index * self.time_step, self.time_step)
             begin = perf_counter()
             result, done = self._step(index)
             self.effort.add(result, done, perf_counter() - begin)
@@ -139,18 +139,18 @@ class Simulation:
         self.watch.sum_up()
         self.rescue.sum_up()
 
-    def saved(self) -> Saved:
+    def saved(self) -> Checkpoint:
         """All that the next step depends on; to be stored or copied before that is taken."""
-        saved = Saved(self.step)
-        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back, self.surroundings.has_sides)
+        saved = Checkpoint(self.step)
+        self.state.save(saved, self.model.lattice.owned, self.integrator.looks_back, self.environment.has_sides)
         self.integrator.save(saved, self.state)
         for part in (self.balance, self.rescue, self.watch):
             part.save(saved)
         saved.numbers |= vars(self.effort)
-        saved.rows = {name: fetch(rows) for name, rows in saved.rows.items()}
+        saved.rows = {name: to_host(rows) for name, rows in saved.rows.items()}
         return saved
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         """Go on from there (collective)."""
         saved.refuse_rows_unlike(self.comm, self.saved())
         self.step, time = saved.step, saved.step * self.time_step
@@ -201,7 +201,7 @@ class Simulation:
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
             self.effort = Effort()
         self.watch.error(index, time, effort.step_error)
-        position = fetch(q[: self.model.lattice.owned])
+        position = to_host(q[: self.model.lattice.owned])
         return Frame(
             index=index,
             time=time,

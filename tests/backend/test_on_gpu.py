@@ -226,10 +226,10 @@ def test_kernels_do_the_same_as_threads(tmp_path: Path):
 
 
 def bodies() -> list[Callable]:
-    """Of all kernels: what ``each`` was given."""
+    """Of all kernels: what ``kernel`` was given."""
     found = []
     for path in PACKAGE.rglob("*.py"):
-        if "\n@each\n" in path.read_text():
+        if "\n@kernel\n" in path.read_text():
             module = importlib.import_module(".".join(("msmpetsc", *path.relative_to(PACKAGE).with_suffix("").parts)))
             found += [one.__wrapped__ for one in vars(module).values() if hasattr(one, "compiled")]
     return found
@@ -255,16 +255,16 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
         for name, case in SIMULATED.items():
             play(block_scene(tmp_path, name=name, **{**case, **SMALLEST}))
     assert set(given) == set(bodies())
-    from msmpetsc.backend import threads
+    from msmpetsc.backend import launcher
 
     h200 = SimpleNamespace(compute_capability=(9, 0))
     with patch("numba.cuda.dispatcher.get_current_device", lambda: h200):
         for body, arguments in given.items():
             types = numba.types.Tuple([numba.typeof(pretend_gpu.bare(one)) for one in arguments])
-            ptx, _ = cuda.compile_ptx(threads.kernel_of(body).py_func, (numba.int64, types), cc=(9, 0))
+            ptx, _ = cuda.compile_ptx(launcher.kernel_of(body).py_func, (numba.int64, types), cc=(9, 0))
             assert ".target sm_90" in ptx and "threads" in ptx
             with warnings.catch_warnings(action="error"):  # a grid of one block is no one's concern
-                threads.kernel_of(body)[1, threads.THREADS]
+                launcher.kernel_of(body)[1, launcher.THREADS]
             if shutil.which("ptxas"):
                 (tmp_path / "kernel.ptx").write_text(ptx)
                 command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]

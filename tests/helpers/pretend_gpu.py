@@ -143,7 +143,7 @@ def launcher(body):
 
 
 def compiled(body):
-    """The CPU's form of a body, which ``each`` has made already."""
+    """The CPU's form of a body, which ``kernel`` has made already."""
     return getattr(__import__(body.__module__, fromlist=["_"]), body.__name__).compiled
 
 

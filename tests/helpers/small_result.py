@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.frame import Frame
 from msmpetsc.output.writer import ResultFile
 
@@ -64,5 +64,5 @@ def write(path: Path, frames: list[Frame] | None = None, surface: bool = True, *
         file.start_frames(len(frames), len((arrays | lattice)["nodes"]), len(POINTS) if surface else None)
         for one in frames:
             file.append(one)
-            file.write_checkpoint(Saved(one.index, {"q": one.position, "q_previous": one.position - 1}))
+            file.write_checkpoint(Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1}))
     return path

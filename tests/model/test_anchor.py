@@ -36,12 +36,14 @@ def led_scene(folder: Path, steps: int, anchors: list[dict], **tables) -> Path:
 def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
     model, frames = play(led_scene(tmp_path, 14, [{"region": LEFT, "path": UP}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
-    led = rest[:, 0] == 0
-    assert led.sum() == 15
+    prescribed = rest[:, 0] == 0
+    assert prescribed.sum() == 15
     for frame in frames:
-        np.testing.assert_array_equal(frame.position[led], rest[led] + place(UP, frame.time))
-    others = (frames[-1].position - rest)[~led]
-    assert 0.5 * 0.03 < mass[~led] @ others[:, 2] / mass[~led].sum() < 1.5 * 0.03  # it swings about the end of the path
+        np.testing.assert_array_equal(frame.position[prescribed], rest[prescribed] + place(UP, frame.time))
+    others = (frames[-1].position - rest)[~prescribed]
+    assert (
+        0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
+    )  # it swings about the end of the path
     moved = np.linalg.norm(others, axis=1)
     assert moved.min() > 0
 
@@ -67,15 +69,15 @@ def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
     stop = 0.06 + 0.5 * T
     model, frames = play(led_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
-    led = rest[:, 0] == 0
+    prescribed = rest[:, 0] == 0
     held, free = frames[6], frames[7]
     assert held.time < stop < free.time
     velocity = (held.position - frames[5].position) / T
-    np.testing.assert_allclose(velocity[led], np.tile([0, 0.2, 0.2], (led.sum(), 1)), atol=1e-12)
+    np.testing.assert_allclose(velocity[prescribed], np.tile([0, 0.2, 0.2], (prescribed.sum(), 1)), atol=1e-12)
     np.testing.assert_allclose(held.momentum, mass @ velocity, atol=1e-12)
     for frame in frames[7:]:
         np.testing.assert_allclose(frame.momentum, held.momentum, rtol=1e-6)
-    assert (np.linalg.norm(free.position[led] - rest[led] - place(UP, free.time), axis=1) > 1e-5).all()
+    assert (np.linalg.norm(free.position[prescribed] - rest[prescribed] - place(UP, free.time), axis=1) > 1e-5).all()
 
 
 def test_let_go_at_the_path_s_velocity_an_unstrained_body_flies_on(tmp_path: Path):
@@ -98,8 +100,8 @@ def test_anchors_are_let_go_one_after_the_other(tmp_path: Path):
     model, frames = play(led_scene(tmp_path, 12, anchors))
     rest = model.lattice.nodes
     for x, stop in zip((0, 0.5), stops, strict=True):
-        led = rest[:, 0] == x
-        on_path = [np.abs(f.position[led] - rest[led] - place(UP, f.time)).max() < 1e-14 for f in frames]
+        prescribed = rest[:, 0] == x
+        on_path = [np.abs(f.position[prescribed] - rest[prescribed] - place(UP, f.time)).max() < 1e-14 for f in frames]
         assert on_path == [f.time < stop for f in frames]
     np.testing.assert_allclose(frames[-1].momentum, frames[8].momentum, rtol=1e-6)
 
@@ -233,11 +235,13 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
     """On so many ranks: the folder of results, and (status, what was told) of each rank for each of all commands."""
     half, most_of_it = {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]}, {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]}
     anchors = [{"region": half, "path": UP, "stop": 0.025}, {"region": most_of_it, "path": UP, "stop": 0.045}]
-    led = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
+    prescribed = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
     found = {}
     for ranks in (1, 2):
         out = balls / f"ranks{ranks}"
-        commands = [[led, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"] for preset in PRESETS]
+        commands = [
+            [prescribed, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"] for preset in PRESETS
+        ]
         commands += [[balls / "scene.toml", "-o", out / "painted.h5"]]
         for value in WRONG:
             commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]

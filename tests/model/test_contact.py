@@ -124,8 +124,8 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
 def test_both_regimes_of_friction_are_among_the_cases():
     for name, holds in {"sticking": True, "slipping": False}.items():
         contact, q, _ = pressed(CASES[f"plane, {name}"])
-        rub = contact.presses[0].rub
-        assert ((rub.slip(q)[1] < rub.stick) == holds).all()
+        apply_friction = contact.presses[0].apply_friction
+        assert ((apply_friction.slip(q)[1] < apply_friction.stick) == holds).all()
 
 
 def test_a_node_in_two_obstacles_gets_both():
@@ -368,10 +368,10 @@ def test_a_path_stays_at_its_last_place():
 def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str):
     """A plane comes up through the bottom of a block that is held there: struck, it would take the plane's speed."""
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
-    led = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
+    prescribed = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
     rising = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1], "path": [{"time": 1.0, "by": [0, 0, 1]}]}
     time = {"step": 0.01, "duration": 0.04}
-    scene = block_scene(tmp_path, time=time, obstacle=[rising], **{hold: [bottom if hold == "pin" else led]})
+    scene = block_scene(tmp_path, time=time, obstacle=[rising], **{hold: [bottom if hold == "pin" else prescribed]})
     model, frames = play(scene)
     low = model.lattice.nodes[:, 2] == 0
     for frame in frames:

@@ -18,7 +18,7 @@ from msmpetsc.model.build import build_model
 from msmpetsc.model.contact.obstacle import depths
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.model.paths import Path as Motion
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Keyframe
@@ -201,15 +201,15 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
     """As the test has it: the first step never is, its halves are."""
     path, alike, asked = (
         against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False),
-        Surroundings.pushes_alike,
+        Environment.pushes_alike,
         [],
     )
 
-    def stuck(around: Surroundings, *given) -> bool:
+    def stuck(around: Environment, *given) -> bool:
         asked.append(0)
         return len(asked) > MOST_SOLVES and alike(around, *given)
 
-    monkeypatch.setattr(Surroundings, "pushes_alike", stuck)
+    monkeypatch.setattr(Environment, "pushes_alike", stuck)
     with pytest.raises(StepFailed, match=r"frame 1 \(t = 0.004 s\) has nodes that pass through .*; try a smaller"):
         play(path)
     asked.clear()

@@ -16,7 +16,7 @@ from small_result import DT, FRAMES, NODES, POINTS, frame, position
 
 import msmpetsc
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.output.writer import ResultFile
 
 
@@ -107,10 +107,10 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
             assert run.frames.position[:].shape == (0, *NODES.shape) and run.checkpoint is None
         for index in range(3):
             file.append(frame(index))
-            file.write_checkpoint(Saved(index, {"q": position(index), "q_previous": position(index)}))
+            file.write_checkpoint(Checkpoint(index, {"q": position(index), "q_previous": position(index)}))
         with msmpetsc.open(tmp_path / "x.h5") as run:
             file.append(frame(3))
-            file.write_checkpoint(Saved(3, {"q": position(3), "q_previous": position(3)}))
+            file.write_checkpoint(Checkpoint(3, {"q": position(3), "q_previous": position(3)}))
             assert len(run.frames.time) == len(run.frames.kinetic) == len(list(run.frames.position)) == 3
             assert np.array_equal(run.frames.position[-1], position(2)) and np.isfinite(run.frames.time).all()
             assert run.checkpoint.step == 3 and np.array_equal(run.checkpoint.q, position(3))
@@ -131,7 +131,7 @@ def test_another_process_sees_the_newest_checkpoint(tmp_path: Path):
         reader = None
         for index in range(4):
             file.append(frame(index, surface=None))
-            file.write_checkpoint(Saved(index, {"q": np.full(NODES.shape, index), "q_previous": NODES}))
+            file.write_checkpoint(Checkpoint(index, {"q": np.full(NODES.shape, index), "q_previous": NODES}))
             reader = reader or subprocess.Popen(
                 [sys.executable, "-c", code, tmp_path / "x.h5"],
                 env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,

@@ -162,11 +162,11 @@ region.painted = "spots.txt"
 
 
 def test_held_parts(panels):
-    east, led = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
+    east, prescribed = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
     assert ((east.held == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.held.mean() < 0.5
-    assert ((led[0].held == 1) == (led[0].points[:, 2] <= 0.48)).all()
-    assert (led[1].held == led[0].held).all()
-    assert not led[2].held.any()
+    assert ((prescribed[0].held == 1) == (prescribed[0].points[:, 2] <= 0.48)).all()
+    assert (prescribed[1].held == prescribed[0].held).all()
+    assert not prescribed[2].held.any()
 
 
 def test_painted_points_mean_the_corners_of_their_cells():

@@ -21,7 +21,7 @@ from frames_worker import NODES, POINTS, STEPS, frame, positions
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.output import continued, writer
 from msmpetsc.output.compress import pack
 from msmpetsc.output.writer import SERIES, ResultFile, finished, open_result, read_checkpoint
@@ -141,7 +141,9 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         marks[len(disk.log)] = index, index - 1
         file.append(frame(index))
         marks[len(disk.log)] = index + 1, index - 1
-        file.write_checkpoint(Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}))
+        file.write_checkpoint(
+            Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+        )
     marks[len(disk.log)] = 12, 11
     file.close()
     assert len(disk.log) > max(marks)  # the trimming wrote
@@ -191,8 +193,8 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
             assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(q, positions(step, NODES))
 
 
-def saved(index: int) -> Saved:
-    return Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+def saved(index: int) -> Checkpoint:
+    return Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
 
 
 def places(file: h5py.File) -> Iterator[tuple[int, int]]:

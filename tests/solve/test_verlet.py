@@ -13,7 +13,7 @@ from test_step import one_spring
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.elasticity import Elasticity
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.model.frame import Frame
 from msmpetsc.model.initial_state import at_rest
 from msmpetsc.model.lattice import Lattice, build_lattice
@@ -32,7 +32,7 @@ EXPLICIT = {"integrator": "verlet"}
 
 def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
     model = Model(None, lattice, None, [], [], [], [], at_rest(lattice))
-    return Verlet(COMM, model, Surroundings(model), Time(step=T, duration=1.0, substep=substep, **EXPLICIT), Solver())
+    return Verlet(COMM, model, Environment(model), Time(step=T, duration=1.0, substep=substep, **EXPLICIT), Solver())
 
 
 def fly(lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None) -> list[State]:
@@ -241,10 +241,10 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
     path = [{"time": 1.0, "by": [0, 0, 0.5]}]
     anchors = [{"region": r, "path": path, "stop": 6.5 * T} for r in (left, {"box": [[0.1, -1, -1], [1, 1, 0.2]]})]
     model, frames = play(block_scene(tmp_path, time={"step": T, "duration": 12 * T} | EXPLICIT, anchor=anchors))
-    led = model.lattice.nodes[:, 0] == 0
+    prescribed = model.lattice.nodes[:, 0] == 0
     for frame in frames[:7]:
-        place = model.lattice.nodes[led] + [0, 0, 0.5 * frame.time]
-        np.testing.assert_allclose(frame.position[led], place, atol=1e-14)
+        place = model.lattice.nodes[prescribed] + [0, 0, 0.5 * frame.time]
+        np.testing.assert_allclose(frame.position[prescribed], place, atol=1e-14)
     np.testing.assert_allclose(frames[-1].momentum, frames[7].momentum, atol=1e-10)
     assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)  # the rest sways
 

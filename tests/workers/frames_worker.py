@@ -7,7 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.frame import Frame
 from msmpetsc.output import writer
 from msmpetsc.output.writer import ResultFile
@@ -50,7 +50,9 @@ def write_all(path: str, gathers: bool = False) -> None:
         for index in range(STEPS + 1):
             file.append(frame(index, nodes, points))
             file.write_checkpoint(
-                Saved(index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]})
+                Checkpoint(
+                    index, {"q": positions(index, NODES)[nodes], "q_previous": positions(index - 1, NODES)[nodes]}
+                )
             )
 
 
@@ -62,7 +64,7 @@ def write_forever(path: str) -> None:
             file.append(frame(index))
             print(index, flush=True)
             file.write_checkpoint(
-                Saved(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+                Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
             )
 
 

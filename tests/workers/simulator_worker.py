@@ -15,18 +15,18 @@ from block_scene import play
 from pretend_gpu import bare, module, pretended
 
 with module("cupy"):
-    from msmpetsc.backend import threads
+    from msmpetsc.backend import launcher as launching
 
 ran = set()
 
 
 def launcher(body):
     ran.add(body.__name__)
-    return threads.launcher(body)
+    return launching.launcher(body)
 
 
 replaced = {"as_argument": lambda value: (None, bare(value)), "_stream": lambda: 0, "THREADS": 8}
-with patch.multiple(threads, **replaced), pretended(launcher):
+with patch.multiple(launching, **replaced), pretended(launcher):
     last = [play(scene)[1][-1].position for scene in sys.argv[1:]]
 print(*sorted(ran))
 for position in last:

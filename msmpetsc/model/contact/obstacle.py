@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import beside
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import like
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.paths import Path, within
 from msmpetsc.scene import schema as scene
 
@@ -46,7 +46,7 @@ class Obstacle:
 
     def points_at(self, time: float) -> np.ndarray:
         """A point of each face (f, 3) [m] at a time."""
-        return self.points + beside(self.points, self.path.at(time)) if self.path.leads_away else self.points
+        return self.points + like(self.points, self.path.at(time)) if self.path.leads_away else self.points
 
     @property
     def has_sides(self) -> bool:
@@ -96,7 +96,7 @@ def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> 
     return least, face
 
 
-@each
+@kernel
 def _depth_of(first, count, step, q, points, normals, sides, least, face):
     for i in range(first, count, step):
         least[i], face[i] = depth(q[i], points, normals, sides[i])
@@ -159,7 +159,7 @@ def side_of(
     return side if enter <= leave + ROUNDED else 0
 
 
-@each
+@kernel
 def _sides_of(first, count, step, q, end, points, points_end, normals, sides, found):
     for i in range(first, count, step):
         found[i] = side_of(q[i], end[i], points, points_end, normals, sides[i])

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import beside
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import like
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides
 
 
@@ -30,11 +30,11 @@ class Penalty:
     friction: float
     stick: float
 
-    def at(self, time: float, sides: np.ndarray | None = None) -> "Press":
+    def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """The obstacle at a time, without friction; ``sides`` (owned or more,) of the nodes."""
-        return Press(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
+        return ContactState(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
 
-    def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "Press":
+    def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
         """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
         if self.friction == 0:
             return self.at(time, sides)
@@ -44,12 +44,12 @@ class Penalty:
         nodes = np.flatnonzero(inside > 0)
         carried = q[nodes] + (points - before)[0]
         limit = self.friction * self.stiffness * inside[nodes]
-        rub = Rub(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
-        return Press(points, normals, self.stiffness, rub, sides)
+        apply_friction = Friction(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
+        return ContactState(points, normals, self.stiffness, apply_friction, sides)
 
 
 @dataclass(frozen=True)
-class Rub:
+class Friction:
     """Friction of one step.
 
     nodes (a,), normal (a, 3); carried (a, 3): where they are if they do not slip [m]; limit (a,): mu N [N];
@@ -94,7 +94,7 @@ class Rub:
         """
         u, length = self.slip(q)
         slope = self.slope(length)
-        blocks = slope[:, None, None] * (beside(q, np.eye(3)) - _squares(self.normal))
+        blocks = slope[:, None, None] * (like(q, np.eye(3)) - _squares(self.normal))
         if true:
             direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
             curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
@@ -103,14 +103,14 @@ class Rub:
 
 
 @dataclass(frozen=True)
-class Press:
+class ContactState:
     """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], friction, if any, and by
     which face each node came in (obstacle.side_of); None: the nearest."""
 
     points: np.ndarray
     normals: np.ndarray
     stiffness: float
-    rub: Rub | None
+    apply_friction: Friction | None
     sides: np.ndarray | None = None
 
     def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +128,7 @@ class Contact:
     Gradient and Hessian act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
     """
 
-    def __init__(self, presses: list[Press], owned: int):
+    def __init__(self, presses: list[ContactState], owned: int):
         self.presses, self.owned = presses, owned
 
     def energy(self, q: np.ndarray) -> float:
@@ -146,16 +146,16 @@ class Contact:
             parts = np.empty(self.owned, like=q)
             _change_of(self.owned, q, base, *press.faces(q), press.stiffness, parts)
             total += float(parts.sum())
-            if press.rub:
-                total += float(press.rub.change(q, base))
+            if press.apply_friction:
+                total += float(press.apply_friction.change(q, base))
         return total
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for press in self.presses:
             _add_gradient_of(self.owned, q, *press.faces(q), press.stiffness, gradient)
-            if press.rub:
-                press.rub.add_gradient(q, gradient)
+            if press.apply_friction:
+                press.apply_friction.add_gradient(q, gradient)
 
     def hessian(self, q: np.ndarray, true: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Nodes in contact (a,), each once, and their blocks (a, 3, 3) [N/m], positive semidefinite: of each push and
@@ -168,16 +168,16 @@ class Contact:
             inside, face = press.depths(q[: self.owned])
             pressed = np.flatnonzero(inside > 0)
             yield pressed, press.stiffness * _squares(press.normals[face[pressed]])
-            if press.rub:
-                yield press.rub.nodes, press.rub.blocks(q, true)
+            if press.apply_friction:
+                yield press.apply_friction.nodes, press.apply_friction.blocks(q, true)
 
     def bound(self, q: np.ndarray) -> np.ndarray:
         """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
         bound = np.zeros(self.owned, like=q)
         for press in self.presses:
             bound += press.stiffness * (press.depths(q[: self.owned])[0] > 0)
-            if press.rub:
-                bound[press.rub.nodes] += 2 * press.rub.limit / press.rub.stick
+            if press.apply_friction:
+                bound[press.apply_friction.nodes] += 2 * press.apply_friction.limit / press.apply_friction.stick
         return bound
 
 
@@ -186,7 +186,7 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
-@each
+@kernel
 def _change_of(first, count, step, q, base, points, normals, sides, stiffness, parts):
     for i in range(first, count, step):
         d, face = depth(q[i], points, normals, sides[i])
@@ -202,7 +202,7 @@ def _change_of(first, count, step, q, base, points, normals, sides, stiffness, p
             parts[i] = 0.5 * stiffness * (d - d_base) * (d + d_base)
 
 
-@each
+@kernel
 def _add_gradient_of(first, count, step, q, points, normals, sides, stiffness, gradient):
     for i in range(first, count, step):
         d, face = depth(q[i], points, normals, sides[i])
@@ -211,8 +211,8 @@ def _add_gradient_of(first, count, step, q, points, normals, sides, stiffness, g
                 gradient[i, c] -= stiffness * d * normals[face, c]
 
 
-@each
-def _rub_of(first, count, step, rows, q, points, normals, sides, carried, impulse, per_mass, v):
+@kernel
+def _friction_of(first, count, step, rows, q, points, normals, sides, carried, impulse, per_mass, v):
     for row in range(first, count, step):
         i = rows[row]
         d, face = depth(q[i], points, normals, sides[i])
@@ -229,10 +229,10 @@ def _rub_of(first, count, step, rows, q, points, normals, sides, carried, impuls
                     v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])
 
 
-def rub(
+def apply_friction(
     rows: np.ndarray,
     q: np.ndarray,
-    press: Press,
+    press: ContactState,
     carried: np.ndarray,
     impulse: float,
     per_mass: np.ndarray,
@@ -244,4 +244,4 @@ def rub(
 
     impulse : mu k dt [kg/s], times the depth the impulse
     """
-    _rub_of(len(rows), rows, q, *press.faces(q), carried, impulse, per_mass, v)
+    _friction_of(len(rows), rows, q, *press.faces(q), carried, impulse, per_mass, v)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import beside
+from msmpetsc.backend.arrays import like
 from msmpetsc.model.contact.obstacle import Obstacle, depths
 
 
@@ -90,5 +90,5 @@ class Reflection:
         """Of displacements v (k, 3) [m] in a step the part along the normals, as seen from the obstacle, (k,) [m]."""
         path = self.obstacle.path
         if path.leads_away:
-            v = v - beside(v, path.at(time) - path.at(time - time_step))
+            v = v - like(v, path.at(time) - path.at(time - time_step))
         return (v * normal).sum(axis=1)

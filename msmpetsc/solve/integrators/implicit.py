@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Saved
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.environment import Environment
 from msmpetsc.scene import schema as scene
 from msmpetsc.solve.instrumentation import Measured, Trace
 from msmpetsc.solve.integrators.state import State
@@ -41,16 +41,16 @@ class ImplicitEuler:
         self,
         comm: MPI.Comm,
         model: Model,
-        surroundings: Surroundings,
+        environment: Environment,
         time: scene.Time,
         solver: scene.Solver,
         measured: Measured = Measured(),
         prefix: str = "",
     ):
-        self.comm, self.model, self.around, self.prefix = comm, model, surroundings, prefix
+        self.comm, self.model, self.around, self.prefix = comm, model, environment, prefix
         self.time_step, self.tau = time.step, self.SHARE * time.step
         self.solver, self.measured = solver, measured
-        self.held = surroundings.held_at(self.time_step)
+        self.held = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
         self.reference, self.trace = None, None
 
@@ -85,7 +85,7 @@ class ImplicitEuler:
         sides = around.met(q, y, **way)
         for solves in range(MOST_SOLVES):
             contact = around.contact(q, time, time_step, sides)
-            self.problem = Problem(q, y, around.load(time), contact, around.led(q, time))
+            self.problem = Problem(q, y, around.load(time), contact, around.prescribed(q, time))
             result = self.stepper.step(**vars(self.problem))
             iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
             met = around.met(q, result.position, **way)
@@ -127,7 +127,7 @@ class ImplicitEuler:
         solver = self.solver
         return Stepper(
             self.comm,
-            self.model.lattice.pin(self.around.pinned_at(time)),
+            self.model.lattice.pin(self.around.fixed_at(time)),
             self.tau,
             find_preset(solver.preset),
             solver.error,
@@ -138,24 +138,24 @@ class ImplicitEuler:
 
     def _let_go(self, time: float) -> None:
         """Another solver where an anchor's time has come (collective)."""
-        held = self.around.held_at(time)
+        held = self.around.anchors_at(time)
         if len(held) < len(self.held):
             self.held = held
             self.destroy()
             self.stepper, self.reference = self._new_stepper(time), None
             self.stepper.set_up()
 
-    def save(self, saved: Saved, _: State) -> None:
+    def save(self, saved: Checkpoint, _: State) -> None:
         self.stepper.save(saved)
 
-    def restore(self, saved: Saved, _: State, time: float) -> None:
+    def restore(self, saved: Checkpoint, _: State, time: float) -> None:
         """Go on after a step that ended at ``time`` (collective)."""
         self._let_go(time)
         self.stepper.restore(saved)
 
     def forget(self) -> None:
         """Let the steps so far leave no trace in the next (collective)."""
-        self.stepper.restore(Saved())
+        self.stepper.restore(Checkpoint())
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective).

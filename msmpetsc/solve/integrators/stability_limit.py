@@ -3,7 +3,7 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import beside
+from msmpetsc.backend.arrays import like
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import Ghosted
@@ -24,7 +24,7 @@ class HighestMode:
         """Know the nodes ``held`` (owned,) bool, and begin with something of every mode, whatever the number of ranks."""
         self.held = held
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
-        self.mode.values[:] = beside(self.mode.values, np.sin(1e4 * np.sin(numbers)))
+        self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
         self.mode.values[: self.lattice.owned][held] = 0
         self._normalise()
         self.squared = 0.0

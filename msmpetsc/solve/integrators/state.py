@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import with_ghosts
 
@@ -34,7 +34,7 @@ class State:
         """The same for steps of another length, which have no history yet."""
         return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
 
-    def save(self, saved: Saved, owned: int, looks_back: bool, has_sides: bool) -> None:
+    def save(self, saved: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
         """looks_back, has_sides : whether the integrator has a use for the history, and contact for the sides"""
         saved.rows |= {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
         if looks_back:
@@ -45,7 +45,7 @@ class State:
             saved.rows[SIDES] = 1.0 * self.sides[:, :owned].T
 
     @staticmethod
-    def restored(comm: MPI.Comm, lattice: Lattice, saved: Saved) -> "State":
+    def restored(comm: MPI.Comm, lattice: Lattice, saved: Checkpoint) -> "State":
         """Collective."""
         names = ("q", "q_previous", *HISTORY) if saved.count("history", 1) else ("q", "q_previous")
         q, q_previous, *history = (with_ghosts(comm, lattice, saved.row(name)) for name in names)

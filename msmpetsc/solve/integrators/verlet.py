@@ -11,14 +11,14 @@ frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eig
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import beside, greatest
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
-from msmpetsc.model.environment import Surroundings
+from msmpetsc.model.environment import Environment
 from msmpetsc.scene import schema as scene
 from msmpetsc.solve.instrumentation import Measured
 from msmpetsc.solve.integrators.stability_limit import HighestMode
@@ -42,14 +42,14 @@ class Verlet:
         self,
         comm: MPI.Comm,
         model: Model,
-        surroundings: Surroundings,
+        environment: Environment,
         time: scene.Time,
         _: scene.Solver,
         measured: Measured = Measured(),
     ):
         if measured != Measured():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
-        self.comm, self.lattice, self.around = comm, model.lattice, surroundings
+        self.comm, self.lattice, self.around = comm, model.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
@@ -58,7 +58,7 @@ class Verlet:
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
-        self.sides = surroundings.no_sides[:, :owned]
+        self.sides = environment.no_sides[:, :owned]
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
         self.known = None  # the positions that ``gradient`` and the highest frequency are of
         self.anchors = None  # how many hold
@@ -69,7 +69,7 @@ class Verlet:
     @property
     def unknowns(self) -> int:
         """Free nodes of this rank: pinned ones and led ones aside."""
-        return int((~self.around.pinned_at(self.time_step)[: self.lattice.owned]).sum())
+        return int((~self.around.fixed_at(self.time_step)[: self.lattice.owned]).sum())
 
     def set_up(self) -> None:
         """There is no matrix to make ready."""
@@ -78,7 +78,7 @@ class Verlet:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
 
-    def save(self, saved: Saved, state: State) -> None:
+    def save(self, saved: Checkpoint, state: State) -> None:
         """grad E is found again from q, if it is known of that."""
         saved.rows["mode"] = self.highest.mode.values[: self.lattice.owned]
         if self.anchors is not None:  # it has taken a step
@@ -87,13 +87,13 @@ class Verlet:
             saved.numbers |= {"squared": -1.0, "known": False}
         saved.numbers["substep"] = self.substep
 
-    def restore(self, saved: Saved, state: State, time: float) -> None:
+    def restore(self, saved: Checkpoint, state: State, time: float) -> None:
         """Go on after a step that ended at ``time`` (collective)."""
         squared = saved.number("squared", -1.0, -1.0, np.finfo(float).max)
         if squared < 0:
             return
         self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = beside(self.v, saved.row("mode"))
+        self.highest.mode.values[: self.lattice.owned] = like(self.v, saved.row("mode"))
         self.highest.mode.update()
         self.highest.squared, self.substep = squared, saved.number("substep", self.substep, np.finfo(float).tiny)
         if saved.count("known", 1):
@@ -187,7 +187,7 @@ class Verlet:
         load = self.around.load(time)
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
         self.work += duration * self.around.power(self.q, time, begin, end, self.sides)
-        self.around.rub(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
+        self.around.apply_friction(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
 
     def _drift(self, begin: float, end: float) -> None:
         """q to the end of a substep: led nodes along their path, nodes that strike something back."""
@@ -200,10 +200,10 @@ class Verlet:
         self.position.update()
 
     def _lead(self, begin: float, end: float) -> None:
-        led = self.around.led(self.position.values, end)[: self.lattice.owned]
+        prescribed = self.around.prescribed(self.position.values, end)[: self.lattice.owned]
         where = np.flatnonzero(self.held & ~self.lattice.pinned[: self.lattice.owned])
-        self.v[where] = (led[where] - self.q[where]) / (end - begin)
-        self.q[where] = led[where]
+        self.v[where] = (prescribed[where] - self.q[where]) / (end - begin)
+        self.q[where] = prescribed[where]
 
     def _strike(self, begin: float, end: float) -> None:
         """By which faces nodes come into contact. One that bounces off is set back, and its velocity is what then led it
@@ -220,10 +220,10 @@ class Verlet:
 
     def _hold(self, time: float) -> None:
         """Know the free nodes anew where an anchor's time has come."""
-        anchors = len(self.around.held_at(time))
+        anchors = len(self.around.anchors_at(time))
         if anchors != self.anchors:
             self.anchors = anchors
-            self.held = self.around.pinned_at(time)[: self.lattice.owned]
+            self.held = self.around.fixed_at(time)[: self.lattice.owned]
             self.free = np.flatnonzero(~self.held)
             self.highest.hold(self.held)
 
@@ -262,7 +262,7 @@ class Verlet:
             field.destroy()
 
 
-@each
+@kernel
 def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
     """v += duration M^(-1) (f_ext - grad E) at the rows of (l, 3) arrays."""
     for row in range(first, count, step):
@@ -271,7 +271,7 @@ def kick(first, count, step, rows, per_mass, load, gradient, duration, v):
             v[i, c] += duration * per_mass[i] * (load[i, c] - gradient[i, c])
 
 
-@each
+@kernel
 def drift(first, count, step, rows, v, duration, q):
     """q += duration v at the rows of (l, 3) arrays."""
     for row in range(first, count, step):

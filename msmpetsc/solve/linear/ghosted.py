@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import beside
+from msmpetsc.backend.arrays import like
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
@@ -35,7 +35,7 @@ class Ghosted:
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
     """(l, 3) from the owned ones (owned, 3) (collective)."""
     field = Ghosted(comm, lattice)
-    field.values[: lattice.owned] = beside(field.values, rows)
+    field.values[: lattice.owned] = like(field.values, rows)
     field.update()
     field.destroy()
     return field.values

@@ -7,7 +7,7 @@ unknowns is: one product or one solve for three right-hand sides.
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -37,8 +37,8 @@ class ContactBlocks:
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.t2, self.unknowns, self.parts = time_step**2, unknowns, []
         row = np.full(unknowns.lattice.owned, -1)
-        row[fetch(unknowns.free)] = np.arange(unknowns.size)
-        self.row = beside(unknowns.free, row)
+        row[to_host(unknowns.free)] = np.arange(unknowns.size)
+        self.row = like(unknowns.free, row)
 
     def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
         """Take the blocks at positions q, ``true`` ones or such as go with A."""
@@ -151,10 +151,10 @@ class Preconditioner:
             return
         given, found = self.blocks = self.blocks or self._create_blocks()
         values = given.values
-        values[:] = beside(values, self.memory.read(x))
+        values[:] = like(values, self.memory.read(x))
         self.pc.matApply(given.mat, found.mat)
         y = self.memory.write(y)
-        y[:] = beside(y, found.values)
+        y[:] = like(y, found.values)
 
     def _create_blocks(self) -> list[Block]:
         """Where the inner one works: a direct solver does on the CPU."""

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from msmpetsc.backend.arrays import fetch
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
@@ -22,12 +22,12 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     Raises InputError for more nonzeros than PETSc can count, and for a type whose vectors are not where the arrays are.
     """
     lattice = unknowns.lattice
-    row, free = np.full(len(lattice.nodes), -1), fetch(unknowns.free)
+    row, free = np.full(len(lattice.nodes), -1), to_host(unknowns.free)
     row[free] = np.arange(unknowns.size)
     weight = time_step**2 * lattice.stiffness
     ends = np.concatenate([lattice.springs, lattice.springs[:, ::-1]])
     diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[free]
-    diagonal += fetch(lattice.mass)[free]
+    diagonal += to_host(lattice.mass)[free]
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
     refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])

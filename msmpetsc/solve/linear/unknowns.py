@@ -9,8 +9,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import beside, fetch
-from msmpetsc.backend.kernel import each
+from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.petsc.limits import refuse_unknowns
@@ -37,7 +37,7 @@ class Unknowns:
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
-        own[fetch(self.free)] = first + np.arange(self.size)
+        own[to_host(self.free)] = first + np.arange(self.size)
         to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
         asked = to_owner.send(lattice.ghosts) - lattice.table.first
         self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
@@ -49,7 +49,7 @@ class Unknowns:
         owned = self.lattice.owned
         free_ghosts = owned + np.flatnonzero(self.numbers[owned:] >= 0)
         sources = self.places[free_ghosts].ravel().astype(PETSc.IntType)
-        self.free_ghosts = beside(self.free, free_ghosts)
+        self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
         self.ghost_values = PETSc.Vec().create(PETSc.COMM_SELF)
         self.ghost_values.setSizes(len(sources))
@@ -94,21 +94,21 @@ class Unknowns:
         self.ghost_values.destroy()
 
 
-@each
+@kernel
 def _spread(first, count, step, columns, rows, nodes):
     for i in range(first, count, step):
         for c in range(3):
             nodes[rows[i], c] = columns[c, i]
 
 
-@each
+@kernel
 def _collect(first, count, step, nodes, rows, columns):
     for i in range(first, count, step):
         for c in range(3):
             columns[c, i] = nodes[rows[i], c]
 
 
-@each
+@kernel
 def _scaled_sum(first, count, step, mass, a, t2, b, rows, columns):
     for i in range(first, count, step):
         for c in range(3):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import beside, fetch, greatest
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.backend.arrays import greatest, like, to_host
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import Preconditioner, TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
@@ -106,8 +106,8 @@ class LowestCurvature:
     def _way_down(self, modes: np.ndarray) -> np.ndarray:
         """What a random direction has of all of them (k, n): where a body may buckle to many sides, no matter which of
         them rounding has made the first, so that it goes the same way on any ranks."""
-        direction = self._sum(fetch((modes * self.functional.mass) @ self._random(1)[0]))
-        return beside(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
+        direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
+        return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
         """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
@@ -123,11 +123,11 @@ class LowestCurvature:
 
     def _random(self, count: int) -> np.ndarray:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
-        lattice, free = self.functional.lattice, fetch(self.unknowns.free)
+        lattice, free = self.functional.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
         random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        return self._unit(self._preconditioned(beside(self.functional.mass, random)))
+        return self._unit(self._preconditioned(like(self.functional.mass, random)))
 
     def _iterate(self, start: np.ndarray, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest eigenvalues (k,) that the iterations come to from directions (l, n), and theirs (k, n)."""
@@ -135,7 +135,7 @@ class LowestCurvature:
         values, (x, last) = self._ritz((start, self._product(start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
-            residuals = self._without_rigid(self._preconditioned(x[1] - beside(mass, values)[:, None] * mass * x[0]))
+            residuals = self._without_rigid(self._preconditioned(x[1] - like(mass, values)[:, None] * mass * x[0]))
             w = self._unit(residuals)
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
             values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
@@ -152,18 +152,18 @@ class LowestCurvature:
         """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
         each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
-        grams = self._sum(np.stack([fetch(span @ products.T), fetch((span * self.functional.mass) @ span.T)]))
+        grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
         sizes, parts = np.linalg.eigh(grams[1])
         kept = sizes > DEPENDENT * max(sizes[-1], TINY)
         parts = parts[:, kept] / np.sqrt(sizes[kept])
         values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
         parts = (parts @ turns)[:, :size].T
-        best = tuple(beside(a, parts) @ a for a in block)
+        best = tuple(like(a, parts) @ a for a in block)
         if len(span) <= size:
             return values[:size], (best, None)
-        moved = tuple(beside(a, parts[:, size:]) @ a[size:] for a in block)
+        moved = tuple(like(a, parts[:, size:]) @ a[size:] for a in block)
         lengths = np.maximum(self._lengths(moved[0]), TINY)
-        return values[:size], (best, tuple(a / beside(a, lengths)[:, None] for a in moved))
+        return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
 
     def _rigid_motions(self) -> np.ndarray | None:
         """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
@@ -176,16 +176,16 @@ class LowestCurvature:
             motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
         motions = motions.reshape(6, -1)
         for _ in range(2):  # once more, for what the first left of rounding
-            sizes, parts = np.linalg.eigh(self._sum(fetch((motions * self.functional.mass) @ motions.T)))
+            sizes, parts = np.linalg.eigh(self._sum(to_host((motions * self.functional.mass) @ motions.T)))
             kept = sizes > DEPENDENT * sizes[-1]
-            motions = beside(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
+            motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions
 
     def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
         if self.rigid is None:
             return directions
-        parts = self._sum(fetch((directions * self.functional.mass) @ self.rigid.T))
-        return directions - beside(directions, parts) @ self.rigid
+        parts = self._sum(to_host((directions * self.functional.mass) @ self.rigid.T))
+        return directions - like(directions, parts) @ self.rigid
 
     def _product(self, directions: np.ndarray) -> np.ndarray:
         """H of each."""
@@ -208,16 +208,16 @@ class LowestCurvature:
 
     def _unit(self, directions: np.ndarray) -> np.ndarray:
         """Of unit length in the norm of M; those of no length stay so."""
-        return directions / beside(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+        return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
 
     def _lengths(self, directions: np.ndarray) -> np.ndarray:
-        return np.sqrt(self._sum(fetch(directions**2 @ self.functional.mass)))
+        return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
         """Over all ranks."""
         return self.comm.allreduce(values)
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         """What the next step's search depends on."""
         lattice = self.functional.lattice
         rows = saved.rows["lowest_mode"] = np.zeros((lattice.owned, 3), like=lattice.nodes)
@@ -226,14 +226,14 @@ class LowestCurvature:
         saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
         saved.numbers["knows_mode"] = self.mode is not None
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         """Go on from there; from nothing saved as if no step had been taken."""
         self.searched = Compression(
             saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False
         )
         self.mode = None
         if saved.count("knows_mode", 1):
-            rows = beside(self.functional.mass, saved.row("lowest_mode"))
+            rows = like(self.functional.mass, saved.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def destroy(self) -> None:

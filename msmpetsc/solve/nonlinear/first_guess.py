@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from msmpetsc.backend.arrays import beside, fetch
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
@@ -45,7 +45,7 @@ class FirstGuess:
         """The step has come to x (l, 3) [m]."""
         self.corrections = [x - self.functional.y, *self.corrections[:1]]
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         if not self.extrapolate:
             return
         lattice = self.functional.lattice
@@ -54,7 +54,7 @@ class FirstGuess:
         for name, rows in zip(SAVED, [*self.corrections, *missing], strict=True):
             saved.rows[name] = rows[: lattice.owned]
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         """Collective."""
         names = SAVED[: saved.count("corrections", len(SAVED))]
         comm, lattice = self.functional.comm, self.functional.lattice
@@ -70,6 +70,6 @@ class FirstGuess:
         if self.holds:
             return 0.0
         mass = self.functional.lattice.mass
-        sums = np.append(fetch(mass @ moved[: len(mass)]), float(mass.sum()))
+        sums = np.append(to_host(mass @ moved[: len(mass)]), float(mass.sum()))
         sums = self.functional.comm.allreduce(sums)
-        return beside(moved, sums[:3] / sums[3])
+        return like(moved, sums[:3] / sums[3])

@@ -29,11 +29,11 @@ class StepFunctional:
         self.per_mass = 1 / self.mass
 
     def begin(
-        self, q: np.ndarray, y: np.ndarray, load: np.ndarray, contact: Contact | None, led: np.ndarray | None
+        self, q: np.ndarray, y: np.ndarray, load: np.ndarray, contact: Contact | None, prescribed: np.ndarray | None
     ) -> None:
         """A new step, as Stepper.step takes it."""
         self.y, self.load, self.contact = y, load, contact
-        self.q[:] = q if led is None else led  # held nodes stay there
+        self.q[:] = q if prescribed is None else prescribed  # held nodes stay there
         self.reach = self.comm.allreduce(greatest(np.abs(q)), MPI.MAX)  # [m]
 
     def gradient_at(self, x: PETSc.Vec, f: PETSc.Vec) -> None:

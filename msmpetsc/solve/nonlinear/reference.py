@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.nonlinear.presets import find_preset
@@ -27,7 +27,7 @@ class Problem:
     y: np.ndarray
     load: np.ndarray
     contact: Contact | None
-    led: np.ndarray | None
+    prescribed: np.ndarray | None
 
 
 class Reference:
@@ -47,7 +47,7 @@ class Reference:
         """
         self.stage.push()
         try:
-            self.stepper.restore(Saved())  # what is measured does not depend on what was measured before
+            self.stepper.restore(Checkpoint())  # what is measured does not depend on what was measured before
             exact = self.stepper.step(**vars(problem), start=positions[-1]).position
             away = self._distances(problem.y, exact)
             found = np.array([self._distances(x, exact) for x in positions])

@@ -8,9 +8,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import beside
+from msmpetsc.backend.arrays import like
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Saved
+from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
@@ -191,7 +191,7 @@ class Stepper:
         y: np.ndarray,
         load: np.ndarray,
         contact: Contact | None = None,
-        led: np.ndarray | None = None,
+        prescribed: np.ndarray | None = None,
         start: np.ndarray | None = None,
     ) -> StepResult:
         """q_(n+1) from q_n and y, where it would be without forces, (l, 3) [m] each, ghosts included.
@@ -204,11 +204,11 @@ class Stepper:
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
         with refusal("PETSc cannot take a step with these options", self._abandon):
-            return self._step(q, y, load, contact, led, start)
+            return self._step(q, y, load, contact, prescribed, start)
 
-    def _step(self, q, y, load, contact, led, start) -> StepResult:
+    def _step(self, q, y, load, contact, prescribed, start) -> StepResult:
         its_before = self.all_its()
-        self.functional.begin(q, y, load, contact, led)
+        self.functional.begin(q, y, load, contact, prescribed)
         self.base[:] = self.functional.q
         self.bound = self.last_error = self.residual = np.inf
         self.early, self.corrected, self.alarmed, self.at_rounding = EARLY, False, False, False
@@ -223,7 +223,7 @@ class Stepper:
         error = self.rounding.added_to(self.last_error, functional.away())
         return StepResult(functional.q.copy(), q, error, iterations, self.all_its() - its_before)
 
-    def save(self, saved: Saved) -> None:
+    def save(self, saved: Checkpoint) -> None:
         """What the next step depends on beside what it is given."""
         self.first_guess.save(saved)
         self.curvature.save(saved)
@@ -232,14 +232,14 @@ class Stepper:
             bound = saved.rows["contact_bound"] = np.zeros(self.lattice.owned, like=self.added)
             bound[self.unknowns.free] = self.added[: self.unknowns.size]
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Checkpoint) -> None:
         """Go on from there; from nothing saved as if no step had been taken (collective)."""
         self.first_guess.restore(saved)
         self.curvature.restore(saved)
         self.ratio = saved.number("ratio", FIRST_RATIO, 0)
         if self.touches:
             bound = saved.rows.get("contact_bound", np.zeros(self.lattice.owned))
-            bound = beside(self.added, bound)[self.unknowns.free]
+            bound = like(self.added, bound)[self.unknowns.free]
             self._add_to_preconditioner(np.tile(bound, len(self.diagonal) // max(len(bound), 1)))
 
     def all_its(self) -> int:

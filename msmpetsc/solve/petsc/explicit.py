@@ -7,7 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from msmpetsc.backend.arrays import beside, fetch
+from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)
@@ -24,7 +24,7 @@ def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
     It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so that
     one product a colour and coordinate tells the entries of all its columns: 81 products.
     """
-    (a, b), colours, free = _neighbours(unknowns), _colours(unknowns), fetch(unknowns.free)
+    (a, b), colours, free = _neighbours(unknowns), _colours(unknowns), to_host(unknowns.free)
     row = np.full(len(colours), -1)
     row[free] = np.arange(unknowns.size)
     row, places, colour = row[a], unknowns.places[b], colours[b]
@@ -34,9 +34,9 @@ def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
         chosen = np.zeros((3, unknowns.size))
         chosen[c] = colours[free] == wanted
         target = unknowns.columns_to_write(x)
-        target[:] = beside(target, chosen)
+        target[:] = like(target, chosen)
         operator.mult(x, y)
-        found, hit = fetch(unknowns.columns(y)), np.flatnonzero(colour == wanted)
+        found, hit = to_host(unknowns.columns(y)), np.flatnonzero(colour == wanted)
         rows.append((row[hit] + unknowns.size * np.arange(3)[:, None]).ravel())
         columns.append(np.tile(places[hit, c], 3))
         values.append(found[:, row[hit]].ravel())
@@ -53,7 +53,7 @@ def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
 
 def _neighbours(unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of local numbers of free nodes that are the same or joined, the first of this rank."""
-    springs, free = fetch(unknowns.lattice.springs), fetch(unknowns.free)
+    springs, free = to_host(unknowns.lattice.springs), to_host(unknowns.free)
     a = np.concatenate([springs[:, 0], springs[:, 1], free])
     b = np.concatenate([springs[:, 1], springs[:, 0], free])
     kept = (a < unknowns.lattice.owned) & (unknowns.numbers[a] >= 0) & (unknowns.numbers[b] >= 0)
@@ -63,7 +63,7 @@ def _neighbours(unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
 def _colours(unknowns: Unknowns) -> np.ndarray:
     """(l,) of 27: where a node is among its cell and the next two, along each axis (collective)."""
     lattice = unknowns.lattice
-    nodes, corner = fetch(lattice.nodes), np.empty(3)
+    nodes, corner = to_host(lattice.nodes), np.empty(3)
     lattice.table.comm.Allreduce(nodes.min(axis=0, initial=np.inf), corner, MPI.MIN)
     index = np.rint((nodes - corner) / lattice.cell_size).astype(np.int64) % 3
     return index @ [9, 3, 1]

@@ -10,7 +10,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
-from msmpetsc.backend.arrays import is_here
+from msmpetsc.backend.arrays import on_host
 from msmpetsc.solve.petsc.library import dense_pointer
 
 
@@ -92,4 +92,4 @@ HOST, CUDA = Host(), Cuda()
 
 
 def memory_of(array: np.ndarray) -> Memory:
-    return HOST if is_here(array) else CUDA
+    return HOST if on_host(array) else CUDA

@@ -36,9 +36,9 @@ from msmpetsc.model.to_device import placed
 from msmpetsc.output.writer import finished, open_result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
-from msmpetsc.solve.nonlinear.presets import find_preset
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc import device
+from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation
 
 ROOT = Path(__file__).parents[1]

@@ -87,7 +87,7 @@ def material_of(draw: Draw) -> dict:
 
 
 def solver_of(draw: Draw) -> dict:
-    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS
 
     preset = str(draw.choice(list(PRESETS)))
     if draw.random() < 0.1:

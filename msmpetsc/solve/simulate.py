@@ -24,12 +24,12 @@ from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.linear.surface import SurfaceMotion
 from msmpetsc.solve.monitors import Watch
-from msmpetsc.solve.nonlinear.presets import Preset, find_preset
 from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
 from msmpetsc.solve.nonlinear.reference import PRESET
 from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.petsc.device import sender
-from msmpetsc.solve.petsc.options import refuse_bad_values, refuse_unused
+from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Done, Rescue
 

@@ -13,8 +13,8 @@ from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.paths import Path as Motion
 from msmpetsc.scene.schema import Keyframe
-from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import PRESETS, find_preset
 
 T = 0.1
 STILL = Motion.through(())

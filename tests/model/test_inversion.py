@@ -22,8 +22,8 @@ from msmpetsc.model.inversion import (
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.material import edge_stiffness
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import PRESETS, find_preset
 
 H, DENSITY, T = 0.1, 1000.0, 1 / 60
 COMM = MPI.COMM_SELF

@@ -25,7 +25,7 @@ from msmpetsc.model.build import build_model
 from msmpetsc.output.restart import Earlier
 from msmpetsc.output.writer import finished
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear.presets import PRESETS
+from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import Simulation
 
 COMM = MPI.COMM_SELF

@@ -15,9 +15,9 @@ from test_step import COMM, T, beam, swing, weight
 from msmpetsc.model.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Measured
-from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset
 from msmpetsc.solve.nonlinear.reference import Problem, Reference
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.simulate import Simulation
 
 FLOOR = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}

@@ -14,11 +14,11 @@ from msmpetsc.cli import compare, fetch, inspect, plan, render, study
 from msmpetsc.cli.main import main
 from msmpetsc.cli.run import add_parser
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset, shown_options
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.options import _is_in_library, refuse_bad_values, refuse_early
 from msmpetsc.solve.petsc.errors import refusal
 from msmpetsc.solve.petsc.initialise import _check_files
-from msmpetsc.solve.petsc.options import _is_in_library, refuse_bad_values, refuse_early
+from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
 
 T = 1 / 60
 COMM = MPI.COMM_SELF

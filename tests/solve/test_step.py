@@ -11,9 +11,9 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.solve.nonlinear.presets import PRESETS, find_preset
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.errors import refusal
+from msmpetsc.solve.presets import PRESETS, find_preset
 
 T = 1 / 60
 GRAVITY = np.array([0, 0, -9.81])

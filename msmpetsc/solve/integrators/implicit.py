@@ -16,10 +16,10 @@ from msmpetsc.model.environment import Environment
 from msmpetsc.scene import schema as scene
 from msmpetsc.solve.instrumentation import Measured, Trace
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.nonlinear.presets import find_preset
 from msmpetsc.solve.nonlinear.reference import PREFIX, Problem, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.petsc.options import refuse_unused
+from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.presets import find_preset
 
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 

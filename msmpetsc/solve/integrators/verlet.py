@@ -25,7 +25,7 @@ from msmpetsc.solve.integrators.stability_limit import HighestMode
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.petsc.options import refuse_unused
+from msmpetsc.solve.options import refuse_unused
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step

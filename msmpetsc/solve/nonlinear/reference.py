@@ -11,8 +11,8 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.nonlinear.presets import find_preset
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
 
 PRESET, ERROR = "newton-multigrid", 1e-10
 PREFIX = "reference_"  # of its PETSc options

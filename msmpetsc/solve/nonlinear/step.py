@@ -30,10 +30,10 @@ from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.minimum import Minimum
-from msmpetsc.solve.nonlinear.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.errors import refusal
 from msmpetsc.solve.petsc.library import total_iterations
+from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has nothing left to tell

@@ -13,9 +13,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, nearest
-from msmpetsc.solve.nonlinear.presets import Preset, forget_defaults, set_defaults
 from msmpetsc.solve.petsc.errors import refusal
 from msmpetsc.solve.petsc.library import Integer, library_file, open_viewer, petsc_library
+from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"

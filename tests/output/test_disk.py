@@ -11,7 +11,7 @@ import pytest
 from test_signals import assert_same, hanging
 
 from msmpetsc.cli.main import main
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 from msmpetsc.solve.simulate import Simulation
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room

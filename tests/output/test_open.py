@@ -99,6 +99,28 @@ def test_nothing_heavy_is_imported(whole: Path):
     assert "h5py" in loaded and loaded.isdisjoint({"petsc4py", "mpi4py", "numba", "pyvista", "matplotlib", "trimesh"})
 
 
+def test_reading_needs_numpy_and_h5py_alone(whole: Path):
+    """Scipy is needed by the embedding alone, xarray by to_xarray."""
+    code = (
+        "import sys\n"
+        "for name in 'petsc4py mpi4py numba pydantic scipy xarray tqdm pyvista matplotlib tomli_w'.split():\n"
+        "    sys.modules[name] = None\n"
+        "import msmpetsc\n"
+        "from msmpetsc.output.compare import compare\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    run.frames.position[-1], run.lattice.nodes[:], run.surface.points[:], run.scene, run.checkpoint, repr(run)\n"
+        "    assert compare(run, run).left_out == []"
+    )
+    done = subprocess.run([sys.executable, "-c", code, whole], env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_itself_is_quick_to_import():
+    code = "import json, sys, msmpetsc\nprint(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout)).isdisjoint({"numpy", "h5py", "petsc4py", "mpi4py", "numba"})
+
+
 def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
     with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
         file.write("lattice/nodes", NODES)

@@ -430,7 +430,7 @@ def result(path: Path, times: list[float], positions: list[np.ndarray], mass: li
     """A result file; positions (n, 3) of each time, the first at rest."""
     with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
         file.write("lattice/nodes", positions[0])
-        file.write("lattice/mass", np.array(mass))
+        file.write("lattice/mass", np.array(mass, float))
         file.start_frames(len(times), len(mass))
         for index, now in enumerate(times):
             values = {name: column[index] for name, column in series.items()}

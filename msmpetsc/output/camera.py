@@ -37,7 +37,7 @@ class Camera:
         return points @ np.array([self.right, self.upward]).T
 
 
-def place_camera(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
+def camera_facing(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequence[float] | None = None) -> Camera:
     """Return a camera in the direction `eye` (3,) of points (n, 3), of any length; up is against gravity, z without it.
 
     Without eye, or with one straight above or below, the longer horizontal extent lies across the picture.

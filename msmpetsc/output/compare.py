@@ -84,7 +84,7 @@ def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Compari
 
     Raises InputError if the lattices do not match, or the runs have no time or not these fields in common.
     """
-    refuse_other_lattice(a, b)
+    refuse_different_lattices(a, b)
     chosen, left_out = _chosen(a, b, names)
     times = a.frames.time[:]
     pairs = common_times(times, b.frames.time[:])
@@ -193,7 +193,7 @@ def rows_agree(a: np.ndarray, b: np.ndarray, slack: float) -> np.ndarray:
     return (np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)) <= slack
 
 
-def refuse_other_lattice(a: Result, b: Result) -> None:
+def refuse_different_lattices(a: Result, b: Result) -> None:
     """Raise InputError with the first reason why the two are not of one lattice."""
 
     def refuse(reason: str) -> None:

@@ -55,7 +55,7 @@ class Result:
         self.path = Path(path)
         self._file = open_result(path)
         try:
-            with damage_in_one_line(self.path):
+            with plain_damage(self.path):
                 self.attributes = {name: as_python(value) for name, value in self._file.attrs.items()}
                 self._datasets = self._lazy(checked_datasets(self._file))
         except BaseException:
@@ -170,14 +170,14 @@ def open_result(path: str | Path) -> h5py.File:
     if not path.is_file():
         kind = "a folder" if path.is_dir() else "a pipe or a device"
         raise InputError(f"{path} is {kind}, not a file" if path.exists() else f"{path}: no such file")
-    with damage_in_one_line(path):
+    with plain_damage(path):
         path.open("rb").close()  # is_hdf5 does not tell why it cannot read
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file")
         # No lock, no cache: it may be written just now. What is read is what stands in the file.
         file = h5py.File(path, "r", locking=False, rdcc_nbytes=0)
     try:
-        with damage_in_one_line(path):
+        with plain_damage(path):
             _check_is_result(path, file)
     except BaseException:
         file.close()
@@ -240,7 +240,7 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
 
 
 @contextmanager
-def damage_in_one_line(path: Path) -> Iterator[None]:
+def plain_damage(path: Path) -> Iterator[None]:
     """Turn what HDF5 and h5py raise on damaged files into an InputError of one line."""
     try:
         yield

@@ -17,12 +17,12 @@ from PIL import Image
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.camera import Camera, place_camera
+from msmpetsc.output.camera import Camera, camera_facing
 from msmpetsc.output.overlays import MARGIN, Ground, Overlays, Rest, fixed_nodes, overlays_at
-from msmpetsc.output.reader import Result, damage_in_one_line
+from msmpetsc.output.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
 
-BODY, HELD, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
+BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
 GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
 GLASS, GLASS_EDGE, GLASS_OPACITY = "#a3b6c4", "#667e90", 0.22
 PANEL_WIDTH, PANEL_HEIGHT, NARROWEST = 460, 1000, 240  # [px]: at most, and the least that a caption needs
@@ -55,7 +55,7 @@ def contact_sheet(
     frames : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
     eye    : direction from the body to the eye (3,); the scene's picture.eye if None
     """
-    with damage_in_one_line(Path(h5_path)), Result(h5_path) as run:
+    with plain_damage(Path(h5_path)), Result(h5_path) as run:
         scene = read_scene(run)
         refuse_what_cannot_be_drawn(run, scene)
         moments = _moments(run, scene, frames, count)
@@ -64,7 +64,7 @@ def contact_sheet(
         if not (np.abs(everywhere) < FARTHEST).all() or np.ptp(everywhere, axis=0).max() == 0:
             raise InputError(f"{h5_path}: the surface at these moments has no extent, or none that can be drawn")
         gravity = scene.gravity.acceleration if scene.gravity else None
-        camera = place_camera(everywhere, gravity, scene.picture.eye if eye is None else eye)
+        camera = camera_facing(everywhere, gravity, scene.picture.eye if eye is None else eye)
         rest = Rest(run.lattice.nodes[:], run.lattice.cells[:], run.surface.points[:])
         panels = []
         for index, points in bodies.items():
@@ -229,7 +229,7 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
     for ground in panel.overlays.grounds:
         _draw_ground(plotter, ground, panel.points, triangles)
     body = pv.PolyData.from_regular_faces(panel.points, triangles)
-    colours = (1 - panel.fixed[:, None]) * _rgb(BODY) + panel.fixed[:, None] * _rgb(HELD)
+    colours = (1 - panel.fixed[:, None]) * _rgb(BODY) + panel.fixed[:, None] * _rgb(FIXED)
     shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
     plotter.add_mesh(body, scalars=colours.astype(np.uint8), rgb=True, **shading)
     for corners in panel.overlays.glass:

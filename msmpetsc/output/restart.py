@@ -18,11 +18,11 @@ from msmpetsc.output.reader import (
     Result,
     as_python,
     checked_dataset,
-    damage_in_one_line,
     finished,
     newest_slot,
     object_at,
     open_result,
+    plain_damage,
 )
 from msmpetsc.output.transfer import scatter_rows
 
@@ -57,16 +57,16 @@ class Earlier:
             true_error = result.attributes.get("true_error")
         with open_result(path) as file:
             names = _checked_numbers(path, file)
-            _refuse_other_series(path, file)
+            _refuse_foreign_series(path, file)
             count, planned = finished(file), len(file["frames/time"])
             step = max(0, int(np.max(file["checkpoint/step"]))) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned, bool(names))
 
 
-def _refuse_other_series(path: Path, file: h5py.File) -> None:
+def _refuse_foreign_series(path: Path, file: h5py.File) -> None:
     """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
-    with damage_in_one_line(path):
+    with plain_damage(path):
         for name, field in FRAME_FIELDS.items():
             if name not in ("position", "surface") and name in list(file["frames"]):
                 dataset = checked_dataset(path, file, f"frames/{name}")
@@ -79,7 +79,7 @@ def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:
 
     Raises InputError for a checkpoint that no run wrote so.
     """
-    with damage_in_one_line(path):
+    with plain_damage(path):
         group = object_at(path, file, "checkpoint")
         if group is None:
             return None

@@ -37,9 +37,9 @@ from msmpetsc.output.reader import (
     FORMAT,
     FORMAT_VERSION,
     checked_dataset,
-    damage_in_one_line,
     finished,
     open_result,
+    plain_damage,
 )
 from msmpetsc.output.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
@@ -267,7 +267,7 @@ class ResultFile:
             count = finished(earlier) if self._copied is None else min(self._copied, finished(earlier))
             for index in range(count):
                 for name, dataset in datasets.items():
-                    with damage_in_one_line(self.path):
+                    with plain_damage(self.path):
                         row = dataset[index]
                     file["frames"][name][index] = row
         self.finished = count

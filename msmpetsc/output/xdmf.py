@@ -41,12 +41,12 @@ def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements:
         topology = ET.SubElement(grid, "Topology", TopologyType=kind, NumberOfElements=str(len(run[elements])))
         topology.append(_data_item(run, elements))
         geometry = ET.SubElement(grid, "Geometry", GeometryType="XYZ")
-        geometry.append(_one_frame(run, points, index))
+        geometry.append(_frame_slab(run, points, index))
         grids.append(grid)
     return grids
 
 
-def _one_frame(run: Result, points: str, index: int) -> ET.Element:
+def _frame_slab(run: Result, points: str, index: int) -> ET.Element:
     """Return frame `index` of points (T, n, 3): start, stride and count along each axis, and where to take it from."""
     _, rows, axes = run[points].shape
     item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=f"{rows} {axes}", Type="HyperSlab")

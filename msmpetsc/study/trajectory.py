@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import common_times, refuse_other_lattice
+from msmpetsc.output.compare import common_times, refuse_different_lattices
 from msmpetsc.output.reader import Result
 
 
@@ -22,7 +22,7 @@ def trajectory_error(result: Path, reference: Path) -> float:
     Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
-        refuse_other_lattice(run, true)
+        refuse_different_lattices(run, true)
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
         pairs = common_times(run.frames.time[:], true.frames.time[:])
         if len(pairs) < 2:

@@ -1,4 +1,4 @@
-"""A disk that is full, or may not be written: one line, exit status 2, and what was written goes on when there is room."""
+"""A disk that is full, or may not be written: one line, exit status 2, and the run goes on when there is room."""
 
 import os
 import resource

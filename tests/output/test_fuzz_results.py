@@ -30,7 +30,7 @@ def read_all(path: Path) -> None:
         for arrays in (run.lattice, run.surface, run.frames):
             for name in arrays:
                 arrays[name][:]
-        run.embedding, run.checkpoint
+        _ = run.embedding, run.checkpoint
 
 
 def compared(one: Path, other: Path) -> None:

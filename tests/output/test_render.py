@@ -18,7 +18,7 @@ from msmpetsc.cli import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import Frame
 from msmpetsc.output import overlays, render
-from msmpetsc.output.camera import YAW, place_camera
+from msmpetsc.output.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
 from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.schema import Region
@@ -60,9 +60,9 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
     embedding = csr_array(np.eye(rows) / factor)
     with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, Begin.OVERWRITE) as file:
         file.write("surface/triangles", np.array(ball.faces))
-        file.write("surface/points", ball.vertices + [0, 0, HEIGHTS[0]])
+        file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         file.write("lattice/cells", np.zeros((1, 8), int))
-        file.write("lattice/nodes", factor * (ball.vertices + [0, 0, HEIGHTS[0]]))
+        file.write("lattice/nodes", factor * (ball.vertices + np.array([0, 0, HEIGHTS[0]])))
         for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
         file.start_frames(len(HEIGHTS), rows, rows if surface else None)
@@ -122,7 +122,7 @@ EYES = [None, (1, -2, 0.6), (-3, 0.5, -1), (0, 0, 1), (0, -1, 0), (3, 0, 4)]
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 0, 4.0)])
 @pytest.mark.parametrize("eye", EYES)
 def test_camera_stands_upright_and_at_the_eye(gravity, eye):
-    camera = place_camera(POINTS, gravity, eye)
+    camera = camera_facing(POINTS, gravity, eye)
     axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
@@ -133,8 +133,8 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
 
 
 def test_the_longer_side_lies_across():
-    assert abs(place_camera(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
-    assert abs(place_camera(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
+    assert abs(camera_facing(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
+    assert abs(camera_facing(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
 
 
 def test_the_eye_chooses_the_side(tmp_path):
@@ -370,7 +370,7 @@ def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert drawn.shape[1] > 8192
     sheets = np.split(drawn, 26, axis=1)
-    for first, other in zip(sheets[:2] * 12, sheets[2:]):
+    for first, other in zip(sheets[:2] * 12, sheets[2:], strict=True):
         np.testing.assert_array_equal(other, first)
     assert body_rows(sheets[1])[0] > body_rows(sheets[0])[0] > 0
 
@@ -394,6 +394,6 @@ def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result,
 
 def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
     monkeypatch.setattr(render.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(InputError, match="y.png cannot be drawn: the graphics library gives a black picture"):
+    with pytest.raises(InputError, match=r"y\.png cannot be drawn: the graphics library gives a black picture"):
         render.draw(*drawing, tmp_path / "y.png")
     assert not (tmp_path / "y.png").exists()

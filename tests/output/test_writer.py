@@ -346,9 +346,9 @@ def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, 
 
 
 def test_too_small_a_disk_is_told_before_the_first_frame(tmp_path):
-    with pytest.raises(InputError, match="will need .* GB, and only .* GB are free"):
-        with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-            file.start_frames(10**6, 10**7)
+    small = pytest.raises(InputError, match=r"will need .* GB, and only .* GB are free")
+    with small, ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(10**6, 10**7)
     assert os.listdir(tmp_path) == []
 
 
@@ -367,7 +367,7 @@ def test_what_is_no_result_is_told(tmp_path, content):
     path = tmp_path / "x.h5"
     if content:
         path.write_bytes(content)
-    with pytest.raises(InputError, match="no such file|not an HDF5 file"):
+    with pytest.raises(InputError, match=r"no such file|not an HDF5 file"):
         open_result(path)
     with h5py.File(tmp_path / "y.h5", "w"):
         pass
@@ -390,7 +390,7 @@ def test_xdmf_refers_to_what_is_there(tmp_path):
     collections = ET.parse(path).getroot().findall("Domain/Grid")
     assert [grid.get("Name") for grid in collections] == ["surface", "lattice"]
     with h5py.File(tmp_path / "a b.h5") as file:
-        for collection, points in zip(collections, ("surface", "position")):
+        for collection, points in zip(collections, ("surface", "position"), strict=True):
             grids = collection.findall("Grid")
             assert [float(grid.find("Time").get("Value")) for grid in grids] == [0, 1 / 60, 2 / 60]
             for index, grid in enumerate(grids):
@@ -404,7 +404,7 @@ def read_item(item: ET.Element, file: h5py.File) -> np.ndarray:
     """What a reader of XDMF would take from the file, its declared shape and type checked."""
     if item.get("ItemType") == "HyperSlab":
         start, stride, count = np.array(item[0].text.split(), int).reshape(3, 3)
-        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count))
+        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count, strict=True))
         return read_item(item[1], file)[part].reshape([int(n) for n in item.get("Dimensions").split()])
     name, dataset = item.text.split(":")
     assert name == Path(file.filename).name

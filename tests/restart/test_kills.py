@@ -1,4 +1,4 @@
-"""Runs killed by SIGKILL at random moments, resumed, killed again: no finished frame is lost, and the end is the same."""
+"""Runs killed by SIGKILL at random moments, resumed, killed again: no frame is lost, and the end is the same."""
 
 import json
 import os

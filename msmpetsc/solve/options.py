@@ -143,7 +143,8 @@ def _is_in_library(name: str) -> bool:
 
 @cache
 def _names_in_library() -> frozenset[str]:
-    """Of the options that stand in PETSc's library and in petsc4py's; a few are words of messages, which does no harm."""
+    """Of the options that stand in PETSc's library and in petsc4py's; a few are words of messages, which does no
+    harm."""
     files = {library_file(), PETSc.__file__}
     found = {name for file in files for name in LITERAL.findall(Path(file).read_bytes())}
     return frozenset(re.sub("%l+d", "%d", name.decode()) for name in found)

@@ -95,6 +95,7 @@ class ImplicitEuler:
             lattice = self.stepper.lattice
             self.reference = Reference(self.comm, lattice, self.tau, touches=bool(self.model.penalties))
         trace, self.trace, self.stepper.observer = self.trace, None, None
+        assert self.problem is not None, "no step was taken"
         positions = [*(trace.positions if trace else []), result.position]
         errors = self.reference.errors(self.problem, positions)
         return errors[-1], trace.as_lists(index, errors[:-1]) if trace else None

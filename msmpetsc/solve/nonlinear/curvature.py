@@ -1,11 +1,11 @@
 """Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
 
-F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
-positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
-for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
-the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when
-the body is compressed anew or more than it was, or something showed a negative curvature; at all other steps the mode
-found last is followed in a few iterations.
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
+is positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is
+looked for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
+2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the
+third. At length when the body is compressed anew or more than it was, or something showed a negative curvature; at all
+other steps the mode found last is followed in a few iterations.
 """
 
 from collections.abc import Callable
@@ -113,8 +113,9 @@ class LowestCurvature:
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, q: np.ndarray, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
-        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
-        for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
+        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid
+        motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all
+        of them."""
         start = self._random(BLOCK)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
@@ -141,7 +142,8 @@ class LowestCurvature:
             residuals = self._without_rigid(self._preconditioned(x[1] - like(mass, values)[:, None] * mass * x[0]))
             w = self._unit(residuals)
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
-            values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
+            span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+            values, (x, last) = self._ritz((span, products), size)
             lowest.append(values[0])
             self.its += len(w)
             if lowest[-1] < 0:
@@ -152,8 +154,8 @@ class LowestCurvature:
         return values, x[0]
 
     def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
-        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
-        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
+        of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
         grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
         sizes, parts = np.linalg.eigh(grams[1])
@@ -169,7 +171,8 @@ class LowestCurvature:
         return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
 
     def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
-        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes are held."""
+        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
+        are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
         columns = q[self.unknowns.free].T

@@ -23,7 +23,8 @@ MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is left."""
+    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is
+    left."""
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str):
         self.functional, self.hessian = functional, hessian

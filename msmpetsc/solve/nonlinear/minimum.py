@@ -77,8 +77,8 @@ class Minimum:
         return self.functional.dual_norm(self.estimate.residual)
 
     def _second_estimate(self, nearer: Iterate, bound: float, enough: float, lowest: float) -> float:
-        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of little but
-        rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
+        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of
+        little but rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
         functional, correction = self.functional, self.estimate.correction
         first, distance = functional.norm(self.first), functional.distance(nearer.q)
         second = self.estimate(nearer, bound, enough, lowest)

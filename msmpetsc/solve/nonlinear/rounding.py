@@ -46,8 +46,8 @@ class Rounding:
         if moved > max(NEGLIGIBLE * size, HOPELESS * away):
             raise StepFailed(
                 f"cannot be solved in double precision: rounding in the stiffest springs moves the body by "
-                f"{moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; try softer materials, less different "
-                "ones, or a smaller time.step",
+                f"{moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; try softer materials, less "
+                "different ones, or a smaller time.step",
                 "rounding",
             )
         if not away > moved:

@@ -1,4 +1,5 @@
-"""Where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and no more.
+"""Examination of where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and
+no more.
 
 The estimate of a step's error is the Newton correction e at x. Where a body is compressed g may have a fold or a saddle
 between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.

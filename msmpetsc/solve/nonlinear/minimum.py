@@ -106,7 +106,7 @@ class Minimum:
         functional = self.functional
         base = functional.evaluate(x, self.f).q
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
-        longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
+        longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
         if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move

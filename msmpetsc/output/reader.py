@@ -48,28 +48,30 @@ class Result:
     attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
     lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
         have, because an older version wrote it or the scene did not ask for it, is not among them
+    file : the same as h5py has it, unchecked where the table of fields ends
     """
 
     def __init__(self, path: str | Path):
         """Raises InputError, one line, if the file is no result, or damaged."""
         self.path = Path(path)
-        self._file = open_result(path)
+        self.file = open_result(path)
         try:
             with plain_damage(self.path):
-                self.attributes = {name: as_python(value) for name, value in self._file.attrs.items()}
-                self._datasets = self._lazy(checked_datasets(self._file))
+                self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
+                self._datasets = self._lazy(checked_datasets(self.file))
         except BaseException:
             self.close()
             raise
         self.lattice, self.surface, self._embedding, self.frames, self._checkpoint = map(self._group, GROUPS)
 
     def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
-        count = finished(self._file)
+        count = finished(self.file)
         return {name: LazyArray(data, count if name.startswith("frames/") else None) for name, data in datasets.items()}
 
     def _group(self, group: str) -> Arrays:
-        names = [name.partition("/") for name in self._datasets]
-        return Arrays(group, {short: self[f"{group}/{short}"] for its_group, _, short in names if its_group == group})
+        start = f"{group}/"
+        arrays = {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
+        return Arrays(group, arrays)
 
     def __enter__(self) -> "Result":
         return self
@@ -79,10 +81,10 @@ class Result:
 
     def close(self) -> None:
         """Close the file; a second call does nothing. Afterwards only what was read already can be used."""
-        self._file.close()
+        self.file.close()
 
     def __repr__(self) -> str:
-        if not self._file:
+        if not self.file:
             return f"<closed {self.path}>"
         nodes, frames = self.lattice.nodes.shape[0], len(self.frames.time)
         return f"<{self.path}: {frames} frames of {nodes} nodes, {self.attributes.get('command', 'no command')}>"

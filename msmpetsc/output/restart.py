@@ -18,7 +18,6 @@ from msmpetsc.output.reader import (
     Result,
     as_python,
     checked_dataset,
-    finished,
     newest_slot,
     object_at,
     open_result,
@@ -55,23 +54,21 @@ class Earlier:
         with Result(path) as result:  # which checks it
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
-        with open_result(path) as file:
-            names = _checked_numbers(path, file)
-            _refuse_foreign_series(path, file)
-            count, planned = finished(file), len(file["frames/time"])
-            step = max(0, int(np.max(file["checkpoint/step"]))) if names is not None and count else 0
+            names = _checked_numbers(path, result.file)
+            _refuse_foreign_series(result)
+            count, planned = len(result.frames.time), result.frames.time.planned[0]
+            step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned, bool(names))
 
 
-def _refuse_foreign_series(path: Path, file: h5py.File) -> None:
+def _refuse_foreign_series(result: Result) -> None:
     """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
-    with plain_damage(path):
-        for name, field in FRAME_FIELDS.items():
-            if name not in ("position", "surface") and name in list(file["frames"]):
-                dataset = checked_dataset(path, file, f"frames/{name}")
-                if dataset.dtype != field.dtype or dataset.shape[1:] != field.shape[1:]:
-                    raise InputError(f"{path} is damaged: frames/{name} has shape {dataset.shape}")
+    for name, array in result.frames.items():
+        if name in FRAME_FIELDS and name not in ("position", "surface"):
+            field = FRAME_FIELDS[name]
+            if array.dtype != field.dtype or array.shape[1:] != field.shape[1:]:
+                raise InputError(f"{result.path} is damaged: frames/{name} has type {array.dtype}")
 
 
 def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:

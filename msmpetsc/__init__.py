@@ -3,6 +3,7 @@
 import hashlib
 import os
 from pathlib import Path
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -33,3 +34,15 @@ def open(path: str | Path) -> "Result":  # noqa: F821
     from msmpetsc.output.reader import Result  # here: the package itself stays quick to import
 
     return Result(path)
+
+
+def run(scene: str | Path | None = None, output: str | Path | None = None, **options: Any) -> Path:
+    """Simulate a scene as ``msmpetsc run`` does, on all ranks, and return the path of the result (cli.main.simulate).
+
+        path = msmpetsc.run("scenes/bunny_fall.toml", "out/b.h5", frames=10, petsc_options={"ksp_rtol": 1e-5})
+
+    Raises InputError, one line, for what cannot be used, and StepFailed for a step that did not converge.
+    """
+    from msmpetsc.cli.main import simulate
+
+    return simulate(scene, output, **options)

@@ -13,7 +13,7 @@ from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from test_cli import IN_ONE_PROCESS
 
-from msmpetsc.cli.describe import log_model, taken
+from msmpetsc.cli.march import log_model, taken
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body

@@ -31,7 +31,7 @@ from msmpetsc.output.writer import ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene
-from msmpetsc.solve.instrumentation import Measured, begin_timing
+from msmpetsc.solve.instrumentation import Probes, begin_timing
 from msmpetsc.solve.options import refuse_early
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.presets import PRESETS
@@ -51,7 +51,7 @@ class RunPlan:
 
     request: RunRequest
     scene: Scene
-    measured: Measured
+    probes: Probes
     interval: Interval
     resumed: Resumed | None
     attributes: dict[str, str | int]
@@ -87,14 +87,14 @@ def prepare(comm: MPI.Comm, request: RunRequest, earlier: Earlier | None, kernel
     began = perf_counter()
     if request.measure:
         begin_timing()
-    measured, interval = Measured(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
+    probes, interval = Probes(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-    refuse_bad_options(comm, scene, measured)
+    refuse_bad_options(comm, scene, probes)
     refuse_steps_beyond(scene.time.steps, request, earlier.step if earlier else 0)
     on_root(comm, lambda: refuse_unwritable(request.measure))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, measured, interval, resumed, attributes, began, kernels_are_new)
+    return RunPlan(request, scene, probes, interval, resumed, attributes, began, kernels_are_new)
 
 
 def march(comm: MPI.Comm, plan: RunPlan) -> Outcome:
@@ -104,7 +104,7 @@ def march(comm: MPI.Comm, plan: RunPlan) -> Outcome:
         compilation_logged(plan.kernels_are_new),
         Signals(comm) as signals,
         open_output(comm, plan) as file,
-        Simulation(comm, plan.scene, described_model(comm, plan), plan.measured) as simulation,
+        Simulation(comm, plan.scene, described_model(comm, plan), plan.probes) as simulation,
     ):
         try:
             with ending_together(comm):

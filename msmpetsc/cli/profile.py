@@ -1,15 +1,14 @@
 """What a run cost, as `--measure` writes it: where the time went, memory, and on what machine."""
 
 import json
-import os
 import platform
-import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import psutil
 from mpi4py import MPI
 
 from msmpetsc import __version__
@@ -90,21 +89,30 @@ def _write(path: Path, text: str, mode: str = "w") -> None:
 
 
 def peak_memory() -> int:
-    """The most of this process that ever was resident [byte]; getrusage would count that of its parent, too, as it
-    was when this process was started."""
-    status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    found = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
-    return 1024 * (found[0] if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    """Return the most memory of this process that ever was resident [byte].
+
+    getrusage counts that of its parent, too, as it was when this process was started; the kernel's own count does not.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
+    peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
+    return 1024 * peaks[0] if peaks else psutil.Process().memory_info().rss
 
 
 def machine() -> dict[str, Any]:
     """Return processor, cores, memory [byte] and system."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    return {
+        "cpu": processor(),
+        "cores": psutil.cpu_count(),
+        "memory": psutil.virtual_memory().total,
+        "system": platform.platform(terse=True),
+    }
+
+
+def processor() -> str:
+    """Return the name of the processor, which psutil does not know."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if psutil.LINUX else []
     names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    cpu = names[0] if names else platform.processor() or platform.machine()
-    return {"cpu": cpu, "cores": os.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def versions() -> dict[str, str]:

@@ -40,7 +40,7 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
     request = request.going_on_from(earlier)
     with lent_options(comm, request.petsc_options):
         from msmpetsc.cli.march import read_scene
-        from msmpetsc.solve.instrumentation import Measured
+        from msmpetsc.solve.instrumentation import Probes
         from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
         from msmpetsc.solve.petsc.device import choose
         from msmpetsc.solve.presets import find_preset, shown_options
@@ -50,7 +50,7 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
         choose(comm, request.device)
         if request.scene or earlier:
             scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-            solvers = solvers_of(scene, Measured(request.true_error, request.trace))
+            solvers = solvers_of(scene, Probes(request.true_error, request.trace))
         elif request.set or request.frames:
             raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
         else:

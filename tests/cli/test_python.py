@@ -113,7 +113,7 @@ def test_keywords_are_said_as_words():
         "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
         '--set=title="a b"',
     ]
-    assert words_of({"ksp_view": None, "options_left": False}) == ["-ksp_view", "-options_left", "False"]
+    assert words_of({"ksp_view": None, "options_left": False}) == ["-ksp_view", "-options_left", "false"]
 
 
 ON_RANKS = """
@@ -131,5 +131,5 @@ except InputError as error:
 def test_on_all_ranks(scene: Path, tmp_path: Path):
     done = run(2, "-c", ON_RANKS, scene, tmp_path / "x.h5", timeout=60)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("refused:  exists") == 2  # raised on both
+    assert done.stdout.count("refused:") == done.stdout.count(" exists") == 2  # raised on both
     assert done.stderr.count("frame 1/1") == 1

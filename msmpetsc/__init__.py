@@ -3,7 +3,10 @@
 import hashlib
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msmpetsc.output.reader import Result
 
 __version__ = "0.1.0"
 
@@ -23,7 +26,7 @@ def _kernel_folder() -> Path:
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
 
 
-def open(path: str | Path) -> "Result":  # noqa: F821
+def open(path: str | Path) -> "Result":
     """A result file, to be read: frames, lattice, surface, embedding, scene. Needs neither MPI nor PETSc.
 
         with msmpetsc.open("out/bunny_fall.h5") as run:

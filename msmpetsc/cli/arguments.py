@@ -51,9 +51,12 @@ def parsed_apart(ours: list[str], petsc: list[str], words: list[str]) -> argpars
 
     Raises InputError.
     """
-    parser = command_parser()
-    _refuse_one_dash(parser, ours, petsc)
-    args = parser.parse_args(ours, argparse.Namespace(petsc_options=tuple(petsc), words=tuple(words)))
+    _refuse_one_dash(ours, petsc)
+    given = argparse.Namespace(petsc_options=tuple(petsc), words=tuple(words))
+    args, unknown = command_parser().parse_known_args(ours, given)
+    if unknown:
+        near = did_you_mean(unknown[0], option_names(args.command))
+        raise InputError(f"{args.command}: unknown argument {unknown[0]}{near}")
     if petsc and args.command not in TAKE_PETSC_OPTIONS:
         raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
     return args
@@ -74,7 +77,7 @@ def _is_petsc_option(word: str) -> bool:
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
 
 
-def _refuse_one_dash(parser: argparse.ArgumentParser, ours: list[str], petsc: list[str]) -> None:
+def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
     """Raise InputError for options of ours that lack a dash, and for any of PETSc's where there is no use for them."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # argparse says so
@@ -89,7 +92,7 @@ def _refuse_one_dash(parser: argparse.ArgumentParser, ours: list[str], petsc: li
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that speaks on rank 0 only, and names the nearest option for an unknown one."""
+    """A parser that prints on rank 0 only, and raises InputError."""
 
     def error(self, message: str):
         raise InputError(message)
@@ -97,13 +100,6 @@ class Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
         if on_first_rank():
             super()._print_message(message, file)
-
-    def parse_args(self, words: Any = None, namespace: Any = None) -> argparse.Namespace:
-        args, unknown = self.parse_known_args(words, namespace)
-        if unknown:
-            near = did_you_mean(unknown[0], option_names(args.command))
-            raise InputError(f"{args.command}: unknown argument {unknown[0]}{near}")
-        return args
 
 
 def command_parser() -> Parser:

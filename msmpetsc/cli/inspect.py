@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene, args.set, PRESETS)
     before = peak_memory()
     body = read_body(MPI.COMM_WORLD, scene)
+    assert body.surface is not None  # which rank 0 has
     mesh = peak_memory() - before
     shares, counted = shares_of(body, scene.cages, args.ranks, MOST_BUILT)
     cells = shares.cells.sum()

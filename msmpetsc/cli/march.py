@@ -80,7 +80,7 @@ class Outcome:
         return not self.signal and self.failure is None
 
 
-def prepare(comm: MPI.Comm, request: RunRequest, earlier: Earlier | None, kernels_are_new: bool) -> RunPlan:
+def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, kernels_are_new: bool) -> RunPlan:
     """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
     refuse_early(comm, option_names("run"))
     choose(comm, request.device)
@@ -97,7 +97,7 @@ def prepare(comm: MPI.Comm, request: RunRequest, earlier: Earlier | None, kernel
     return RunPlan(request, scene, probes, interval, resumed, attributes, began, kernels_are_new)
 
 
-def march(comm: MPI.Comm, plan: RunPlan) -> Outcome:
+def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
     """Build the model and take its steps; after each, call the observers (collective)."""
     failure = None
     with (
@@ -126,7 +126,7 @@ def march(comm: MPI.Comm, plan: RunPlan) -> Outcome:
     return Outcome(simulation, file, cost, checkpoints.signal, failure)
 
 
-def finish(comm: MPI.Comm, plan: RunPlan, outcome: Outcome, started: float) -> int:
+def finish(comm: MPI.Intracomm, plan: RunPlan, outcome: Outcome, started: float) -> int:
     """Write what stands beside the result and say how the run ended; return the exit status (collective).
 
     started : count of perf_counter at the start of the command [s]
@@ -147,7 +147,7 @@ def finish(comm: MPI.Comm, plan: RunPlan, outcome: Outcome, started: float) -> i
     return 0
 
 
-def tell_done(comm: MPI.Comm, plan: RunPlan) -> int:
+def tell_done(comm: MPI.Intracomm, plan: RunPlan) -> int:
     """Finish the files of a run that has all its frames; return the exit status (collective)."""
     on_root(comm, lambda: write_companions(plan.request, whole=True))
     log.info("%s has all its %d frames: nothing left to do", plan.request.path, plan.scene.stored)
@@ -163,6 +163,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     def changed(changes: list[str]) -> Scene:
         if request.scene is not None:
             return load_scene(request.scene, changes, PRESETS)
+        assert earlier is not None  # as earlier_run sees to
         return stored_scene(earlier, changes, PRESETS)
 
     changes = [] if request.preset is None else [f"solver.preset={json.dumps(request.preset)}"]
@@ -183,7 +184,7 @@ def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
             raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
 
 
-def attributes_of(comm: MPI.Comm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
+def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
     """Return what the file says of the run that made it; PETSc's options are the user's, before ours are among them."""
     options = PETSc.Options().getAll().items()
     return {
@@ -198,7 +199,7 @@ def attributes_of(comm: MPI.Comm, scene: Scene, request: RunRequest) -> dict[str
     }
 
 
-def open_output(comm: MPI.Comm, plan: RunPlan) -> ResultFile:
+def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
     request = plan.request
     if plan.resumed:
@@ -209,7 +210,7 @@ def open_output(comm: MPI.Comm, plan: RunPlan) -> ResultFile:
     return file
 
 
-def described_model(comm: MPI.Comm, plan: RunPlan) -> Model:
+def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     """Build the model and say what it is made of (collective)."""
     model = build_model(comm, plan.scene)
     log_model(comm, model)
@@ -218,7 +219,7 @@ def described_model(comm: MPI.Comm, plan: RunPlan) -> Model:
     return model
 
 
-def start_output(comm: MPI.Comm, plan: RunPlan, file: ResultFile, simulation: Simulation) -> int:
+def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, simulation: Simulation) -> int:
     """Write the model, go on where an earlier run stopped, and make room for frames (collective).
 
     Returns the number of frames of the steps taken so far.
@@ -232,7 +233,7 @@ def start_output(comm: MPI.Comm, plan: RunPlan, file: ResultFile, simulation: Si
     return simulation.stored_until(simulation.step) if simulation.step else 0
 
 
-def write_model(comm: MPI.Comm, file: ResultFile, model: Model) -> None:
+def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     """Write the parts of the file that do not change with time (collective)."""
     lattice, owned = model.lattice, model.lattice.owned
     springs = slice(lattice.springs_owned)
@@ -291,16 +292,16 @@ def tell_stop(number: int, path: Path, simulation: Simulation) -> int:
         Signal(number).name, simulation.step, simulation.steps, simulation.step * simulation.time_step,
         shlex.quote(str(path)),
     )  # fmt: skip
-    return STATUS[Signal(number)]
+    return STATUS[number]
 
 
 # What a run says of itself
 
 
-def log_model(comm: MPI.Comm, model: Model) -> None:
-    """Size of the body, counts of the lattice, volumes and masses side by side, nodes that the scene's tables take
-    (collective)."""
+def log_model(comm: MPI.Intracomm, model: Model) -> None:
+    """Log size, volume and mass of body and lattice, counts, and nodes that the scene's tables take (collective)."""
     lattice, body = model.lattice, model.body
+    assert body is not None  # as in every model that build_model makes
     held = int(lattice.pinned[: lattice.owned].sum())
     own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum())
     cells, springs, pinned, mass = (comm.allreduce(number) for number in own)
@@ -319,12 +320,12 @@ def log_model(comm: MPI.Comm, model: Model) -> None:
 
 
 def sides(lengths: Iterable[float]) -> str:
-    """0.3 x 0.2325 x 0.2974"""
+    """Return "0.3 x 0.2325 x 0.2974" of three lengths."""
     return " x ".join(f"{length:.4g}" for length in lengths)
 
 
 def taken(reaches: Iterable[Reach]) -> list[str]:
-    """What each anchor and force takes; of a force's nodes some may be held, which take their share of it, too."""
+    """Name what each anchor and force takes; of a force's nodes some may be held, which take their part of it, too."""
     named = []
     for reach in reaches:
         if reach.key.startswith("anchor"):
@@ -337,7 +338,7 @@ def taken(reaches: Iterable[Reach]) -> list[str]:
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
-    """How long it took [s], and which files there are; the first of them holds the frames."""
+    """Log how long it took [s], and which files there are; the first of them holds the frames."""
     sizes = {path: tqdm.format_sizeof(path.stat().st_size, "B") for path in files if path.is_file()}
     result, *others = (f"{path} ({size})" for path, size in sizes.items())
     log.info("took %s, %s of it before the first step", spoken(seconds), spoken(setup))
@@ -345,5 +346,5 @@ def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) ->
 
 
 def spoken(seconds: float) -> str:
-    """A time as a person would say it; short ones with a digit more."""
+    """Return a time as a person would say it; short ones with a digit more."""
     return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)

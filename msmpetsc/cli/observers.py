@@ -1,5 +1,6 @@
 """The observers of a run's steps: frames and checkpoints are written, progress is shown, signals are heard."""
 
+import logging
 import os
 import re
 import signal
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from mpi4py import MPI
 
@@ -23,7 +24,7 @@ from msmpetsc.output.writer import ResultFile
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation
 
-STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
+STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 CHECKPOINT_TIME = 0.01  # part of the time that checkpoints may take
 SECONDS = {"s": 1, "min": 60, "h": 3600}
 
@@ -61,7 +62,7 @@ class ProgressLine:
     @contextmanager
     def shown(cls, comm: MPI.Comm, steps: int) -> Iterator["ProgressLine"]:
         """Show it in the block, and end the line after it."""
-        progress = Progress(steps, enabled=comm.rank == 0 and log.isEnabledFor(20))
+        progress = Progress(steps, enabled=comm.rank == 0 and log.isEnabledFor(logging.INFO))
         try:
             yield cls(progress)
         finally:
@@ -137,7 +138,7 @@ class Signals:
 
     def __init__(self, comm: MPI.Comm):
         self.comm, self._asked, self._stepping = comm, 0, False
-        self._before: dict[int, object] = {}
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Signals":
         if threading.current_thread() is threading.main_thread():

@@ -54,7 +54,7 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
         elif request.set or request.frames:
             raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
         else:
-            solvers = {"": (find_preset(request.preset or Solver().preset), 0)}
+            solvers = {"": (find_preset(request.preset or Solver.model_fields["preset"].default), 0)}
         on_root(comm, lambda: refuse_bad_values(solvers))
         if comm.rank == 0:
             print("\n".join(shown_options(solvers)))

@@ -7,19 +7,7 @@ import sys
 import pytest
 from conftest import ENVIRONMENT, run
 
-SLOW = {
-    "numba",
-    "numpy",
-    "scipy",
-    "h5py",
-    "mpi4py",
-    "petsc4py",
-    "pydantic",
-    "trimesh",
-    "meshio",
-    "matplotlib",
-    "pyvista",
-}
+SLOW = {"numba", "numpy", "scipy", "h5py", "mpi4py", "petsc4py", "pydantic", "trimesh", "meshio", "pyvista"}
 IMPORTS = """
 import json, sys
 from msmpetsc.cli.main import main

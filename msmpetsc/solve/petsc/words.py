@@ -64,7 +64,8 @@ def _words_of_mapping(options: Mapping[str, Any]) -> list[str]:
         option = f"-{name.removeprefix('-')}"
         if not re.fullmatch(r"-[A-Za-z]\w*", option):
             raise ValueError(f"{option} is no name of an option")
-        words += [option] if value is None or value is True else [option, str(value).lower() if value is False else str(value)]
+        text = "false" if value is False else str(value)
+        words += [option] if value is None or value is True else [option, text]
     return words
 
 

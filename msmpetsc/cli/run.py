@@ -41,7 +41,7 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
     with lent_options(comm, request.petsc_options):
         from msmpetsc.cli.march import read_scene
         from msmpetsc.solve.instrumentation import Probes
-        from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
+        from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
         from msmpetsc.solve.petsc.device import choose
         from msmpetsc.solve.presets import find_preset, shown_options
         from msmpetsc.solve.simulate import solvers_of
@@ -58,5 +58,5 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
         on_root(comm, lambda: refuse_bad_values(solvers))
         if comm.rank == 0:
             print("\n".join(shown_options(solvers)))
-        tell_none_left()
+        silence_options_left()
     return 0

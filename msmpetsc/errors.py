@@ -36,7 +36,7 @@ PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
 
 
 def as_expected(error: Exception) -> MsmpetscError | None:
-    """The error as one of ours, if it is one that a user can meet: memory that is not enough is."""
+    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is."""
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
@@ -44,21 +44,21 @@ def as_expected(error: Exception) -> MsmpetscError | None:
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name nearest to a wrong one; None where none is near."""
+    """Return the valid name nearest to a wrong one; None where none is near."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """ ", did you mean 'x'?" with the nearest valid name; empty where none is near."""
+    """Return ", did you mean 'x'?" with the nearest valid name; nothing where none is near."""
     near = nearest(name, valid)
     return f", did you mean {near!r}?" if near else ""
 
 
 def one_line(error: Exception, length: int = 160) -> str:
-    """The first line of what a library says went wrong, of printable characters: files speak through it, too."""
+    """Return the first line of what a library says went wrong, in printable characters: files speak through it, too."""
     return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)
 
 
 def printable(text: str, length: int = 160) -> str:
-    """The text, cut, without what would act on a terminal."""
+    """Return the text, cut, without what would act on a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:length])

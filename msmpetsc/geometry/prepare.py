@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
 
 # A repair that keeps less than this of the area did not mend the body but lost it: of
@@ -148,7 +149,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
     if (value is not None) != (name in TAKES_VALUE):
         raise InputError(f"prepare: '{name}' takes {'a' if name in TAKES_VALUE else 'no'} value")
     try:
-        result = STEPS[name](surface, *([] if value is None else [value]))
+        result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
         raise InputError(f"prepare: '{name}': {error}") from error
     except Exception as error:  # what the libraries below raise on odd meshes is not documented

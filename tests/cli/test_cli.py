@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from conftest import ENVIRONMENT, run
 
-from msmpetsc.cli.main import split_petsc_options
+from msmpetsc.cli.arguments import split_petsc_options
 from msmpetsc.output.reader import finished
 
 SCENE = """

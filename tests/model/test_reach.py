@@ -13,8 +13,8 @@ from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from test_cli import IN_ONE_PROCESS
 
-from msmpetsc.cli.describe import log_model, taken
 from msmpetsc.cli.main import main
+from msmpetsc.cli.march import log_model, taken
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body
 from msmpetsc.model.reach import Reach

@@ -10,9 +10,8 @@ from conftest import run
 from mpi4py import MPI
 from test_step import beam, petsc_options, swing, weight  # noqa: F401 (petsc_options is a fixture)
 
-from msmpetsc.cli import compare, fetch, inspect, plan, render, study
+from msmpetsc.cli.arguments import COMMANDS, option_names
 from msmpetsc.cli.main import main
-from msmpetsc.cli.run import add_parser
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -171,14 +170,9 @@ def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options:
 
 
 def test_an_option_of_ours_with_one_dash_is_told_its_name(capsys):
-    import argparse
-
     found = 0
-    for module in (compare, fetch, inspect, plan, render, study, None):
-        name = module.__name__.rpartition(".")[2] if module else "run"
-        commands = argparse.ArgumentParser().add_subparsers()
-        (module.add_parser if module else add_parser)(commands)
-        for option in commands.choices[name]._option_string_actions:
+    for name in COMMANDS:
+        for option in option_names(name):
             if option.startswith("--") and (name, option) not in {("run", "--help"), ("inspect", "--help")}:
                 assert main([name, option[1:], "3"]) == 2
                 assert f"did you mean '{option}'?" in capsys.readouterr().err

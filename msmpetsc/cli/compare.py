@@ -6,7 +6,7 @@ import numpy as np
 
 from msmpetsc.cli.arguments import refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import AT_REST, Comparison, Field, compare, place
+from msmpetsc.output.compare import Comparison, FieldError, compare, point_text, rest_of
 from msmpetsc.output.reader import Result, refuse_deadly
 
 SAME, DIFFERENT = 0, 1
@@ -44,7 +44,7 @@ def print_what_is_not_shared(first: Result, second: Result, comparison: Comparis
         print(f"{name} is in {first.path if name in first.frames else second.path} only: not compared")
 
 
-def row(field: Field, comparison: Comparison, rtol: float) -> str:
+def row(field: FieldError, comparison: Comparison, rtol: float) -> str:
     """Return a line of the table; frames are numbered as in the first file."""
     index, first = int(np.argmax(field.errors)), field.first_above(rtol)
     since = "-" if first is None else comparison.pairs[first, 0]
@@ -65,17 +65,16 @@ def print_first_difference(result: Result, comparison: Comparison, rtol: float) 
     names = ", ".join(name for name, index in firsts.items() if index == first)
     print(f"they differ from frame {comparison.pairs[first, 0]} on, t = {comparison.times[first]:g} s: {names}")
     for field in comparison.fields:
-        if field.name in AT_REST and field.name in firsts:
+        if field.name in ("position", "surface") and field.name in firsts:
             print_node(result, comparison, field, firsts[field.name])
             break
     return True
 
 
-def print_node(result: Result, comparison: Comparison, field: Field, first: int) -> None:
+def print_node(result: Result, comparison: Comparison, field: FieldError, first: int) -> None:
     """Print which node or surface point is farthest off at a frame, and where it is at rest."""
-    group, stored = AT_REST[field.name]
-    number, array = field.worst[first], getattr(result, group).get(stored)
-    rest = f", at rest at {place(array[number])}" if array is not None else ""
+    number, rest_rows = field.worst[first], rest_of(result, field.name)
+    rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
     off = f"{field.errors[first] * field.scale:.3g} m off at frame {comparison.pairs[first, 0]}"
     print(f"{kind} {number}{rest}, is {off}, farther than any other")

@@ -27,7 +27,7 @@ from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.reach import Reach
 from msmpetsc.output.progress import duration
 from msmpetsc.output.restart import Earlier
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene
@@ -203,11 +203,9 @@ def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
     request = plan.request
     if plan.resumed:
-        file = plan.resumed.file(comm, plan.attributes)
-    else:
-        file = ResultFile(request.path, comm, plan.attributes, request.overwrite)
-    file.gathers = request.gather
-    return file
+        return plan.resumed.file(comm, plan.attributes, request.gather)
+    begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
+    return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.writer import ResultFile
 

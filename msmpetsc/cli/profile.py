@@ -15,7 +15,7 @@ from msmpetsc import __version__
 from msmpetsc.backend.arrays import on_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation

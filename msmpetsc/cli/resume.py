@@ -11,10 +11,9 @@ from mpi4py import MPI
 from msmpetsc import __version__
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
-from msmpetsc.output.continued import Anew, InPlace
 from msmpetsc.output.reader import refuse_deadly
-from msmpetsc.output.restart import Earlier, read_saved, refuse_other_lattice
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.reading import scene_of
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
@@ -33,7 +32,7 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 def examined(path: Path) -> Earlier:
     """Look at the file of an earlier run, on one rank. Raises InputError for what is no result, or a damaged one."""
     refuse_deadly(path)
-    return Earlier.look(path)
+    return Earlier.read(path)
 
 
 def options_to_keep(earlier: Earlier, given: Sequence[str]) -> Iterator[str]:
@@ -110,15 +109,15 @@ class Resumed:
             if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
                 yield f"-{name}: {_shown(was.get(name))} in {earlier.path}, {_shown(options.get(name))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
-            return InPlace(earlier.path, comm, attributes)
+            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
         attributes["scene_file"] = attributes["scene_file"] or earlier.texts["scene_file"]
-        return Anew(earlier.path, comm, attributes, earlier.finished)
+        return ResultFile(earlier.path, comm, attributes, Begin.COPY, gathers)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
         """Raise InputError where the mesh makes another lattice than it did (collective)."""
@@ -126,17 +125,17 @@ class Resumed:
         rows = {"lattice/nodes": lattice.nodes[: lattice.owned]}
         if not self.differs:
             rows["lattice/mass"] = lattice.mass
-        refuse_other_lattice(comm, self.earlier.path, rows)
+        refuse_changed_lattice(comm, self.earlier.path, rows)
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
-        path, saved = self.earlier.path, read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
+        path, saved = self.earlier.path, read_checkpoint(comm, self.earlier.path, simulation.model.lattice.owned)
         if saved is not None and saved.step >= simulation.steps:
             raise InputError(f"{path} has come to step {saved.step} already: it cannot end at step {simulation.steps}")
         kept = 0 if saved is None else simulation.stored_until(saved.step)
         if kept > self.earlier.finished:
             raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
-        if isinstance(file, Anew) and self.differs:  # later frames are of how it was
+        if self.differs:  # later frames are of how it was
             file.keep(kept)
         if saved is None:
             return

@@ -20,6 +20,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.errors import InputError, one_line, printable
 from msmpetsc.output.lazy import Arrays, LazyArray
+from msmpetsc.scene.toml import toml_of
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")
@@ -110,8 +111,6 @@ class Result:
         text = self.attributes.get("scene")
         if not isinstance(text, str):
             raise InputError(f"{self.path} does not say its scene")
-        from msmpetsc.scene.reading import toml_of  # loads pydantic: who reads frames need not wait
-
         try:
             return toml_of(text)
         except (ValueError, RecursionError) as error:

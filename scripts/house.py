@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Prints the measures of a tree of msmpetsc as a Markdown table: state, files, imports, findings, README, start-up times.
+"""Prints the measures of a tree of msmpetsc as a Markdown table: state, files, imports, findings, times.
 
     scripts/house.py [FOLDER] [--before FOLDER] [--quick]
 
 FOLDER is a clone, this one if none is given; --before puts an older one's column beside it. A tree with a .venv runs
-by its own Python. --quick leaves out what runs the program, ruff or mypy. Rules are those of this clone's pyproject.toml.
+by its own Python. --quick leaves out what runs the program, ruff or mypy, whose rules are this clone's.
 """
 
 import ast
@@ -91,7 +91,9 @@ def classes(modules: dict[str, ast.Module]) -> dict[str, list[ast.ClassDef]]:
 def state(modules: dict[str, ast.Module]) -> Iterator[tuple[str, object]]:
     """Yield rows of classes and their attributes."""
     kinds = classes(modules)
-    counts = [(name, *map(len, attributes(node))) for name, nodes in kinds.items() for node in nodes]
+    counts: list[tuple[str, int, int]] = []
+    for name, nodes in kinds.items():
+        counts += [(name, len(every), len(late)) for every, late in map(attributes, nodes)]
     shown = [f"{name} {every} ({late})" for name, every, late in sorted(counts, key=lambda row: -row[1])]
     yield "attributes of Stepper (born late)", next(text for text in shown if text.startswith("Stepper "))
     yield "most attributes (born late)", ", ".join(shown[:5])
@@ -118,7 +120,8 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     """Return the groups of modules that import each other."""
 
     def reached(start: str) -> set[str]:
-        seen, ahead = set(), [start]
+        seen: set[str] = set()
+        ahead = [start]
         while ahead:
             new = arrows[ahead.pop()] - seen
             seen |= new
@@ -159,10 +162,13 @@ def long_functions(modules: dict[str, ast.Module]) -> Iterator[tuple[int, str]]:
     for module, tree in modules.items():
         for node in (node for node in ast.walk(tree) if isinstance(node, DEF)):
             first = node.body[0]
-            text = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) is not None else 0
-            lines = node.end_lineno - node.lineno + 1 - text
+            lines = height(node) - (height(first) if ast.get_docstring(node) is not None else 0)
             if lines > LONGEST:
                 yield lines, f"{module}.{node.name}"
+
+
+def height(node: ast.stmt) -> int:
+    return (node.end_lineno or node.lineno) - node.lineno + 1
 
 
 # ---- documents

@@ -103,7 +103,7 @@ def test_a_strained_block_stores_the_energy_of_an_isotropic_solid(name: str, rot
 
 
 def test_the_three_stiffnesses_of_a_bulk_lattice():
-    """E = 7/4 k1 / h and isotropy k1 = k2 + 8/3 k3 (design: lattice elasticity)."""
+    """E = 7/4 k1 / h and isotropy k1 = k2 + 8/3 k3 (msmpetsc/README.md: lattice elasticity)."""
     kinds = np.array([EDGE, FACE_DIAGONAL, SPACE_DIAGONAL])
     k1, k2, k3 = calibrated_stiffness(E, H, kinds, np.array([4, 2, 1]))
     assert 7 / 4 * k1 / H == pytest.approx(E) and k1 == pytest.approx(k2 + 8 / 3 * k3)

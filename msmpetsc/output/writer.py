@@ -88,7 +88,7 @@ class ResultFile:
     gathers = False
 
     def __init__(self, path: str | Path, comm, attributes: dict, overwrite: bool = False):
-        """comm: an mpi4py communicator. attributes: see README.md of this folder; format and format_version are added here."""
+        """comm: an mpi4py communicator. attributes: see design.md; format and format_version are added here."""
         self.path = Path(path)
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm = comm

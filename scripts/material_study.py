@@ -23,8 +23,9 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.solve.nonlinear.presets import find_preset
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
 
 E, NU, DENSITY, GRAVITY = 1e6, 1 / 4, 1000.0, 9.81  # [Pa], [-], [kg/m^3], [m/s^2]
 C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E  # [Pa]
@@ -192,7 +193,7 @@ def steps(
     stepper = Stepper(COMM, lattice, t, find_preset(preset), error=error)
     try:
         for load in loads:
-            q, before = stepper.step(q, 2 * q - before, load).position, q
+            q, before = stepper.step(StepProblem(q, 2 * q - before, load)).position, q
             yield q, before
     finally:
         stepper.destroy()

@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
     initialise(MPI.COMM_WORLD, args.petsc_options)
     from msmpetsc.model.build import read_body
     from msmpetsc.model.partition import shares_of
-    from msmpetsc.solve.nonlinear.presets import PRESETS
-    from msmpetsc.solve.petsc.options import refuse_early
+    from msmpetsc.solve.options import refuse_early
+    from msmpetsc.solve.presets import PRESETS
 
     refuse_early(MPI.COMM_WORLD, args.parser._option_string_actions)
     signal.signal(signal.SIGTERM, stop)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def try_all(args: argparse.Namespace, target: float) -> list:
     """The trials, each told of when it is done."""
-    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.measure import Bench
     from msmpetsc.study.plan import Planner
     from msmpetsc.study.process import Processes

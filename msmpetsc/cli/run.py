@@ -36,7 +36,7 @@ from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
-    from msmpetsc.solve.instrumentation import Measured
+    from msmpetsc.solve.instrumentation import Probes
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -92,7 +92,7 @@ class ListPresets(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_) -> None:
-        from msmpetsc.solve.nonlinear.presets import PRESETS
+        from msmpetsc.solve.presets import PRESETS
 
         if MPI.COMM_WORLD.rank == 0:
             width = max(map(len, PRESETS))
@@ -114,8 +114,8 @@ def run(args: argparse.Namespace) -> int:
 
     all_are_new = cache_is_empty()
     from msmpetsc.model.build import build_model
+    from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.petsc.device import choose
-    from msmpetsc.solve.petsc.options import refuse_early
     from msmpetsc.solve.simulate import (
         Simulation,
         refuse_bad_options,
@@ -180,9 +180,9 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
     earlier = resume.look(comm, args) if args.scene or args.resume else None
     initialise(comm, args.petsc_options)
-    from msmpetsc.solve.nonlinear.presets import find_preset, shown_options
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
     from msmpetsc.solve.petsc.device import choose
-    from msmpetsc.solve.petsc.options import refuse_bad_values, refuse_early, tell_none_left
+    from msmpetsc.solve.presets import find_preset, shown_options
     from msmpetsc.solve.simulate import solvers_of
 
     refuse_early(comm, args.parser._option_string_actions)
@@ -200,16 +200,16 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     return 0
 
 
-def what_is_measured(args: argparse.Namespace) -> "Measured":
+def what_is_measured(args: argparse.Namespace) -> "Probes":
     """Raises InputError for numbers of steps that are none."""
-    from msmpetsc.solve.instrumentation import Measured, begin_timing
+    from msmpetsc.solve.instrumentation import Probes, begin_timing
 
     refuse_below_one(args, "true_error", "trace")
     if args.trace is not None and args.measure is None:
         raise InputError("--trace needs --measure, the file that it is written to")
     if args.measure:
         begin_timing()
-    return Measured(args.true_error, args.trace)
+    return Probes(args.true_error, args.trace)
 
 
 def refuse_steps_beyond(steps: int, args: argparse.Namespace, taken: int) -> None:
@@ -245,7 +245,7 @@ def finish(path: Path, args: argparse.Namespace) -> None:
 
 def read_scene(args: argparse.Namespace, earlier: Earlier | None) -> Scene:
     """The scene with what the command line changes; --set comes last and wins."""
-    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS
 
     changes = []
     if args.preset is not None:

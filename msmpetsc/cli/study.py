@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_below_one(args, "jobs")
     refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
-    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.runner import run_study
 
     signal.signal(signal.SIGTERM, stop)
@@ -74,7 +74,7 @@ def part_of(text: str | None):
 
 def tell_cases(args: argparse.Namespace, folder: Path) -> None:
     """A line a case; its number is the I of --part I/N, where N is the number of cases."""
-    from msmpetsc.solve.nonlinear.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.case import shown_command
     from msmpetsc.study.runner import list_study
 

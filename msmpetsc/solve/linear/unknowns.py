@@ -33,7 +33,7 @@ class Unknowns:
         self.lattice, self.memory = lattice, memory_of(lattice.nodes)
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
         self.size = len(self.free)
-        first = comm.exscan(self.size) or 0
+        first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)

@@ -21,8 +21,8 @@ def asks_for_entries(viewer: PETSc.Viewer) -> bool:
 def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
     """An operator on vectors of unknowns, 3m x 3m, as AIJ (collective).
 
-    It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so that
-    one product a colour and coordinate tells the entries of all its columns: 81 products.
+    It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so
+    that one product a colour and coordinate tells the entries of all its columns: 81 products.
     """
     (a, b), colours, free = _neighbours(unknowns), _colours(unknowns), to_host(unknowns.free)
     row = np.full(len(colours), -1)

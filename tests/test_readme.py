@@ -22,7 +22,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.solve.nonlinear.presets import PRESETS
+from msmpetsc.solve.presets import PRESETS
 from msmpetsc.study.reading import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}

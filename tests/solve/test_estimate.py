@@ -158,7 +158,9 @@ def test_two_solvers_do_not_take_each_others_options():
         first = Stepper(COMM, lattice, T, find_preset("lbfgs"))
         second = Stepper(COMM, lattice, T, find_preset("newton"), prefix="reference_")
         assert first.snes.getType() == "qn" and second.snes.getType() == "newtonls"
-        assert first.control.tightest == 1e-9 and second.control.tightest == float(PRESETS["newton"].options["ksp_rtol"])
+        assert first.control.tightest == 1e-9 and second.control.tightest == float(
+            PRESETS["newton"].options["ksp_rtol"]
+        )
         second.destroy()
         first.destroy()
     finally:

@@ -11,7 +11,7 @@ import trimesh
 from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
-from test_cli import IN_ONE_PROCESS
+from one_process import IN_ONE_PROCESS
 
 from msmpetsc.cli.describe import log_model, taken
 from msmpetsc.cli.main import main

@@ -30,7 +30,7 @@ from msmpetsc.cli.storing import tell_stop, write_frames, write_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.restart import Earlier
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.petsc.initialise import initialise
@@ -140,9 +140,10 @@ def run(args: argparse.Namespace) -> int:
         with (
             compilation_logged(all_are_new),
             Signals(comm) as signals,
-            resumed.file(comm, about) if resumed else ResultFile(path, comm, about, args.overwrite) as file,
+            resumed.file(comm, about, args.gather)
+            if resumed
+            else ResultFile(path, comm, about, Begin.OVERWRITE if args.overwrite else Begin.NEW, args.gather) as file,
         ):
-            file.gathers = args.gather
             model = build_model(comm, scene)
             log_model(comm, model)
             if resumed:
@@ -180,7 +181,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
     earlier = resume.look(comm, args) if args.scene or args.resume else None
     initialise(comm, args.petsc_options)
-    from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
     from msmpetsc.solve.petsc.device import choose
     from msmpetsc.solve.presets import find_preset, shown_options
     from msmpetsc.solve.simulate import solvers_of
@@ -196,7 +197,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     on_root(comm, lambda: refuse_bad_values(solvers))
     if comm.rank == 0:
         print("\n".join(shown_options(solvers)))
-    tell_none_left()
+    silence_options_left()
     return 0
 
 

@@ -1,4 +1,4 @@
-"""TOML text of unknown origin -> its data, with the standard library alone."""
+"""Text to TOML data, guarded against what takes for ever to parse; without the packages that check a scene."""
 
 import re
 import tomllib
@@ -10,7 +10,7 @@ DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPE
 
 
 def toml_of(text: str) -> dict[str, Any]:
-    """Return the data of a TOML text. Raises ValueError for other text, RecursionError for one nested too deeply."""
+    """Return the text's data. Raises ValueError for what is not TOML, RecursionError for what is nested too deeply."""
     if DEEP_KEY.search(text):
         raise RecursionError
     return tomllib.loads(text)

@@ -1,4 +1,4 @@
-"""What is done about a step that fails, so that a hard moment costs time instead of the run."""
+"""Recovery from a step that fails, so that a hard moment costs time instead of the run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -14,7 +14,7 @@ from conftest import ENVIRONMENT, run
 from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.cli.main import split_petsc_options
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 SCENE = """
 [mesh]

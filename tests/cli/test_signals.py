@@ -13,7 +13,7 @@ from conftest import ENVIRONMENT
 from stopped_runs import EVERY, STEPS, assert_same, hanging, ranks_of, signal_after
 
 from msmpetsc.cli.main import main
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 pytestmark = pytest.mark.timeout(100)

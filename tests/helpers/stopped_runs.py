@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from block_scene import block_scene
 
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 EVERY, STEPS = 3, 40
 

@@ -31,7 +31,7 @@ class State:
         return (self.q - self.q_previous) / time_step
 
     def over(self, time_step: float, shorter: float) -> "State":
-        """The same for steps of another length, which have no history yet."""
+        """The same state for steps of another length, which have no history yet."""
         return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
 
     def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:

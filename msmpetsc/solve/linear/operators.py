@@ -9,8 +9,8 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.explicit import asks_for_entries, explicit
 from msmpetsc.solve.petsc.memory import Memory
 
 

@@ -26,7 +26,7 @@ CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for 
 
 @dataclass
 class StepError:
-    """What is known of the step in progress.
+    """Error of the step in progress.
 
     goal        : relative error to come to; 0 where a budget of iterations ends the step
     error       : of the last iterate, estimated or bounded

@@ -1,4 +1,4 @@
-"""How far a step is from its exact solution: the Newton correction, found no better than an estimate needs.
+"""Error estimate of a step: the Newton correction, computed no better than an estimate needs.
 
 The error x - x* solves H e = F(x) but for terms of second order, H the true Hessian. |F|_(M^-1) bounds |e|_M, but
 was seen up to 6000 times too large on stiff bodies; some CG iterations on H, preconditioned as the step is, tell

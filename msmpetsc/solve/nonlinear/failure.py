@@ -52,7 +52,7 @@ def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
 
 
 def _worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Where F pulls farthest, and what is inside out (collective)."""
+    """Words on where F pulls farthest, and what is inside out (collective)."""
     comm, lattice = functional.comm, functional.lattice
     worst = place_of_greatest(comm, lattice, *functional.pull(iterate.f))
     return f", worst at {worst}{inside_out(comm, lattice, iterate.q)}"

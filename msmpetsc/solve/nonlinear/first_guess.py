@@ -1,4 +1,4 @@
-"""Where a step starts from: the best of a few guesses that cost next to nothing."""
+"""First guess of a step: the best of a few guesses that cost next to nothing."""
 
 import numpy as np
 

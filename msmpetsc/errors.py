@@ -45,7 +45,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
 
 
 def as_expected(error: Exception) -> MsmpetscError | None:
-    """The error as one of ours, if it is one that a user can meet: too little memory, a package of an extra."""
+    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is."""
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")

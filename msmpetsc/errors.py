@@ -33,6 +33,15 @@ class StepFailed(MsmpetscError):
 
 
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
+EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
+    "run": ("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch", "psutil", "tqdm"),
+    "mesh": ("meshio", "manifold3d", "fast_simplification"),
+    "render": ("pyvista",),
+    "study": ("pandas", "matplotlib", "jinja2", "tomlkit"),
+    "repair": ("pymeshfix",),
+    "xarray": ("xarray",),
+    "cuda": ("cupy",),
+}
 
 
 def as_expected(error: Exception) -> MsmpetscError | None:
@@ -40,7 +49,15 @@ def as_expected(error: Exception) -> MsmpetscError | None:
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
+    if isinstance(error, ModuleNotFoundError) and (extra := extra_of(error.name or "")):
+        return InputError(f"{error.name} is not installed: pip install 'msmpetsc[{extra}]' brings it")
     return error if isinstance(error, MsmpetscError) else None
+
+
+def extra_of(module: str) -> str | None:
+    """Return the extra of pyproject.toml that brings a module; None for any other module."""
+    package = module.partition(".")[0]
+    return next((extra for extra, packages in EXTRAS.items() if package in packages), None)
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:

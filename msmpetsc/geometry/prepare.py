@@ -1,9 +1,8 @@
 """Preparing a surface: named steps that mend, reduce, join or place it."""
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-import fast_simplification
-import manifold3d
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -12,6 +11,9 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
+
+if TYPE_CHECKING:
+    import manifold3d
 
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
@@ -63,6 +65,8 @@ def largest_part(surface: Surface) -> Surface:
 
 def union(surface: Surface) -> Surface:
     """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
+    import manifold3d  # of the extra "mesh"
+
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
@@ -102,6 +106,8 @@ def simplify(surface: Surface, faces: int) -> Surface:
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
+    import fast_simplification  # of the extra "mesh"
+
     points, triangles = fast_simplification.simplify(surface.points, surface.triangles, target_count=int(faces))
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
@@ -181,8 +187,10 @@ def _part_labels(surface: Surface) -> np.ndarray:
     return np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
 
 
-def _solid(part: Surface, number: int) -> manifold3d.Manifold:
+def _solid(part: Surface, number: int) -> "manifold3d.Manifold":
     """A part as a solid, turned outwards; InputError if it does not bound one."""
+    import manifold3d
+
     report = examine(part)
     part = compact(part.points, part.triangles)
     triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]

@@ -16,7 +16,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
-import meshio
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
@@ -91,6 +90,8 @@ def read_surface(path: str | Path) -> Surface:
             points, faces = _READERS[kind](path, data)
             if faces.ndim != 2 or faces.shape[1] != 3:
                 faces = trimesh.geometry.triangulate_quads(faces)
+    except ModuleNotFoundError:  # a reader's package: says which extra brings it
+        raise
     except Exception as error:  # on garbage the readers raise whatever comes
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
@@ -326,6 +327,8 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 def _read_mixed_ply(data: bytes) -> Arrays:
     """A binary PLY whose faces differ in their number of corners, which trimesh does not read."""
+    import meshio  # of the extra "mesh"
+
     mesh = meshio.ply.read(BytesIO(data))
     polygons = [face for block in mesh.cells for face in block.data]
     return mesh.points, trimesh.geometry.triangulate_quads(polygons)
@@ -380,6 +383,8 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 def _read_meshio(path: Path, data: bytes) -> Arrays:
     """Outer surface of the tetrahedra, or else triangles and quads, without unused points."""
+    import meshio  # of the extra "mesh"
+
     unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
     packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
     with mock.patch.multiple(meshio.vtu._vtu, **packers):

@@ -11,7 +11,7 @@ import trimesh
 from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
-from test_cli import IN_ONE_PROCESS
+from one_process import IN_ONE_PROCESS
 
 from msmpetsc.cli.main import main
 from msmpetsc.cli.march import log_model, taken
@@ -231,7 +231,11 @@ def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ImplicitEuler, "advance", failing)
     assert main(["run", str(scene), "-o", str(path)]) == 3
     *_, took, left, error = capsys.readouterr().err.splitlines()
-    assert "took " in took and f"left 3 frames in {path} (" in left and error == "msmpetsc: error: frame 3 (t = 0.03 s) planted"
+    assert (
+        "took " in took
+        and f"left 3 frames in {path} (" in left
+        and error == "msmpetsc: error: frame 3 (t = 0.03 s) planted"
+    )
 
 
 COMPILES = """

@@ -186,7 +186,7 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
     }
     if not arrays.on_host(q):
         around = elasticity.springs
-        tables = around.other, around.stiffness
+        tables = around.neighbour, around.stiffness
         found["A, by a kernel"] = seconds_of(lambda: laplacian_around(len(q), q, *tables, gradient))
         product = stepper.hessian.mult
         found["Hessian product in a graph"] = in_a_graph(lambda: product(None, x, y))

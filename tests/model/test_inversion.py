@@ -169,7 +169,7 @@ def test_products_with_the_hessian_look_at_resisting_cells_only(q: np.ndarray):
     """And lose nothing by that."""
     cells, few, whole = Elasticity(COMM, SMALL).cells, np.zeros_like(q), np.zeros_like(q)
     cells.hessian_at(q, False)(V, few)
-    add_resistance_hessian(q, *cells.all, False, V, whole)
+    add_resistance_hessian(q, cells.cells, cells.resistance, cells.volume, False, V, whole)
     np.testing.assert_allclose(few, whole, rtol=0, atol=1e-15 * np.abs(whole).max())
     assert len(cells.resisting(REST)) == 0 < len(cells.resisting(q))
 

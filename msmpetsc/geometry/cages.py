@@ -12,18 +12,19 @@ import igl
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import Route, SortedKeys, together
+from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.grid import Grid
+from msmpetsc.geometry.grid import LIMIT, Grid, decode_morton, encode_morton
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport
 
 BOUNDARY, INTERIOR = 1, 2
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
-PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
+PACK = np.array([LIMIT**2, LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
+TOLERANCE = 0.01  # of a wanted number of cells
+SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
 MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
@@ -44,7 +45,7 @@ class Body:
 class Cages:
     """Valid cells of a body, each rank's share in Morton order.
 
-    table : keys of the cells (geometry.morton)
+    table : keys of the cells (geometry.grid)
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
     """
 
@@ -55,7 +56,7 @@ class Cages:
     @property
     def ijk(self) -> np.ndarray:
         """(n_local, 3) grid index of this rank's cells."""
-        return morton.decode(self.table.keys)
+        return decode_morton(self.table.keys)
 
 
 def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000) -> Cages:
@@ -70,7 +71,7 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
     interior = cells_of_gaps(gaps)
     ijk = np.concatenate([boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(boundary), len(interior)])
-    keys = morton.encode(ijk)
+    keys = encode_morton(ijk)
     table = SortedKeys(body.comm, keys)
     route = Route(body.comm, table.owner(keys))
     order = np.argsort(route.send(keys))
@@ -149,7 +150,7 @@ def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np
         cells = MARK[method](corners[start : start + CHUNK], low, high)
         keys.append(np.unique(cells @ PACK))
     packed = np.unique(np.concatenate(keys))
-    return np.stack([packed // PACK[0], packed // PACK[1] % morton.LIMIT, packed % morton.LIMIT], axis=1)
+    return np.stack([packed // PACK[0], packed // PACK[1] % LIMIT, packed % LIMIT], axis=1)
 
 
 def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
@@ -172,3 +173,49 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
         inside = cells[np.abs(winding) > 0.5]
         gaps.append(inside[:, [0, 1, 2, 2]])  # a gap of one cell each
     return np.concatenate(gaps)
+
+
+def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000) -> float:
+    """The cell size [m] that gives ``count`` cells within 1%, or the nearest found with a warning (collective).
+
+    The number of cells falls about as a power of the size, so this is a secant search in logarithms,
+    kept inside the bracket found so far: the number is a step function and not quite monotone.
+
+    raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
+    """
+    if count > max_cells:
+        raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
+    refuse_beyond_memory(body.comm, count)
+    excess = {}  # log(size) -> log(cells / count)
+    guess = np.log(_first_guess(body, count))
+    for _ in range(SEARCH_LIMIT):
+        boundary, gaps = slab_cells(body, Grid.covering(body.bounds, np.exp(guess)), method, 20 * max_cells)
+        excess[guess] = np.log(count_cells(body.comm, boundary, gaps) / count)
+        nearest = min(excess, key=lambda size: abs(excess[size]))
+        if abs(np.expm1(excess[nearest])) <= TOLERANCE:
+            return float(np.exp(nearest))
+        guess = _next_guess(excess, nearest)
+    found = round(count * np.exp(excess[nearest]))
+    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, found)
+    return float(np.exp(nearest))
+
+
+def _first_guess(body: Body, count: int) -> float:
+    """The size h with V / h^3 + 3/4 A / h^2 = count: the body's volume, and what the boundary cells stick out."""
+    roots = np.roots([count, 0, -0.75 * body.report.area, -abs(body.report.volume)])
+    return float(roots.real.max())
+
+
+def _next_guess(excess: dict[float, float], nearest: float) -> float:
+    """Where the secant through the two best tries meets zero, else the middle of the bracket."""
+    slope = -2.5  # between that of a shell and that of a solid
+    if len(excess) > 1:
+        second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))
+        secant = (excess[nearest] - excess[second]) / (nearest - second)
+        slope = secant if -5 < secant < -1 else slope
+    guess = nearest - excess[nearest] / slope
+    low = max((size for size in excess if excess[size] > 0), default=-np.inf)
+    high = min((size for size in excess if excess[size] < 0), default=np.inf)
+    if low < guess < high and guess not in excess:
+        return guess
+    return (low + high) / 2 if np.isfinite(low + high) else guess

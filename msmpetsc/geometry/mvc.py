@@ -18,14 +18,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from msmpetsc.geometry.block import ITSELF
-from msmpetsc.geometry.squares import AROUND, CELLS, EDGE, EDGES, NODES, OF_CORNER, SQUARE
+from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
 
 FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with its leading terms removed
 
 
 class View(NamedTuple):
-    """What a point p sees of its block: see new_view and look_from. The last two are filled where a cage asks."""
+    """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
 
     planes: np.ndarray  # (3,4) heights of the block's grid planes over p
     angles: np.ndarray  # (144,) g_jk of the grid edges; 0 = not yet
@@ -39,7 +38,7 @@ def new_view():
 
 
 @numba.njit(cache=True)
-def look_from(u, view):
+def set_view(u, view):
     """Make the view that of the point u (3,)."""
     for axis in range(3):
         for i in range(4):
@@ -118,7 +117,7 @@ def square_frame(square, view):
 
 
 @numba.njit(cache=True)
-def see_square(square, view):
+def set_square(square, view):
     """Put the weights of a square into the view; 0 where its plane holds p, which is not on it."""
     a0, a1, b0, b1, d = square_frame(square, view)
     if d == 0.0:
@@ -175,7 +174,7 @@ def joined_cage(corner, valid, view, weights):
             if set_limit(square, view, weights):
                 return
             if np.isnan(view.squares[square, 0]):
-                see_square(square, view)
+                set_square(square, view)
             for i in range(4):
                 weights[NODES[square, i]] += outwards * view.squares[square, i]
     weights /= weights.sum()
@@ -188,5 +187,5 @@ def mvc_weights(u, weights):
     alone[ITSELF] = True
     view = new_view()
     for p in range(len(u)):
-        look_from(u[p], view)
+        set_view(u[p], view)
         joined_cage(0, alone, view, weights[p])

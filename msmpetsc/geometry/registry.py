@@ -17,7 +17,8 @@ import pooch
 
 from msmpetsc.errors import InputError, nearest, printable
 from msmpetsc.geometry.prepare import prepare
-from msmpetsc.geometry.surface import Surface, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface
 
 MESH_DIR = "MSMPETSC_MESH_DIR"
 

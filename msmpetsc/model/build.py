@@ -9,7 +9,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import choose_cell_size
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load

@@ -12,8 +12,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.material import CellMaterial, calibrated_stiffness, edge_stiffness
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
@@ -96,11 +96,11 @@ def build_lattice(
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.part)
     """
     h = cages.grid.cell_size
-    corner_keys = morton.encode(cages.ijk[:, None, :] + CORNERS)
+    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
     cells = table.find(corner_keys)
     ijk, local_cells, octants = _local_cells(cages, table)
-    ghosts = table.find(morton.encode(ijk[len(table.keys) :]))
+    ghosts = table.find(encode_morton(ijk[len(table.keys) :]))
     numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
     springs, owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
     mass, of_spring = density * h**3 / 8 * octants.sum(axis=1), young_modulus or float(stiffness)
@@ -142,16 +142,16 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarra
     Returns grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
     which of the 8 cells around each owned node are valid, (owned, 8) bool.
     """
-    ijk = morton.decode(table.keys)
-    around = morton.encode(ijk[:, None, :] - CORNERS)
+    ijk = decode_morton(table.keys)
+    around = encode_morton(ijk[:, None, :] - CORNERS)
     octants = cages.table.find(around) >= 0
     cell_keys = np.unique(around[octants])
-    corner_keys = morton.encode(morton.decode(cell_keys)[:, None, :] + CORNERS)
+    corner_keys = encode_morton(decode_morton(cell_keys)[:, None, :] + CORNERS)
     ghost_keys = np.setdiff1d(corner_keys, table.keys)
     keys = np.concatenate([table.keys, ghost_keys])
     order = np.argsort(keys)
     local = order[np.searchsorted(keys, corner_keys, sorter=order)]
-    return morton.decode(keys), local, octants
+    return decode_morton(keys), local, octants
 
 
 def _sums_of_nodes(cells: np.ndarray, values: np.ndarray, owned: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from msmpetsc.comm import sample_of, splitters_of
 from msmpetsc.geometry.cages import Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import choose_cell_size
 from msmpetsc.geometry.interior import Slab
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.scene import schema as scene

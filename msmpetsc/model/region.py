@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.model.lattice import CORNERS, Lattice
 from msmpetsc.scene.schema import Region
 
@@ -44,7 +44,7 @@ class Finder:
         if region.painted is None:
             where = inside(region, self.cages.grid.node_positions(ijk + 0.5), self.body.bounds)
         else:
-            where = np.isin(morton.encode(ijk), morton.encode(self._painted_cells(key, region.painted)))
+            where = np.isin(encode_morton(ijk), encode_morton(self._painted_cells(key, region.painted)))
         if not self.body.comm.allreduce(bool(where.any()), MPI.LOR):
             raise InputError(f"{key}.region holds the centre of no cell")
         return where
@@ -79,8 +79,8 @@ class Finder:
         return numbers
 
     def _corners_of(self, cells: np.ndarray, lattice: Lattice) -> np.ndarray:
-        keys = np.unique(morton.encode(cells[:, None, :] + CORNERS))
-        return np.isin(morton.encode(self.cages.grid.nearest_nodes(lattice.nodes)), keys)
+        keys = np.unique(encode_morton(cells[:, None, :] + CORNERS))
+        return np.isin(encode_morton(self.cages.grid.nearest_nodes(lattice.nodes)), keys)
 
 
 def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:

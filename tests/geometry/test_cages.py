@@ -21,12 +21,12 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
 from msmpetsc.geometry.prepare import compact, prepare
-from msmpetsc.geometry.surface import Surface, examine, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface, examine
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
@@ -38,25 +38,25 @@ SIDE = 6  # cells of the small grid of the boundary tests
 
 
 @settings(deadline=None)
-@given(arrays(np.int64, (9, 3), elements=st.integers(0, morton.LIMIT - 1)))
+@given(arrays(np.int64, (9, 3), elements=st.integers(0, LIMIT - 1)))
 def test_morton_round_trip_in_the_order_of_the_interleaved_bits(ijk):
-    keys = morton.encode(ijk)
-    assert np.array_equal(morton.decode(keys), ijk)
+    keys = encode_morton(ijk)
+    assert np.array_equal(decode_morton(keys), ijk)
     bits = ["".join(f"{k:021b}"[b] + f"{j:021b}"[b] + f"{i:021b}"[b] for b in range(21)) for i, j, k in ijk.tolist()]
     assert keys.tolist() == [int(b, 2) for b in bits]
 
 
-@given(st.integers(0, morton.LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
+@given(st.integers(0, LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
 def test_morton_keeps_the_order_along_each_axis(at, axis, ijk):
     low, high = ijk.copy(), ijk.copy()
     low[axis], high[axis] = at, at + 1
-    assert morton.encode(low) < morton.encode(high)
+    assert encode_morton(low) < encode_morton(high)
 
 
 def test_morton_is_minus_one_outside():
-    outside = np.array([[-1, 0, 0], [0, morton.LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
-    assert (morton.encode(outside) == -1).all()
-    assert morton.encode(outside[:, None]).shape == (4, 1)
+    outside = np.array([[-1, 0, 0], [0, LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
+    assert (encode_morton(outside) == -1).all()
+    assert encode_morton(outside[:, None]).shape == (4, 1)
 
 
 # --- boundary cells ---
@@ -121,7 +121,7 @@ def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
     a, b, c = corners
     points = a + i[:, None] * (b - a) + j[:, None] * (c - a)
     marked = touched_cells(corners[None], np.zeros(3, np.int64), np.full(3, 301))
-    assert np.isin(morton.encode(np.floor(points).astype(np.int64)), morton.encode(marked)).all()
+    assert np.isin(encode_morton(np.floor(points).astype(np.int64)), encode_morton(marked)).all()
 
 
 def through_grid_points(count: int) -> np.ndarray:

@@ -23,7 +23,8 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import repair
-from msmpetsc.geometry.surface import Surface, check_encloses, examine, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.model.build import read_body
 from msmpetsc.scene.reading import load_scene
 

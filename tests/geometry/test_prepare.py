@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import STEPS, prepare
+from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.registry import find
-from msmpetsc.geometry.surface import Surface, examine, read_surface
+from msmpetsc.geometry.surface import Surface, examine
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:

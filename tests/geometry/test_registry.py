@@ -19,8 +19,9 @@ from msmpetsc.cli import fetch as command
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import registry
 from msmpetsc.geometry.prepare import STEPS
+from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.registry import MODELS, Download, Model, Packaged, fetch, load, locate
-from msmpetsc.geometry.surface import examine, read_surface
+from msmpetsc.geometry.surface import examine
 
 
 def sha256(content: bytes) -> str:

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import Grid
+from msmpetsc.geometry.grid import Grid, encode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import CORNERS, Lattice, build_lattice
 from msmpetsc.model.material import EDGE, FACE_DIAGONAL, SPACE_DIAGONAL, calibrated_stiffness
@@ -22,7 +21,7 @@ E, H, DENSITY = 3e4, 0.2, 800.0
 def cages_of(cells: np.ndarray, cell_size: float = H) -> Cages:
     """Cages made of exactly these cells (c, 3)."""
     grid = Grid(np.array([1.0, -2.0, 3.0]), cell_size, cells.max(axis=0) + 1)
-    table = SortedKeys(MPI.COMM_SELF, morton.encode(cells))
+    table = SortedKeys(MPI.COMM_SELF, encode_morton(cells))
     return Cages(grid, table, np.ones(len(table.keys), np.uint8))
 
 

@@ -120,7 +120,8 @@ def _axes(body: Body) -> np.ndarray:
 def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
     if cells > max_cells:
         raise InputError(
-            f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, above cages.max_cells = {max_cells}"
+            f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, "
+            f"above cages.max_cells = {max_cells}"
         )
 
 

@@ -75,7 +75,7 @@ def _next_plane(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarray:
 def _join(comm: MPI.Comm, gaps: np.ndarray, label: np.ndarray, own: np.ndarray, slab: Slab) -> np.ndarray:
     """Labels made global and equal wherever components of neighbouring slabs are one."""
     count = int(label.max(initial=EXTERIOR))
-    offset = comm.exscan(count) or 0
+    offset = comm.exscan(count) or 0  # type: ignore[attr-defined]  # an intracommunicator
     label = np.where(label == EXTERIOR, EXTERIOR, label + offset)
     theirs = _to_previous(comm, label[own & (gaps[:, 0] == slab.first)])
     pairs = np.unique(np.stack([label[~own], theirs], axis=1), axis=0)

@@ -20,7 +20,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry import registry
 from msmpetsc.geometry.prepare import STEPS
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.registry import MODELS, Download, Model, Packaged, fetch, load, locate
+from msmpetsc.geometry.registry import MODELS, Download, NamedMesh, Packaged, fetch, load, locate
 from msmpetsc.geometry.surface import examine
 
 
@@ -62,7 +62,7 @@ def toy(site, tmp_path, monkeypatch):
     monkeypatch.setenv("MSMPETSC_MESH_DIR", str(tmp_path / "meshes"))
     monkeypatch.setattr(registry.pooch, "os_cache", lambda project: tmp_path / "cache" / project)
     monkeypatch.syspath_prepend(tmp_path / "packages")
-    model = Model(
+    model = NamedMesh(
         copy="toybox.ply",
         copy_sha256=sha256(COPY),
         licence="free",

@@ -32,7 +32,7 @@ from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.profile import machine, versions
 from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.to_device import placed
+from msmpetsc.model.build import to_device
 from msmpetsc.output.writer import finished, open_result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
@@ -310,7 +310,7 @@ def dissected(cells: int, args: argparse.Namespace) -> dict:
     model = build_model(MPI.COMM_SELF, scene)
     found = {"cells": len(model.lattice.cells), "CPU": parts(model, scene.time.step)}
     device.choose(MPI.COMM_SELF, "cuda")
-    there = placed(model, device.sender(MPI.COMM_SELF))
+    there = to_device(model, device.sender(MPI.COMM_SELF))
     found["GPU"] = parts(there, scene.time.step)
     found["a frame"] = a_frame(scene, model, args.frames) | launches(there.lattice.nodes)
     PETSc.Options().delValue(device.OPTION)

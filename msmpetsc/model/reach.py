@@ -15,11 +15,10 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.paths import SAME, within
+from msmpetsc.model.loads import SAME, Anchor, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene.schema import Force, Obstacle, Scene, Time
+from msmpetsc.scene.schema import Force, ObstacleTable, Scene, Time
 
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 
@@ -145,7 +144,7 @@ def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:
     return ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
 
 
-def _acts_in_a_step(table: Force | Obstacle, time: Time) -> bool:
+def _acts_in_a_step(table: Force | ObstacleTable, time: Time) -> bool:
     """Whether it is there at the end of a step; or, where steps are taken in substeps, at any time of the run."""
     if time.integrator == "verlet":
         return table.start < time.duration and (table.stop is None or table.stop > 0)

@@ -4,6 +4,7 @@ import re
 import tomllib
 from collections.abc import Collection, Iterable
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def scene_of(
     by_user: bool = True,
     to_read: bool = True,
 ) -> Scene:
-    """The same of a text that stood in the file.
+    """Check the text of a scene file as ``load_scene`` does the file.
 
     to_read: whether the files that it names are to be read
     """
@@ -60,7 +61,7 @@ def scene_of(
 
 
 def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
     text = _read(path, kind)
     return text, _parse(path, text)
 
@@ -77,7 +78,7 @@ def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | 
 
 
 def lies_below(folder: Path, name: str) -> bool:
-    """Whether a path from ``folder`` leads to what lies in it, links followed."""
+    """Return whether a path from ``folder`` leads to what lies in it, links followed."""
     path = folder / name
     try:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
@@ -109,7 +110,10 @@ def _read(path: Path, kind: str) -> str:
 
 
 def toml_of(text: str) -> dict[str, Any]:
-    """Its data. Raises ValueError for what is not TOML, RecursionError for what is nested too deeply."""
+    """Return the data of a TOML text.
+
+    Raises ValueError for what is not TOML, RecursionError for what is nested too deeply.
+    """
     if DEEP_KEY.search(text):
         raise RecursionError
     return tomllib.loads(text)
@@ -129,7 +133,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
 
 
 def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
-    """Carry out one "key.path=value" in ``data``; returns the key path."""
+    """Carry out a "key.path=value" in ``data``; returns the key path."""
     try:
         if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
             raise InputError("is not UTF-8 text")
@@ -141,8 +145,8 @@ def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
             raise InputError("is nested too deeply")
         value = _override_value(raw.strip())
         holder: Any = data
-        for key, following in zip(path, path[1:], strict=False):
-            empty = [] if isinstance(following, int) else {}
+        for key, following in pairwise(path):
+            empty: Any = [] if isinstance(following, int) else {}
             holder = _put(holder, key, empty, replace=False)
         _put(holder, path[-1], value, replace=True)
     except InputError as error:

@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.contact.overlap import overlap
+from msmpetsc.model.contact.obstacle import describe_overlap
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.locate import inverted
+from msmpetsc.model.locate import worst_inverted
 from msmpetsc.solve.energy_balance import MUCH, Ledger
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
@@ -25,7 +25,7 @@ class Watch:
 
     def inverted(self, index: int, time: float, q: np.ndarray) -> int:
         """The number of cells inside out at q (l, 3) [m] (collective)."""
-        self.now, place = inverted(self.comm, self.lattice, q)
+        self.now, place = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             log.warning(
                 "frame %d (t = %.6g s): %d cell%s inside out, the worst %s; %s",
@@ -56,7 +56,7 @@ class Watch:
         """Where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
         new = [o for o in around.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
-            found = overlap(self.comm, self.lattice, obstacle, q, around.fixed_at(time), time)
+            found = describe_overlap(self.comm, self.lattice, obstacle, q, around.fixed_at(time), time)
             if found:
                 log.warning(
                     "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",

@@ -10,12 +10,11 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model
+from msmpetsc.model.build import Model, to_device
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.frame import Frame
-from msmpetsc.model.to_device import placed
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Measured
@@ -90,7 +89,7 @@ class Simulation:
     """Steps a model from its start. Use as a context manager: its PETSc objects are destroyed on leaving."""
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, measured: Measured = Measured()):
-        model = placed(model, sender(comm))
+        model = to_device(model, sender(comm))
         self.comm, self.model, self.time_step = comm, model, scene.time.step
         self.steps, self.every, self.measured, self.trace = scene.time.steps, scene.output.every, measured, None
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
@@ -102,7 +101,7 @@ class Simulation:
         self.watch = Watch(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        sides = self.environment.met(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
+        sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.step = 0  # steps taken
         self.stored, self.stored_until = scene.stored, scene.stored_until  # numbers of frames

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
@@ -124,8 +124,8 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
 def test_both_regimes_of_friction_are_among_the_cases():
     for name, holds in {"sticking": True, "slipping": False}.items():
         contact, q, _ = pressed(CASES[f"plane, {name}"])
-        apply_friction = contact.presses[0].apply_friction
-        assert ((apply_friction.slip(q)[1] < apply_friction.stick) == holds).all()
+        friction = contact.states[0].friction
+        assert ((friction.slip(q)[1] < friction.stick) == holds).all()
 
 
 def test_a_node_in_two_obstacles_gets_both():

@@ -19,7 +19,7 @@ from msmpetsc.model.contact.obstacle import depths
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.environment import Environment
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.energy_balance import Ledger
@@ -201,7 +201,7 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
     """As the test has it: the first step never is, its halves are."""
     path, alike, asked = (
         against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False),
-        Environment.pushes_alike,
+        Environment.same_push,
         [],
     )
 
@@ -209,7 +209,7 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
         asked.append(0)
         return len(asked) > MOST_SOLVES and alike(around, *given)
 
-    monkeypatch.setattr(Environment, "pushes_alike", stuck)
+    monkeypatch.setattr(Environment, "same_push", stuck)
     with pytest.raises(StepFailed, match=r"frame 1 \(t = 0.004 s\) has nodes that pass through .*; try a smaller"):
         play(path)
     asked.clear()

@@ -82,13 +82,13 @@ class ImplicitEuler:
         """
         around, iterations, ksp_its = self.around, 0, 0
         way = {"time": time, "time_step": time_step, "before": before, "held": self.stepper.lattice.pinned}
-        sides = around.met(q, y, **way)
+        sides = around.contact_faces(q, y, **way)
         for solves in range(MOST_SOLVES):
             contact = around.contact(q, time, time_step, sides)
             self.problem = Problem(q, y, around.load(time), contact, around.prescribed(q, time))
             result = self.stepper.step(**vars(self.problem))
             iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
-            met = around.met(q, result.position, **way)
+            met = around.contact_faces(q, result.position, **way)
             settled = np.where(sides > 0, sides, met) if solves else met
             if not self._passes(result.position, time, sides, settled):
                 if around.penalties:  # what reflects goes by the way to x alone
@@ -105,7 +105,7 @@ class ImplicitEuler:
         """Whether any node on its way to x has met what did not push it (collective)."""
         if not (self.around.has_sides and self.around.penalties):
             return False
-        return self.comm.allreduce(not self.around.pushes_alike(x, time, sides, met), MPI.LOR)
+        return self.comm.allreduce(not self.around.same_push(x, time, sides, met), MPI.LOR)
 
     def follow(self) -> None:
         """Trace the step that comes next."""

@@ -147,7 +147,7 @@ class Verlet:
     def _meet(self, state: State, time: float) -> None:
         """The sides of a state."""
         before = None if state.sides is None else state.sides[:, : self.lattice.owned]
-        self.sides = self.around.met(self.q, self.q, time, 0.0, before, self.held)
+        self.sides = self.around.contact_faces(self.q, self.q, time, 0.0, before, self.held)
 
     def _take(self, count: int, start: float, time: float) -> None:
         """All substeps of a step."""
@@ -157,7 +157,7 @@ class Verlet:
         for begin, end in zip(times, times[1:], strict=False):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
-            self.work += self.around.appearing(self.q, begin, end, self.sides)
+            self.work += self.around.energy_of_new_obstacles(self.q, begin, end, self.sides)
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
@@ -210,7 +210,7 @@ class Verlet:
         there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
-        self.sides = self.around.met(self.before, self.q, end, end - begin, self.sides, self.held)
+        self.sides = self.around.contact_faces(self.before, self.q, end, end - begin, self.sides, self.held)
         after, before, work = self.around.reflect(self.q, self.before, end, end - begin, self.held, self.sides)
         self.work += work
         if after is not self.q:
@@ -232,7 +232,10 @@ class Verlet:
         fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        pushed = self.around.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
+        pushed = (
+            self.around.contact_stiffness_bound(self.q, speed, start, time, self.sides)[self.free]
+            * self.per_mass[self.free]
+        )
         return self.comm.allreduce(greatest(pushed), MPI.MAX)
 
     def _count(self, squared: float) -> int:

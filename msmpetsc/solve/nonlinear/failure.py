@@ -6,7 +6,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.locate import inside_out, place_of_greatest
+from msmpetsc.model.locate import describe_inverted, node_of_greatest
 
 if TYPE_CHECKING:
     from msmpetsc.solve.nonlinear.step import Stepper
@@ -49,5 +49,5 @@ def no_minimum(stepper: "Stepper", error: float) -> StepFailed:
 
 def _where_worst(stepper: "Stepper") -> str:
     """Where ``stepper.work``, which is F, pulls farthest, and what is inside out (collective)."""
-    worst = place_of_greatest(stepper.comm, stepper.lattice, *stepper.functional.pull(stepper.work))
-    return f", worst at {worst}{inside_out(stepper.comm, stepper.lattice, stepper.functional.q)}"
+    worst = node_of_greatest(stepper.comm, stepper.lattice, *stepper.functional.pull(stepper.work))
+    return f", worst at {worst}{describe_inverted(stepper.comm, stepper.lattice, stepper.functional.q)}"

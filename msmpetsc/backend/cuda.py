@@ -22,7 +22,7 @@ def missing() -> str | None:
         return f"no GPU is seen: {str(error).splitlines()[0]}"
 
 
-def take_one(rank: int) -> None:
+def use_device(rank: int) -> None:
     """Use, of several GPUs, the one that PETSc takes too: r modulo their number for rank r."""
     import cupy
 

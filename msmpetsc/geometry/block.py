@@ -57,19 +57,19 @@ OF_CORNER = np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()  # the 
 
 @numba.njit(cache=True)
 def corner_bit(v, axis):
-    """Coordinate, 0 or 1, of corner v along an axis."""
+    """Return the coordinate, 0 or 1, of corner v along an axis."""
     return (v >> (2 - axis)) & 1
 
 
 @numba.njit(cache=True)
 def corner_node(v):
-    """Entry of corner v among the 64 nodes."""
+    """Return the entry of corner v among the 64 nodes."""
     return 16 * (1 + corner_bit(v, 0)) + 4 * (1 + corner_bit(v, 1)) + 1 + corner_bit(v, 2)
 
 
 @numba.njit(cache=True)
 def cells_around(v, valid):
-    """Which of the 8 cells around corner v are valid: bit 4i + 2j + k for the cell at (i,j,k) in {0,1}^3."""
+    """Return which of the 8 cells around corner v are valid: bit 4i + 2j + k for the cell at (i,j,k) in {0,1}^3."""
     first = 9 * corner_bit(v, 0) + 3 * corner_bit(v, 1) + corner_bit(v, 2)
     mask = 0
     for bit in range(8):
@@ -80,14 +80,16 @@ def cells_around(v, valid):
 
 @numba.njit(cache=True)
 def smoothstep(z):
-    """z^2 (3 - 2z) on [0,1], constant beyond: its slope is 0 at both ends."""
+    """Return z^2 (3 - 2z) on [0,1], constant beyond: its slope is 0 at both ends."""
     z = min(max(z, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
 
 @numba.njit(cache=True)
 def corner_blend(v, u):
-    """W(v, p) of Eq. 8: product over the axes of smoothstep(1 - distance to v). Sums to 1 over the 8 corners.
+    """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
+
+    It sums to 1 over the 8 corners.
 
     On a face of the cell only its 4 corners count, and no W changes along the face's normal: two cells that share
     the face and agree on what a corner says (L_v of Eq. 8) therefore agree in position and in slope.

@@ -55,12 +55,12 @@ class Cages:
 
     @property
     def ijk(self) -> np.ndarray:
-        """(n_local, 3) grid index of this rank's cells."""
+        """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
 
 def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000) -> Cages:
-    """The valid cells of side ``cell_size`` [m] (collective).
+    """Return the valid cells of side ``cell_size`` [m] (collective).
 
     method : "exact", or "sample" for the paper's sample points
     raises : InputError if there would be more than ``max_cells``
@@ -79,12 +79,12 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
 
 
 def count_cells(comm: MPI.Comm, boundary: np.ndarray, gaps: np.ndarray) -> int:
-    """Number of valid cells on all ranks."""
+    """Return the number of valid cells on all ranks (collective)."""
     return comm.allreduce(len(boundary) + int((gaps[:, 3] - gaps[:, 2] + 1).sum()))
 
 
 def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled: the longest comes first."""
+    """Return boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled, the longest first."""
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     _refuse_above(max_cells, _least_cells(body, grid), grid)
@@ -100,7 +100,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
 
 
 def _least_cells(body: Body, grid: Grid) -> float:
-    """Fewer than there will be, known before they are made."""
+    """Return fewer cells than there will be, known before they are made."""
     return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
 
@@ -126,7 +126,7 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
 
 
 def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
-    """Triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
+    """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
@@ -140,7 +140,7 @@ def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
 
 
 def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
-    """Distinct boundary cells (b, 3) of the slab in lexicographic order.
+    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order.
 
     The paper's samples of a triangle may lie in another slab than its rank's, but then the
     triangle was sent there too.
@@ -155,9 +155,9 @@ def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np
 
 
 def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
-    """Interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size
-    (Jacobson et al. 2013). Time follows the bounding box here, memory does not.
+    """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
 
+    (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
     """
     surface = body.comm.bcast(body.surface)
@@ -177,7 +177,7 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
 
 
 def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000) -> float:
-    """The cell size [m] that gives ``count`` cells within 1%, or the nearest found with a warning (collective).
+    """Return the cell size [m] that gives ``count`` cells within 1%, or the nearest with a warning (collective).
 
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
     kept inside the bracket found so far: the number is a step function and not quite monotone.
@@ -196,19 +196,19 @@ def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: i
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)
-    found = round(count * np.exp(excess[nearest]))
-    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, found)
+    cells = round(count * np.exp(excess[nearest]))
+    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, cells)
     return float(np.exp(nearest))
 
 
 def _first_guess(body: Body, count: int) -> float:
-    """The size h with V / h^3 + 3/4 A / h^2 = count: the body's volume, and what the boundary cells stick out."""
+    """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
     roots = np.roots([count, 0, -0.75 * body.report.area, -abs(body.report.volume)])
     return float(roots.real.max())
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
-    """Where the secant through the two best tries meets zero, else the middle of the bracket."""
+    """Return where the secant through the two best tries meets zero, else the middle of the bracket."""
     slope = -2.5  # between that of a shell and that of a solid
     if len(excess) > 1:
         second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))

@@ -39,12 +39,12 @@ class Embedding:
 
     @property
     def points(self) -> int:
-        """Surface points of this rank."""
+        """Number of surface points of this rank."""
         return len(self.indptr) - 1
 
 
 def embed(points: np.ndarray, cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
-    """W for surface points (collective).
+    """Return W for surface points (collective).
 
     points    : (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells
     nodes     : the lattice's node numbers by grid key
@@ -84,7 +84,7 @@ def _entries(
     smoothing: float,
     part: slice,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nonzero weights of some points as rows, columns and values."""
+    """Return the nonzero weights of some points as rows, columns and values."""
     weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
     point, node = np.nonzero(weights)
     return row[part][point], numbers[cell[part]][point, node], weights[point, node]
@@ -96,14 +96,14 @@ def _gather_rows(
     """Bring rows to the ranks that keep them: equal contiguous ranges."""
     first = total * np.arange(comm.size + 1) // comm.size
     route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
-    here = slice(first[comm.rank], first[comm.rank + 1])
-    shape = (int(here.stop - here.start), nodes)
-    csr = coo_array((route.send(weights), (route.send(rows) - here.start, route.send(columns))), shape=shape).tocsr()
+    start, stop = first[comm.rank], first[comm.rank + 1]
+    shape = (int(stop - start), nodes)
+    csr = coo_array((route.send(weights), (route.send(rows) - start, route.send(columns))), shape=shape).tocsr()
     return Embedding(csr.indptr, csr.indices, csr.data)
 
 
 def stencil_weights(kind: str, u: np.ndarray, neighbours: np.ndarray, smoothing: float = 1.0) -> np.ndarray:
-    """Weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
+    """Return the weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
 
     u          : (p,3) coordinates in the cell, in [0,1]
     neighbours : (p,27) bool; column (dx+1)*9 + (dy+1)*3 + (dz+1): the cell at that offset is valid. 13 is the cell

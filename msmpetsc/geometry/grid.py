@@ -25,7 +25,7 @@ class Grid:
 
     @classmethod
     def covering(cls, bounds: np.ndarray, cell_size: float) -> "Grid":
-        """The grid that starts at the low corner of ``bounds`` (2, 3) [m].
+        """Return the grid that starts at the low corner of ``bounds`` (2, 3) [m].
 
         Raises InputError for a cell size too small to number the cells along an axis.
         """
@@ -38,16 +38,16 @@ class Grid:
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 
     def to_cells(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
+        """Return points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
         inside = np.nextafter(self.shape.astype(float), 0)
         return np.clip((points - self.origin) / self.cell_size, 0, inside)
 
     def node_positions(self, ijk: np.ndarray) -> np.ndarray:
-        """Positions [m] of grid nodes (..., 3)."""
+        """Return the positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
 
     def nearest_nodes(self, points: np.ndarray) -> np.ndarray:
-        """Grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
+        """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
         return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
 
 

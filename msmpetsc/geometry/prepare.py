@@ -1,4 +1,4 @@
-"""Preparing a surface: named steps that mend, reduce, join or place it."""
+"""Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
 
 from collections.abc import Callable, Sequence
 
@@ -24,7 +24,7 @@ def prepare(
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
-    """The surface after the steps, then scaled, then placed.
+    """Return the surface after the steps, then scaled, then moved.
 
     steps : each the name of a step, or {name: value} for one that takes a value (see STEPS)
     size  : longest side of the bounding box [m]; scaled about the origin
@@ -142,7 +142,7 @@ TAKES_VALUE = ("simplify", "rotate")
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """One step, its failures as InputError with its name."""
+    """Carry out a step, its failures as InputError with its name."""
     if name not in STEPS:
         raise InputError(f"prepare: no step '{name}' (there are: {', '.join(STEPS)})")
     if (value is not None) != (name in TAKES_VALUE):
@@ -160,19 +160,19 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
 
 
 def _bounds(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates of the points in use, (3,) each."""
+    """Return the lowest and highest coordinates of the points in use, (3,) each."""
     points = surface.points[np.unique(surface.triangles)]
     return points.min(axis=0), points.max(axis=0)
 
 
 def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
-    """The surface of these triangles and only their points, in the order they had."""
+    """Return the surface of these triangles and only their points, in the order they had."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
 def _part_labels(surface: Surface) -> np.ndarray:
-    """(f,) number of the connected part of each triangle; points of equal position connect."""
+    """Return the number (f,) of the connected part of each triangle; points of equal position connect."""
     triangles = first_of_equal(surface.points)[surface.triangles]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
     n = len(surface.points)
@@ -181,7 +181,7 @@ def _part_labels(surface: Surface) -> np.ndarray:
 
 
 def _solid(part: Surface, number: int) -> manifold3d.Manifold:
-    """A part as a solid, turned outwards; InputError if it does not bound one."""
+    """Return a part as a solid, turned outwards; InputError if it does not bound one."""
     report = examine(part)
     part = compact(part.points, part.triangles)
     triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]
@@ -201,7 +201,7 @@ def _two_triangles_an_edge(surface: Surface) -> bool:
 
 
 def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each of the (f, 3) merged triangles its patch, and whether to flip it.
+    """Return for each of the (f, 3) merged triangles its patch, and whether to flip it.
 
     Every triangle stands twice in a graph, as it is and flipped; neighbours are linked in the
     two ways that agree. A patch then makes two components, each the other one flipped: take
@@ -213,11 +213,11 @@ def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(edge, kind="stable")
     first = np.flatnonzero(np.diff(edge[order], prepend=-1))
     pairs = first[np.diff(first, append=len(order)) == 2]
-    one, other = order[pairs], order[pairs + 1]
-    against = f * ((start < end)[one] == (start < end)[other])  # same direction: flip one of them
-    one, other = one // 3, other // 3
-    rows = np.concatenate([one, one + f])
-    columns = np.concatenate([other + against, other + f - against])
+    a, b = order[pairs], order[pairs + 1]
+    against = f * ((start < end)[a] == (start < end)[b])  # same direction: flip one of them
+    a, b = a // 3, b // 3
+    rows = np.concatenate([a, a + f])
+    columns = np.concatenate([b + against, b + f - against])
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * f, 2 * f))
     _, label = connected_components(graph, directed=False)
     as_is, flipped = label[:f], label[f:]

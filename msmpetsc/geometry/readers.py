@@ -72,7 +72,7 @@ def _check_arrays(path: Path, points: np.ndarray, triangles: np.ndarray) -> None
 
 
 def _kind(path: Path) -> str:
-    """The format by the file's name, '.gz' aside; InputError if it is not one we read."""
+    """Return the format by the file's name, '.gz' aside; raise InputError if it is not one we read."""
     name = path.name.lower()
     kind = Path(name.removesuffix(".gz")).suffix.removeprefix(".")
     if path.is_dir():
@@ -87,7 +87,7 @@ def _kind(path: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """The file's bytes, decompressed."""
+    """Return the file's bytes, decompressed."""
     try:
         data = path.read_bytes()
         data = _decompressed(data) if data.startswith(b"\x1f\x8b") else data
@@ -102,7 +102,7 @@ def _content(path: Path) -> bytes:
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Not more than a mesh can shrink: gzip packs zeros a thousandfold."""
+    """Decompress, but not to more than a mesh can shrink from: gzip packs zeros a thousandfold."""
     most = max(LEAST_LIMIT, MOST_PACKED * len(data))
     with gzip.open(BytesIO(data)) as file:
         content = file.read(most + 1)
@@ -145,7 +145,7 @@ def _gltf(kind: str, data: bytes) -> dict:
 
 
 def _instanced_rows(kind: str, data: bytes) -> int:
-    """Rows of the points and corners of all meshes, wherever nodes put them."""
+    """Return the rows of the points and corners of all meshes, wherever nodes put them."""
     tree = _gltf(kind, data)
     counts = [accessor["count"] for accessor in tree.get("accessors", [])]
 
@@ -158,8 +158,10 @@ def _instanced_rows(kind: str, data: bytes) -> int:
 
 
 def _claimed_rows(kind: str, data: bytes) -> int:
-    """How many rows (points, faces) the header claims, each of at least a byte: some readers
-    allocate them before they look for them."""
+    """Return how many rows (points, faces) the header claims, each of at least a byte.
+
+    Some readers allocate them before they look for them.
+    """
     if kind == "ply":
         header = data[: data.find(b"end_header")]
         return sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", header, re.MULTILINE)))
@@ -191,7 +193,7 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _read_mixed_ply(data: bytes) -> Arrays:
-    """A binary PLY whose faces differ in their number of corners, which trimesh does not read."""
+    """Read a binary PLY whose faces differ in their number of corners, which trimesh does not read."""
     mesh = meshio.ply.read(BytesIO(data))
     polygons = [face for block in mesh.cells for face in block.data]
     return mesh.points, trimesh.geometry.triangulate_quads(polygons)
@@ -208,6 +210,7 @@ class _FolderResolver(FilePathResolver):
         self._read: dict[str, bytes] = {}
 
     def get(self, name: str) -> bytes:
+        """Return the content of a named file; ValueError if it is none that may be read."""
         path = Path(self.parent, name)
         if not lies_below(Path(self.parent), name) or not path.is_file():
             raise ValueError(f"it names {name}, which is no file in its folder")
@@ -223,9 +226,11 @@ class _Unpacker:
         self.left = most
 
     def zlib(self, block: bytes) -> bytes:
+        """Unpack a block as zlib.decompress does."""
         return self._counted(zlib.decompressobj().decompress(block, self.left + 1))
 
     def lzma(self, block: bytes) -> bytes:
+        """Unpack a block as lzma.decompress does."""
         return self._counted(lzma.LZMADecompressor(memlimit=LEAST_LIMIT).decompress(block, self.left + 1))
 
     def _counted(self, content: bytes) -> bytes:
@@ -252,7 +257,7 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 
 def _read_meshio(path: Path, data: bytes) -> Arrays:
-    """Outer surface of the tetrahedra, or else triangles and quads, without unused points."""
+    """Read the outer surface of the tetrahedra, or else triangles and quads, without unused points."""
     unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
     packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
     with mock.patch.multiple(meshio.vtu._vtu, **packers):  # type: ignore[call-overload]  # typeshed takes no names
@@ -268,7 +273,7 @@ def _read_meshio(path: Path, data: bytes) -> Arrays:
 
 
 def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """(f, 3) the faces of one tetrahedron only, wound outwards. tetrahedra: (c, 4)."""
+    """Return the faces (f, 3) of one tetrahedron only, wound outwards, of tetrahedra (c, 4)."""
     a, b, c, d = points[tetrahedra].swapaxes(0, 1)
     inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
@@ -278,7 +283,7 @@ def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _read_mz3(path: Path, data: bytes) -> Arrays:
-    """The mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
+    """Read the mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
     magic, content, faces, points, skip = struct.unpack_from("<HHIII", data)
     if magic != 0x5A4D or content & 3 != 3:  # bits 0 and 1: has triangles, has points
         raise ValueError("no mz3 header with triangles and points")

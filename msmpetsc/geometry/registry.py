@@ -75,7 +75,7 @@ class MeshFile:
 
 
 def locate(source: str, folder: str | Path) -> Path:
-    """The mesh file of a registry name, or of a path relative to ``folder``.
+    """Return the mesh file of a registry name, or of a path relative to ``folder``.
 
     A name is looked for in $MSMPETSC_MESH_DIR, then among the fetched files, then in installed
     packages. Raises InputError if the mesh is not here or is not what the registry knows.
@@ -89,7 +89,7 @@ def locate(source: str, folder: str | Path) -> Path:
 
 
 def load(source: str, folder: str | Path) -> Surface:
-    """The surface of a registry name or a path; a name's original after the model's own steps."""
+    """Return the surface of a registry name or a path; a name's original after the model's own steps."""
     if source not in MODELS:
         return read_surface(locate(source, folder))
     file = _require(source)
@@ -99,7 +99,7 @@ def load(source: str, folder: str | Path) -> Surface:
 
 
 def find(name: str) -> MeshFile | None:
-    """Where a model of the registry lies on this machine, or None."""
+    """Return where a named mesh lies on this machine, or None."""
     model = MODELS[name]
     if os.environ.get(MESH_DIR):
         copy = Path(os.environ[MESH_DIR]) / model.copy
@@ -118,7 +118,7 @@ def find(name: str) -> MeshFile | None:
 
 
 def fetch(name: str, progress: bool = False) -> Path:
-    """Download a model's original into the cache, or find it where it is; its path.
+    """Download a model's original into the cache, or find it where it is; return its path.
 
     Raises InputError for an unknown name, a model that has no download, a failed connection,
     or a file that is not the one the registry knows.
@@ -147,7 +147,7 @@ def fetch(name: str, progress: bool = False) -> Path:
 
 
 def _require(name: str) -> MeshFile:
-    """Where the model lies; InputError saying how to get it if it is not here."""
+    """Return where a named mesh lies; raise InputError saying how to get it if it is not on this machine."""
     file, model = find(name), MODELS[name]
     if file:
         return file
@@ -184,7 +184,7 @@ def _originals(name: str) -> pooch.Pooch:
 
 
 def _inside_package(path: str) -> Path | None:
-    """A file inside an installed package, found without importing any of its code."""
+    """Return a file inside an installed package, found without importing any of its code."""
     module, _, rest = path.partition("/")
     spec = find_spec(module)
     for folder in (spec.submodule_search_locations or ()) if spec else ():

@@ -31,7 +31,7 @@ from msmpetsc.geometry.mvc import joined_cage, new_view, set_view
 
 @numba.njit(cache=True)
 def own_weight(own, valid, smoothing):
-    """b(p) of Eq. 9: 0 on everything shared with a valid neighbour, 1 away from it; f_h is smoothstep(x / h).
+    """Return b(p) of Eq. 9: 0 on everything shared with a valid neighbour, 1 away from it; f_h is smoothstep(x / h).
 
     own (64,): the cell's own coordinates; the sum in Eq. 9 is taken over the corners shared with that neighbour.
     """
@@ -48,7 +48,7 @@ def own_weight(own, valid, smoothing):
 
 @numba.njit(cache=True)
 def boundary_blends(u, valid, blends):
-    """W(v, p) of Eq. 8 into blends (8,), 0 off B_c: the corners shared with another valid cell. Returns their sum."""
+    """Set W(v, p) of Eq. 8 in blends (8,), 0 off B_c: the corners shared with another valid cell. Return their sum."""
     for v in range(8):
         mask = cells_around(v, valid)
         alone = mask & (mask - 1) == 0
@@ -58,7 +58,7 @@ def boundary_blends(u, valid, blends):
 
 @numba.njit(cache=True)
 def cages_weights(u, neighbours, smoothing, weights):
-    """s(p) of Eq. 7: u (p,3) in [0,1]; neighbours (p,27) bool; smoothing h in (0,1]; weights (p,64), result."""
+    """Set s(p) of Eq. 7: u (p,3) in [0,1]; neighbours (p,27) bool; smoothing h in (0,1]; weights (p,64), result."""
     alone = np.zeros(27, np.bool_)
     alone[ITSELF] = True
     view, blends, joined = new_view(), np.empty(8), np.empty(64)
@@ -80,7 +80,9 @@ def cages_weights(u, neighbours, smoothing, weights):
 
 @cache
 def gradient_table():
-    """(256,3,27): column a of F_v is table[mask, a] @ x over the 3x3x3 nodes around v; mask as in cells_around.
+    """Return a table (256,3,27): column a of F_v is table[mask, a] @ x over the 3x3x3 nodes around v.
+
+    The mask is that of cells_around.
 
     One valid cell is enough: its 8 nodes span space. Mask 0 does not occur and holds zeros.
     """
@@ -113,5 +115,5 @@ def _affine_weights(u, neighbours, table, weights):
 
 
 def affine_weights(u, neighbours, weights):
-    """J(p) of Eq. 8 with affine L_v: u (p,3) in [0,1]; neighbours (p,27) bool; weights (p,64), result."""
+    """Set J(p) of Eq. 8 with affine L_v: u (p,3) in [0,1]; neighbours (p,27) bool; weights (p,64), result."""
     _affine_weights(u, neighbours, gradient_table(), weights)

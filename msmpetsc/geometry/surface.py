@@ -25,7 +25,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfaceReport:
-    """What a surface is like.
+    """Measures of a surface, and counts of its faults.
 
     Edges are counted after merging points of equal position (so the loose triangles of an STL
     may be closed) and dropping the triangles that this leaves with two equal corners.
@@ -69,7 +69,7 @@ def examine(surface: Surface) -> SurfaceReport:
 
 
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
-    """Warnings about a surface whose inside is in doubt; none for a clean one.
+    """Return warnings about a surface whose inside is in doubt; none for a clean one.
 
     Flatness is measured along the principal axes, so that a tilted sheet is seen too. A closed
     surface is judged by its mean thickness, 2 |volume| / area, relative to its longest side.
@@ -91,7 +91,7 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 
 def _warnings(report: SurfaceReport) -> list[str]:
-    """One line for each doubtful property of the surface, with its remedy."""
+    """Return a line for each doubtful property of the surface, with its remedy."""
     warnings = []
     if report.boundary_edges:
         warnings.append(
@@ -113,15 +113,17 @@ def _warnings(report: SurfaceReport) -> list[str]:
 
 
 def merged_triangles(surface: Surface) -> np.ndarray:
-    """(g, 3) triangles over merged points: equal positions share the number of the first of
-    them, triangles left with fewer than three corners are dropped."""
+    """Return the triangles (g, 3) over merged points.
+
+    Equal positions have the number of the first of them; triangles left with fewer than three corners are dropped.
+    """
     triangles = first_of_equal(surface.points)[surface.triangles]
     a, b, c = triangles.T
     return triangles[(a != b) & (b != c) & (c != a)]
 
 
 def first_of_equal(points: np.ndarray) -> np.ndarray:
-    """(v,) for each point the lowest number of a point of exactly the same position."""
+    """Return for each point (v,) the lowest number of a point of exactly the same position."""
     order = np.lexsort(points.T)  # stable: equal points stay in the order of their numbers
     sorted_points = points[order]
     starts = np.ones(len(points), bool)
@@ -132,8 +134,10 @@ def first_of_equal(points: np.ndarray) -> np.ndarray:
 
 
 def edge_use(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each undirected edge, how many triangles use it, and how many of those run along it
-    from its lower to its higher point number. Both (e,)."""
+    """Return for each undirected edge (e,) how many triangles use it, and how many of those run along it upwards.
+
+    Upwards is from its lower to its higher point number.
+    """
     if len(triangles) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()

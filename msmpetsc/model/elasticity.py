@@ -1,4 +1,4 @@
-"""The elastic energy of a lattice, whatever its law: what the solver sees of a material."""
+"""The elastic energy of a lattice, whatever its law: the interface of the solver to a material."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,10 @@ RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lu
 
 
 class Elasticity:
-    """E of this rank's share of a lattice, its gradient and its Hessian: Hooke's springs (model.springs), or, where
-    the law stiffens, stiffening ones and cells that resist being turned inside out (model.inversion).
+    """E of this rank's part of a lattice, its gradient and its Hessian.
+
+    It is that of Hooke's springs (model.springs), or, where the law stiffens, of stiffening ones and of cells that
+    resist being turned inside out (model.inversion).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
     owned nodes. ``cells`` is None where they do not resist.
@@ -33,11 +35,11 @@ class Elasticity:
         self.parts = [part for part in (self.springs, self.cells) if part]
 
     def energy(self, q: np.ndarray) -> float:
-        """[J]"""
+        """Return E [J] of what this rank owns."""
         return sum(part.energy(q) for part in self.parts)
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """E(q) - E(base) [J]."""
+        """Return E(q) - E(base) [J] of what this rank owns."""
         return sum(part.change(q, base) for part in self.parts)
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
@@ -55,13 +57,13 @@ class Elasticity:
         return concavity[: self.owned]
 
     def resists(self, q: np.ndarray) -> bool:
-        """Whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
+        """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
         if self.cells is None or not len(self.cells.cells):
             return False
         return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
 
     def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
-        """The Hessian of E at q.
+        """Return the Hessian of E at q (l, 3) [m].
 
         projected : without its negative parts, as of compressed springs
         """

@@ -6,6 +6,7 @@ end that it owns. Global node numbers follow Morton order, so they do not depend
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -100,41 +101,79 @@ def build_lattice(
     h = cages.grid.cell_size
     corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
-    ijk, local_cells, octants = _local_cells(cages, table)
-    ghosts = table.find(encode_morton(ijk[len(table.keys) :]))
-    numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
-    springs, springs_owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
-    mass = density * h**3 / 8 * octants.sum(axis=1)
+    net = _network(cages, table)
     given = young_modulus if stiffness is None else stiffness
-    assert given is not None
-    of_spring: float | np.ndarray = given
-    of_cell: float | np.ndarray = given
-    if of_cells is not None:
-        made_of = of_cells(ijk[local_cells[:, 0]])
-        mass = h**3 / 8 * _sums_of_nodes(local_cells, made_of.density, len(mass))
-        of_spring = _sums_of_springs(local_cells, made_of.spring, ijk, springs, len(mass)) / sharing
-        of_cell = made_of.spring
+    mass, of_spring, of_cell = _sums(net, h, density, given, of_cells)
     if stiffness is None:
-        of_spring, of_cell = calibrated_stiffness(of_spring, h, kind, sharing), edge_stiffness(of_cell, h)
-    kept, cells_owned = _kept_cells(local_cells, len(table.keys), stiffening)
+        of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
+    kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)
     return Lattice(
         table=table,
         cell_size=h,
-        nodes=cages.grid.node_positions(ijk),
-        ghosts=ghosts,
+        nodes=cages.grid.node_positions(net.ijk),
+        ghosts=net.ghosts,
         mass=mass,
         cells=table.find(corner_keys),
         cell_kind=cages.kind,
-        springs=springs,
-        springs_owned=springs_owned,
-        rest_length=h * np.sqrt(kind),
-        stiffness=np.broadcast_to(of_spring, len(springs)).copy(),
-        pinned=np.zeros(len(ijk), bool),
+        springs=net.springs,
+        springs_owned=net.springs_owned,
+        rest_length=h * np.sqrt(net.kind),
+        stiffness=np.broadcast_to(of_spring, len(net.springs)).copy(),
+        pinned=np.zeros(len(net.ijk), bool),
         stiffening=stiffening,
-        local_cells=local_cells[kept],
+        local_cells=net.cells[kept],
         cells_owned=cells_owned,
-        cell_stiffness=np.broadcast_to(of_cell, len(local_cells))[kept],
+        cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
     )
+
+
+class _Network(NamedTuple):
+    """Nodes, cells and springs of a rank before they are of a material. Fields as in Lattice, or as said here.
+
+    ijk     : (l, 3) grid index of the nodes, owned and ghosts
+    octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
+    cells   : (c, 8) local corner nodes of all cells around the owned nodes
+    kind    : (s,) of the springs, their squared lengths in cells
+    sharing : (s,) number of cells that share each spring
+    """
+
+    ijk: np.ndarray
+    octants: np.ndarray
+    ghosts: np.ndarray
+    cells: np.ndarray
+    springs: np.ndarray
+    springs_owned: int
+    kind: np.ndarray
+    sharing: np.ndarray
+
+
+def _network(cages: Cages, table: SortedKeys) -> _Network:
+    """Return this rank's nodes, cells and springs (collective)."""
+    owned = len(table.keys)
+    ijk, cells, octants = _local_cells(cages, table)
+    ghosts = table.find(encode_morton(ijk[owned:]))
+    numbers = np.concatenate([table.first + np.arange(owned), ghosts])
+    return _Network(ijk, octants, ghosts, cells, *_springs(cells, numbers, owned))
+
+
+def _sums(
+    net: _Network,
+    h: float,
+    density: float,
+    given: float | None,
+    of_cells: Callable[[np.ndarray], CellMaterial] | None,
+) -> tuple[np.ndarray, float | np.ndarray, float | np.ndarray]:
+    """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
+
+    given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
+    """
+    assert given is not None
+    if of_cells is None:
+        return density * h**3 / 8 * net.octants.sum(axis=1), given, given
+    owned, made_of = len(net.octants), of_cells(net.ijk[net.cells[:, 0]])
+    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density, owned)
+    of_spring = _sums_of_springs(net.cells, made_of.spring, net.ijk, net.springs, owned) / net.sharing
+    return mass, of_spring, made_of.spring
 
 
 def _kept_cells(local_cells: np.ndarray, owned: int, stiffening: float) -> tuple[np.ndarray, int]:

@@ -33,7 +33,7 @@ TINY = 1e-300
 
 @numba.njit(cache=True)
 def spring_energy(x: float, y: float, z: float, r: float, k: float, b: float) -> float:
-    """1/2 k (|(x, y, z)| - r)^2 (Eq. 13), and what stiffening b adds, [J]."""
+    """Return 1/2 k (|(x, y, z)| - r)^2 (Eq. 13), and what stiffening b adds, [J]."""
     stretch = math.sqrt(x * x + y * y + z * z) - r
     energy = 0.5 * k * stretch * stretch
     if b > 0.0:
@@ -44,7 +44,7 @@ def spring_energy(x: float, y: float, z: float, r: float, k: float, b: float) ->
 
 @numba.njit(cache=True)
 def spring_change(u: float, v: float, w: float, dx: float, dy: float, dz: float, r: float, k: float, b: float) -> float:
-    """The energy of a spring that was (u, v, w) and changed by (dx, dy, dz) less what it was [J]."""
+    """Return the energy of a spring that was (u, v, w) and changed by (dx, dy, dz) less what it was [J]."""
     x, y, z = u + dx, v + dy, w + dz
     length, before = math.sqrt(x * x + y * y + z * z), math.sqrt(u * u + v * v + w * w)
     total = length + before
@@ -58,7 +58,7 @@ def spring_change(u: float, v: float, w: float, dx: float, dy: float, dz: float,
 
 @numba.njit(cache=True)
 def spring_pull(x: float, y: float, z: float, r: float, k: float, b: float) -> float:
-    """f [N/m]: the gradient at the end that (x, y, z) points to is f times that."""
+    """Return f [N/m]: the gradient at the end that (x, y, z) points to is f times that."""
     length = math.sqrt(x * x + y * y + z * z)
     f = k * (1.0 - r / max(length, TINY))
     if b > 0.0:
@@ -71,7 +71,7 @@ def spring_pull(x: float, y: float, z: float, r: float, k: float, b: float) -> f
 def spring_block(
     x: float, y: float, z: float, r: float, k: float, b: float, projected: bool
 ) -> tuple[float, float, float, float]:
-    """c, e of the spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
+    """Return c, e of the spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
     It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length; ``projected``
     leaves out the negative part that a compressed spring has across.
@@ -92,7 +92,7 @@ def spring_block(
 def block_product(
     c: float, ex: float, ey: float, ez: float, dx: float, dy: float, dz: float
 ) -> tuple[float, float, float]:
-    """(c I + e e^T) d"""
+    """Return (c I + e e^T) d."""
     along = ex * dx + ey * dy + ez * dz
     return c * dx + along * ex, c * dy + along * ey, c * dz + along * ez
 
@@ -152,7 +152,7 @@ class SpringScatter:
 def elastic_energy(
     q: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray, stiffening: float
 ) -> float:
-    """Sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
+    """Return the sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
     energy = 0.0
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
@@ -170,7 +170,7 @@ def elastic_change(
     stiffness: np.ndarray,
     stiffening: float,
 ) -> float:
-    """E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
+    """Return E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
     change = 0.0
     moved = q - base
     for s in range(len(springs)):
@@ -320,30 +320,30 @@ class SpringGather:
     def energy(self, q: np.ndarray) -> float:
         """Return E [J] of the half of each spring that is nearer to an owned node: all ranks' sum is the body's."""
         parts = np.empty(self.neighbour.shape[1], like=q)
-        energy_around(len(parts), q, *self._all, parts)
+        _energy_around(len(parts), q, *self._all, parts)
         return float(parts.sum())
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
         """Return E(q) - E(base) [J] of the halves of springs that ``energy`` counts."""
         parts = np.empty(self.neighbour.shape[1], like=q)
-        change_around(len(parts), q, base, *self._all, parts)
+        _change_around(len(parts), q, base, *self._all, parts)
         return float(parts.sum())
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add grad E [N] to the owned rows of ``gradient``."""
-        gradient_around(self.neighbour.shape[1], q, *self._all, gradient)
+        _gradient_around(self.neighbour.shape[1], q, *self._all, gradient)
 
     def add_concavity(self, q: np.ndarray, concavity: np.ndarray) -> None:
         """Add to the owned rows of ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
-        concavity_around(self.neighbour.shape[1], q, *self._all, concavity)
+        _concavity_around(self.neighbour.shape[1], q, *self._all, concavity)
 
     def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
-        return partial(product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
+        return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
 
 
 @kernel
-def energy_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, parts):
+def _energy_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, parts):
     for i in range(first, count, step):
         energy = 0.0
         for s in range(neighbour.shape[0]):
@@ -356,7 +356,7 @@ def energy_around(first, count, step, q, neighbour, kind, stiffness, lengths, st
 
 
 @kernel
-def change_around(first, count, step, q, base, neighbour, kind, stiffness, lengths, stiffening, parts):
+def _change_around(first, count, step, q, base, neighbour, kind, stiffness, lengths, stiffening, parts):
     for i in range(first, count, step):
         mx, my, mz = q[i, 0] - base[i, 0], q[i, 1] - base[i, 1], q[i, 2] - base[i, 2]
         change = 0.0
@@ -371,7 +371,7 @@ def change_around(first, count, step, q, base, neighbour, kind, stiffness, lengt
 
 
 @kernel
-def gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, gradient):
+def _gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, gradient):
     for i in range(first, count, step):
         gx, gy, gz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):
@@ -389,7 +389,7 @@ def gradient_around(first, count, step, q, neighbour, kind, stiffness, lengths, 
 
 
 @kernel
-def concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, concavity):
+def _concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, concavity):
     for i in range(first, count, step):
         total = 0.0
         for s in range(neighbour.shape[0]):
@@ -402,7 +402,7 @@ def concavity_around(first, count, step, q, neighbour, kind, stiffness, lengths,
 
 
 @kernel
-def product_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, projected, v, product):
+def _product_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, projected, v, product):
     for i in range(first, count, step):
         px, py, pz = 0.0, 0.0, 0.0
         for s in range(neighbour.shape[0]):

@@ -62,7 +62,7 @@ def _printable(name: str) -> str:
 
 
 def _painted(value: Any) -> str | tuple[int, ...]:
-    """A file's name, or numbers of points."""
+    """Return a file's name, or numbers of points."""
     if isinstance(value, str) and 0 < len(value) <= 1000:
         return _printable(value)
     numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
@@ -143,7 +143,7 @@ StepName = Literal["merge", "largest_part", "union", "repair", "orient"]
 
 
 def _step(value: Any) -> str | dict[str, Any]:
-    """A step name, or a table of one key, checked and plain."""
+    """Return a step name, or a table of one key, checked and plain."""
     if isinstance(value, dict):
         return StepTable.model_validate(value).model_dump(exclude_none=True)
     if not isinstance(value, str):

@@ -84,7 +84,7 @@ def test_messages_are_staged_on_the_cpu_where_mpi_knows_no_gpus(options, knows: 
     try:
         with (
             patch.object(device, "what_is_missing", lambda: None),
-            patch.object(cuda, "take_one", lambda rank: None),
+            patch.object(cuda, "use_device", lambda rank: None),
             patch.object(device, "_mpi_knows_gpus", lambda: knows),
         ):
             assert device.sender(MPI.COMM_SELF) is cuda.send

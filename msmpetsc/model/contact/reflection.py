@@ -60,8 +60,9 @@ class Reflection:
         time_step: float,
         sides: np.ndarray,
     ) -> np.ndarray:
-        """q_(n-1) (n, 3) [m] so that velocities are reversed but nodes stay where they are, behind the face until they
-        have gone back through it: no spring is stretched, no energy comes in.
+        """Return q_(n-1) (n, 3) [m] so that velocities are reversed but nodes stay where they are.
+
+        They are behind the face until they have gone back through it: no spring is stretched, no energy comes in.
 
         a : (n, 3) [m] acceleration times t^2. Where that presses a node on, half of it is the least way back in a step,
             or the node would sink in with e < 1; but no node leaves faster than it came.

@@ -13,7 +13,7 @@ from msmpetsc.comm import log
 def cache_is_empty() -> bool:
     """Return whether numba's cache for these sources (msmpetsc/__init__.py) has no index file.
 
-    Each kernel has one. To be asked before modules with kernels are imported, for some are compiled then.
+    Each kernel has one. To be asked before kernels are called, which writes them.
     """
     return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
 

@@ -8,7 +8,6 @@ and interior; the last two are the valid ones.
 import os
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from mpi4py import MPI
 
@@ -160,6 +159,10 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
     """
+    try:
+        import igl
+    except ImportError:
+        raise InputError("an open mesh needs libigl: pip install msmpetsc[mesh]; or close its holes") from None
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = boundary @ PACK

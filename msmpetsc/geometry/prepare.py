@@ -1,13 +1,12 @@
 """Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
+from types import ModuleType
 
-import fast_simplification
-import manifold3d
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
@@ -62,10 +61,12 @@ def largest_part(surface: Surface) -> Surface:
 
 def union(surface: Surface) -> Surface:
     """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
+    manifold3d = _library("manifold3d", "mesh", "union")
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
-        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
+        _solid(manifold3d, Surface(surface.points, surface.triangles[labels == part]), part)
+        for part in range(labels.max() + 1)
     ]
     mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
@@ -73,14 +74,11 @@ def union(surface: Surface) -> Surface:
 
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
-    try:
-        from pymeshfix import MeshFix
-    except ImportError:
-        raise InputError("repair needs pymeshfix: pip install msmpetsc[repair]") from None
+    pymeshfix = _library("pymeshfix", "repair", "repair")
     surface = merge(surface)
     if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
         raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
-    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:
@@ -101,7 +99,8 @@ def simplify(surface: Surface, faces: int) -> Surface:
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
-    points, triangles = fast_simplification.simplify(surface.points, surface.triangles, target_count=int(faces))
+    library = _library("fast_simplification", "mesh", "simplify")
+    points, triangles = library.simplify(surface.points, surface.triangles, target_count=int(faces))
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
         return repair(reduced)  # collapsing edges can pinch thin places
@@ -127,6 +126,8 @@ def orient(surface: Surface) -> Surface:
 
 def rotate(surface: Surface, turn: dict) -> Surface:
     """Turn about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
+    from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
+
     axis = np.asarray(turn["axis"], float)
     if not axis.any():
         raise InputError("the axis has no direction")
@@ -180,7 +181,15 @@ def _part_labels(surface: Surface) -> np.ndarray:
     return np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
 
 
-def _solid(part: Surface, number: int) -> manifold3d.Manifold:
+def _library(name: str, extra: str, step: str) -> ModuleType:
+    """Return a library that one step alone needs, or raise InputError saying which extra of this package has it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"{step} needs {name}: pip install msmpetsc[{extra}]") from None
+
+
+def _solid(manifold3d: ModuleType, part: Surface, number: int) -> object:
     """Return a part as a solid, turned outwards; InputError if it does not bound one."""
     report = examine(part)
     part = compact(part.points, part.triangles)

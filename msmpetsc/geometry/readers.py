@@ -15,7 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
-import meshio
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
@@ -194,6 +193,8 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 def _read_mixed_ply(data: bytes) -> Arrays:
     """Read a binary PLY whose faces differ in their number of corners, which trimesh does not read."""
+    import meshio  # a slow import for what few scenes name
+
     mesh = meshio.ply.read(BytesIO(data))
     polygons = [face for block in mesh.cells for face in block.data]
     return mesh.points, trimesh.geometry.triangulate_quads(polygons)
@@ -258,6 +259,8 @@ def _read_trimesh(path: Path, data: bytes) -> Arrays:
 
 def _read_meshio(path: Path, data: bytes) -> Arrays:
     """Read the outer surface of the tetrahedra, or else triangles and quads, without unused points."""
+    import meshio
+
     unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
     packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
     with mock.patch.multiple(meshio.vtu._vtu, **packers):  # type: ignore[call-overload]  # typeshed takes no names

@@ -99,6 +99,8 @@ def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path
     if device.what_is_missing():
         pytest.skip(device.what_is_missing())
     options["mat_type"] = "seqaijcusparse"
-    with patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array):
-        with pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"):
-            play(block_scene(tmp_path, **FALL))
+    with (
+        patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array),
+        pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"),
+    ):
+        play(block_scene(tmp_path, **FALL))

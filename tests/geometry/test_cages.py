@@ -7,6 +7,7 @@ Enclosed cells: scipy.ndimage.label on the dense grid.
 """
 
 import os
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -294,6 +295,12 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
 
 
+def test_an_open_box_without_libigl_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "igl", None)
+    with pytest.raises(InputError, match=r"pip install msmpetsc\[mesh\]"):
+        fill(aligned_box(lid=False), 0.1)
+
+
 def test_the_longest_side_may_be_any():
     whole = fill(aligned_box(), 0.1).ijk
     for turns in (1, 2):
@@ -329,12 +336,12 @@ def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_
 
 
 def test_too_many_cells_are_refused():
-    with pytest.raises(InputError, match="above cages.max_cells = 149"):
+    with pytest.raises(InputError, match=r"above cages.max_cells = 149"):
         fill(aligned_box(), 0.1, max_cells=149)
     assert len(fill(aligned_box(), 0.1, max_cells=150).kind) == 150
-    with pytest.raises(InputError, match="above cages.max_cells"):
+    with pytest.raises(InputError, match=r"above cages.max_cells"):
         fill(aligned_box(), 1e-5)  # at once: 1.5e14 cells are not tried
-    with pytest.raises(InputError, match="cages.cell_size: 1e-08 m would cut the body into 1e"):
+    with pytest.raises(InputError, match=r"cages.cell_size: 1e-08 m would cut the body into 1e"):
         fill(aligned_box(), 1e-8)
 
 
@@ -372,5 +379,5 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
 
 
 def test_more_cells_than_allowed_are_not_sought():
-    with pytest.raises(InputError, match="cages.count: 151 is more than cages.max_cells = 150"):
+    with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
         choose_cell_size(aligned_box(), 151, max_cells=150)

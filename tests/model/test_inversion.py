@@ -273,7 +273,7 @@ def test_every_preset_steps_the_stiffening_law_to_the_error_it_declares(preset: 
 
 @pytest.mark.parametrize("preset", ["fast-msm", "paper"])
 def test_beyond_that_the_plain_presets_fail_and_say_so(preset: str):
-    with pytest.raises(StepFailed, match="did not converge: .* try .*another preset"):
+    with pytest.raises(StepFailed, match=r"did not converge: .* try .*another preset"):
         squeezed_step(preset, 0.45, 1e-3)
 
 

@@ -185,10 +185,10 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
     """
     options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
     database = PETSc.Options()
-    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
-    ours = options.keys() - given
+    users = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
+    ours = options.keys() - users
     for chosen, bound in BOUND_TO_TYPE.items():
-        if chosen in given:
+        if chosen in users:
             ours -= bound
     if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
         ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
@@ -200,7 +200,7 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
 
 
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
-    """What PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
+    """Options that PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
 
     solvers : prefix of their options -> preset and budget of iterations
 
@@ -225,8 +225,42 @@ def _quoted(value: str | None) -> str:
 
 
 def forget_defaults(names: set[str]) -> None:
-    """Take them out again: another preset may follow, and -options_left is to show the user's own."""
+    """Take options out again: another preset may follow, and -options_left is to show the user's own."""
     in_use.subtract(names)
     for name in names:
         if not in_use[name]:
             PETSc.Options().delValue(name)
+
+
+class SolverOptions:
+    """A preset's options in PETSc's database while its solver lives.
+
+    prefix : of the solver's options
+    names  : of those that are the preset's own, prefix included
+    """
+
+    def __init__(self, preset: Preset, prefix: str, budget: int):
+        self.prefix, self.names = prefix, set_defaults(preset, prefix, budget)
+        self.hidden: dict[str, str | None] = {}
+
+    def hide(self, name: str) -> None:
+        """Keep an option of the user's from all objects that are made from now on."""
+        database = PETSc.Options()
+        if self.prefix + name in database.getAll():
+            self.hidden[self.prefix + name] = database.getAll()[self.prefix + name]
+            database.delValue(self.prefix + name)
+
+    def is_default(self, name: str) -> bool:
+        """Whether an option is the preset's own, not the user's."""
+        return self.prefix + name in self.names
+
+    def is_given(self, name: str) -> bool:
+        """Whether an option stands in the database, the user's or the preset's."""
+        return self.prefix + name in PETSc.Options().getAll()
+
+    def withdraw(self) -> None:
+        """Leave the database as the user has it."""
+        for name, value in self.hidden.items():
+            PETSc.Options().setValue(name, value)
+            PETSc.Options().getString(name)  # it has been of use
+        forget_defaults(self.names)

@@ -1,11 +1,11 @@
 """Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
 
-F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
-positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
-for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
-the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when
-the body is compressed anew or more than it was, or something showed a negative curvature; at all other steps the mode
-found last is followed in a few iterations.
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
+is positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is
+looked for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
+2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the
+third. At length when the body is compressed anew or more than it was, or something showed a negative curvature; at all
+other steps the mode found last is followed in a few iterations.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,8 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import greatest, like, to_host
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.initial_state import uniform
-from msmpetsc.solve.linear.operators import Preconditioner, TrueHessian
+from msmpetsc.solve.linear.operators import TrueHessian
+from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 BLOCK = 4  # directions of a long search
@@ -36,7 +37,7 @@ Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of 
 
 @dataclass(frozen=True)
 class Compression:
-    """Of all ranks: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
 
     greatest: float
     total: float
@@ -52,8 +53,9 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if not self.resists else 0.0
 
-    def exceeds(self, other: "Compression") -> bool:
-        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
+    def exceeds(self, searched: "Compression") -> bool:
+        """Whether modes may have come since another compression was searched."""
+        return self.greatest > MORE * searched.greatest or self.total > MORE * searched.total
 
 
 NONE = Compression(0.0, 0.0, False)
@@ -75,24 +77,26 @@ class LowestCurvature:
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
     def compression(self, q: np.ndarray) -> Compression:
-        """At positions q (l, 3) [m]."""
+        """Compression at positions q (l, 3) [m]."""
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        shares = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
-        found = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
-        most, sums, resist = zip(*found, strict=True)
+        ratios = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
+        gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
+        most, sums, resist = zip(*gathered, strict=True)
         return Compression(max(most), sum(sums), any(resist))
 
-    def lowest(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray]:
-        """The lowest eigenvalue of M^(-1) H that was found, and a direction (n,) of about that curvature, about where H
-        was linearised last.
+    def lowest(
+        self, q: np.ndarray, compression: Compression, alarmed: bool, hint: PETSc.Vec | None
+    ) -> tuple[float, np.ndarray]:
+        """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
 
+        q       : positions (l, 3) [m] that H was linearised at last
         alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
         if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
-            values, modes = self._search_at_length(hint)
+            values, modes = self._search_at_length(q, hint)
         else:
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
         if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
@@ -104,18 +108,19 @@ class LowestCurvature:
         return values[0], self.mode
 
     def _way_down(self, modes: np.ndarray) -> np.ndarray:
-        """What a random direction has of all of them (k, n): where a body may buckle to many sides, no matter which of
-        them rounding has made the first, so that it goes the same way on any ranks."""
+        """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
+        which of them rounding has made the first, so that it goes the same way on any ranks."""
         direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(self, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
-        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
-        for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
+    def _search_at_length(self, q: np.ndarray, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
+        """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
+        rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
+        of all of them."""
         start = self._random(BLOCK)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
-        self.rigid = self._rigid_motions()
+        self.rigid = self._rigid_motions(q)
         _, modes = self._iterate(self._without_rigid(start), MOST, LEAST)
         known = [] if self.mode is None else [self.mode[None]]
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
@@ -138,7 +143,8 @@ class LowestCurvature:
             residuals = self._without_rigid(self._preconditioned(x[1] - like(mass, values)[:, None] * mass * x[0]))
             w = self._unit(residuals)
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
-            values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
+            span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+            values, (x, last) = self._ritz((span, products), size)
             lowest.append(values[0])
             self.its += len(w)
             if lowest[-1] < 0:
@@ -149,8 +155,8 @@ class LowestCurvature:
         return values, x[0]
 
     def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
-        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
-        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
+        of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
         grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
         sizes, parts = np.linalg.eigh(grams[1])
@@ -165,11 +171,12 @@ class LowestCurvature:
         lengths = np.maximum(self._lengths(moved[0]), TINY)
         return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
 
-    def _rigid_motions(self) -> np.ndarray | None:
-        """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
+    def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
+        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
+        are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
-        columns = self.functional.q[self.unknowns.free].T
+        columns = q[self.unknowns.free].T
         motions = np.zeros((6, *columns.shape), like=columns)
         for c in range(3):
             motions[c, c] = 1.0
@@ -198,42 +205,40 @@ class LowestCurvature:
     def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
         if self.vectors is None:
             self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
-        given, made = self.vectors
+        source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):
-            self.memory.write(given)[:] = direction
-            act(None, given, made)
-            result[:] = self.memory.read(made)
+            self.memory.write(source)[:] = direction
+            act(None, source, product)
+            result[:] = self.memory.read(product)
         return results
 
     def _unit(self, directions: np.ndarray) -> np.ndarray:
-        """Of unit length in the norm of M; those of no length stay so."""
+        """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
 
     def _lengths(self, directions: np.ndarray) -> np.ndarray:
         return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
-        """Over all ranks."""
+        """Sum over all ranks."""
         return self.comm.allreduce(values)
 
-    def save(self, saved: Checkpoint) -> None:
-        """What the next step's search depends on."""
-        lattice = self.functional.lattice
-        rows = saved.rows["lowest_mode"] = np.zeros((lattice.owned, 3), like=lattice.nodes)
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next step's search depends on."""
+        lattice, searched = self.functional.lattice, self.searched
+        rows = np.zeros((lattice.owned, 3), like=lattice.nodes)
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
-        saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
-        saved.numbers["knows_mode"] = self.mode is not None
+        numbers = {"searched_greatest": searched.greatest, "searched_total": searched.total}
+        checkpoint.keep({"lowest_mode": rows}, {**numbers, "knows_mode": self.mode is not None})
 
-    def restore(self, saved: Checkpoint) -> None:
-        """Go on from there; from nothing saved as if no step had been taken."""
-        self.searched = Compression(
-            saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False
-        )
-        self.mode = None
-        if saved.count("knows_mode", 1):
-            rows = like(self.functional.mass, saved.row("lowest_mode"))
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken."""
+        most, total = (checkpoint.number(name, 0, 0) for name in ("searched_greatest", "searched_total"))
+        self.searched, self.mode = Compression(most, total, False), None
+        if checkpoint.count("knows_mode", 1):
+            rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def destroy(self) -> None:

@@ -97,12 +97,12 @@ class Environment:
         states = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
         return Contact(states, owned) if states else None
 
-    def push(self, time: float, sides: np.ndarray) -> Contact | None:
-        """Return what presses at a time, without friction; None if nothing does."""
+    def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
+        """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
         states = self._states(time, sides)
         return Contact(states, self.lattice.owned) if states else None
 
-    def _states(self, time: float, sides: np.ndarray) -> list[ContactState]:
+    def _states(self, time: float, sides: np.ndarray | None) -> list[ContactState]:
         return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def apply_friction(

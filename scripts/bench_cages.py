@@ -16,13 +16,11 @@ import trimesh
 from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
-from msmpetsc.geometry import morton
-from msmpetsc.geometry.cages import Body, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
-from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.cages import Body, choose_cell_size, fill
+from msmpetsc.geometry.embedding import KINDS, embed
+from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
-from msmpetsc.geometry.stencil import KINDS
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.lattice import CORNERS
 
@@ -70,7 +68,7 @@ def row(name: str, body: Body, count: int) -> list[str]:
     """The table's cells for one body filled with about ``count`` cells."""
     cell_size = choose_cell_size(body, count)
     cages = fill(body, cell_size)
-    nodes = SortedKeys(comm, morton.encode(cages.ijk[:, None, :] + CORNERS).ravel())
+    nodes = SortedKeys(comm, encode_morton(cages.ijk[:, None, :] + CORNERS).ravel())
     points = np.empty((0, 3))
     triangles = 0
     if body.surface is not None:

@@ -33,8 +33,7 @@ from petsc4py import PETSc
 from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.profile import machine, versions
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.to_device import placed
+from msmpetsc.model.build import Model, build_model, to_device
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
@@ -189,7 +188,7 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
     }
     if not arrays.on_host(q):
         around = elasticity.springs
-        tables = around.other, around.stiffness
+        tables = around.neighbour, around.stiffness
         found["A, by a kernel"] = seconds_of(lambda: laplacian_around(len(q), q, *tables, gradient))
         product = stepper.jacobian.hessian.mult
         found["Hessian product in a graph"] = in_a_graph(lambda: product(None, x, y))
@@ -313,7 +312,7 @@ def dissected(cells: int, args: argparse.Namespace) -> dict:
     model = build_model(MPI.COMM_SELF, scene)
     found = {"cells": len(model.lattice.cells), "CPU": parts(model, scene.time.step)}
     device.choose(MPI.COMM_SELF, "cuda")
-    there = placed(model, device.sender(MPI.COMM_SELF))
+    there = to_device(model, device.sender(MPI.COMM_SELF))
     found["GPU"] = parts(there, scene.time.step)
     found["a frame"] = a_frame(scene, model, args.frames) | launches(there.lattice.nodes)
     PETSc.Options().delValue(device.OPTION)

@@ -12,7 +12,7 @@ from clone import parser
 
 import numpy as np
 
-from msmpetsc.geometry.stencil import KINDS, stencil_weights
+from msmpetsc.geometry.embedding import KINDS, stencil_weights
 
 COMPARED = ("trilinear", *KINDS)
 BAR = np.array([4, 1, 1])  # sides [m]

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.model.inversion import least_volumes
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 from msmpetsc.output.reader import Result
 from msmpetsc.output.render import read_scene
 

@@ -11,9 +11,9 @@ from msmpetsc.comm import log
 
 
 def cache_is_empty() -> bool:
-    """Whether numba's cache for these sources (msmpetsc/__init__.py) has no index file, of which each kernel has one.
+    """Return whether numba's cache for these sources (msmpetsc/__init__.py) has no index file.
 
-    To be asked before modules with kernels are imported, for some are compiled then.
+    Each kernel has one. To be asked before kernels are called, which writes them.
     """
     return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
 
@@ -37,6 +37,6 @@ class FirstCompilation(Listener):
 
 @contextmanager
 def compilation_logged(all_are_new: bool) -> Iterator[None]:
-    """Within this block the first compilation is logged."""
+    """Log the first compilation within this block."""
     with install_listener("numba:compile", FirstCompilation(all_are_new)):
         yield

@@ -7,7 +7,10 @@ import numpy as np
 
 
 def missing() -> str | None:
-    """Why there is no GPU here, in words, None if there is one: the runtime is asked, for PETSc would crash at exit."""
+    """Return why there is no GPU, in words, None if there is one.
+
+    The runtime is asked, for PETSc would crash at exit.
+    """
     try:
         import cupy
         from numba import cuda  # noqa: F401
@@ -19,22 +22,22 @@ def missing() -> str | None:
         return f"no GPU is seen: {str(error).splitlines()[0]}"
 
 
-def take_one(rank: int) -> None:
-    """Of several GPUs the one that PETSc takes too: r modulo their number for rank r."""
+def use_device(rank: int) -> None:
+    """Use, of several GPUs, the one that PETSc takes too: r modulo their number for rank r."""
     import cupy
 
     cupy.cuda.Device(rank % cupy.cuda.runtime.getDeviceCount()).use()
 
 
 def send(array: np.ndarray) -> np.ndarray:
-    """The same on the GPU."""
+    """Return a copy of an array in the memory of the GPU."""
     import cupy
 
     return cupy.asarray(array)
 
 
 def view(pointer: int, size: int) -> np.ndarray:
-    """Memory of someone else, (size,) numbers, as an array; valid while that is there."""
+    """Return memory of someone else, (size,) numbers, as an array; valid as long as that memory."""
     import cupy
 
     if not size:
@@ -44,13 +47,14 @@ def view(pointer: int, size: int) -> np.ndarray:
 
 
 def wait() -> None:
-    """Until the GPU has done all that it was given."""
+    """Wait until the GPU has done all that it was given."""
     import cupy
 
     cupy.cuda.Device().synchronize()
 
 
 def name() -> str:
+    """Return the name of the GPU in use."""
     import cupy
 
     return cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()

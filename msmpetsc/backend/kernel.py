@@ -9,8 +9,9 @@ from msmpetsc.backend.arrays import on_host
 
 
 def kernel(body: Callable[..., None]) -> Callable[..., None]:
-    """``body(first, count, step, *arguments)``, which does something for every i in range(first, count, step), as
-    ``kernel(body)(count, *arguments)``, which does it for all i below a count, in any order.
+    """Make of ``body(first, count, step, *arguments)``, for every i in range(first, count, step), a kernel.
+
+    ``kernel(body)(count, *arguments)`` does the same for all i below a count, in any order.
 
     The first argument is an array, whose type tells where. What the body calls is compiled by numba.njit and takes
     its roots from ``math``; no two indices write to the same place. The loop stands in the body, and not here, so
@@ -27,5 +28,5 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
 
             launcher(body)(count, *arguments)
 
-    everywhere.compiled = compiled
+    everywhere.compiled = compiled  # type: ignore[attr-defined]  # for tests, which run bodies on what is no GPU
     return everywhere

@@ -19,7 +19,7 @@ KEPT = 4096  # arrays that numba has seen
 
 @cache
 def launcher(body: Callable[..., None]) -> Callable[..., None]:
-    """What backend.kernel calls: one thread for each index below a count, in CuPy's current stream."""
+    """Return what backend.kernel calls: one thread for each index below a count, in CuPy's current stream."""
     kernel, known = kernel_of(body), {}
 
     def launch(count, *arguments):
@@ -34,7 +34,7 @@ def launcher(body: Callable[..., None]) -> Callable[..., None]:
 
 
 def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
-    """Takes a count and the tuple of what the body takes beside its range."""
+    """Return the CUDA kernel of a body: it takes a count and the tuple of the body's further arguments."""
     compiled = cuda.jit(device=True)(body)
 
     @cuda.jit
@@ -44,8 +44,8 @@ def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
     return threads
 
 
-def as_argument(value: np.ndarray | float) -> tuple[Hashable, np.ndarray | float]:
-    """What tells for which type it is compiled, and the value: an array as numba wants it, anything else as it is."""
+def as_argument(value: np.ndarray | float) -> tuple[object, object]:
+    """Return what says for which type a kernel is compiled, and the value: an array as numba wants it, or as it is."""
     if isinstance(value, cupy.ndarray):
         return _seen_by_numba(value.data.ptr, value.shape, value.strides, value.dtype.str)
     return type(value), value
@@ -55,9 +55,9 @@ def as_argument(value: np.ndarray | float) -> tuple[Hashable, np.ndarray | float
 def _seen_by_numba(
     pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], kind: str
 ) -> tuple[Hashable, object]:
-    """It owns nothing; made once, for that takes longer than a launch."""
-    told = {"data": (pointer, False), "shape": shape, "strides": strides, "typestr": kind, "version": 3}
-    array = cuda.from_cuda_array_interface(told, sync=False)
+    """Return numba's view of an array, which owns nothing; made once, for that takes longer than a launch."""
+    interface = {"data": (pointer, False), "shape": shape, "strides": strides, "typestr": kind, "version": 3}
+    array = cuda.from_cuda_array_interface(interface, sync=False)
     return (kind, len(shape), array.is_c_contiguous(), array.is_f_contiguous()), array
 
 

@@ -20,7 +20,7 @@ from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:
     from msmpetsc.geometry.surface import Surface
-    from msmpetsc.model.partition import Shares
+    from msmpetsc.model.partition import Partition
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_bad_numbers(args)
     initialise(MPI.COMM_WORLD, list(args.petsc_options))
     from msmpetsc.model.build import read_body
-    from msmpetsc.model.partition import shares_of
+    from msmpetsc.model.partition import partition_of
     from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.presets import PRESETS
 
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     body = read_body(MPI.COMM_WORLD, scene)
     assert body.surface is not None  # which rank 0 has
     mesh = peak_memory() - before
-    shares, counted = shares_of(body, scene.cages, args.ranks, MOST_BUILT)
+    shares, counted = partition_of(body, scene.cages, args.ranks, MOST_BUILT)
     cells = shares.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
@@ -69,7 +69,7 @@ def refuse_bad_numbers(args: argparse.Namespace) -> None:
         raise InputError(f"--bandwidth must be more than 0, not {args.bandwidth:g}")
 
 
-def print_counts(args: argparse.Namespace, scene: Scene, shares: "Shares", counted: int) -> None:
+def print_counts(args: argparse.Namespace, scene: Scene, shares: "Partition", counted: int) -> None:
     """Print a table of what there is, and what a rank has of it."""
     how = "counted" if counted == shares.cells.sum() else f"scaled from a lattice of {counted} cells"
     print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
@@ -89,7 +89,7 @@ def print_counts(args: argparse.Namespace, scene: Scene, shares: "Shares", count
     print(f"{positions:{WIDTH}}{24 * scene.stored * shares.nodes.sum() / GB:15.3g}")
 
 
-def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Shares", mesh: float) -> None:
+def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Partition", mesh: float) -> None:
     """Print memory and time, and what they rest on; ``mesh``: bytes that preparing the surface took."""
     from msmpetsc.study.forecast import Network, forecast
 
@@ -116,7 +116,7 @@ def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shar
     )
 
 
-def print_limits(shares: "Shares") -> None:
+def print_limits(shares: "Partition") -> None:
     """Print at how many cells of this body, on as many ranks, integers end."""
     from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
 
@@ -133,7 +133,7 @@ def print_limits(shares: "Shares") -> None:
         print(f"{name} end at {limit} ({integer}): {cells:.3g} cells{too_few}")
 
 
-def largest(shares: "Shares", count: Callable[["Shares"], float], limit: int) -> float:
+def largest(shares: "Partition", count: Callable[["Partition"], float], limit: int) -> float:
     """Return the number of cells with which this body's ``count`` comes to its limit, on as many ranks."""
     log_cells = brentq(lambda x: np.log(count(shares.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
     return float(np.exp(log_cells))

@@ -11,7 +11,7 @@ SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolate
 
 
 def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Every cell that a triangle touches: exact up to rounding, and conservative within it.
+    """Return every cell that a triangle touches: exact up to rounding, and conservative within it.
 
     corners   : (f, 3, 3) triangles in cell units
     low, high : (3,) int, cells outside low..high-1 are left out
@@ -21,7 +21,7 @@ def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 
 def sampled_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Cells of the paper's sample points v3 + (i/n)(v1 - v3) + (j/n)(v2 - v3), n = ceil(longest side).
+    """Return the cells of the paper's sample points v3 + (i/n)(v1 - v3) + (j/n)(v2 - v3), n = ceil(longest side).
 
     Misses cells that a triangle only grazes. Arguments and result as in ``touched_cells``.
     """
@@ -59,14 +59,14 @@ def _clip(polygon, n, axis, plane, side, out):
 
 @numba.njit(cache=True)
 def _slab(polygon, n, axis, index, slack, work, out):
-    """The part of the polygon between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
+    """Cut the polygon to between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
     m = _clip(polygon, n, axis, index - slack, 1.0, work)
     return _clip(work, m, axis, index + 1 + slack, -1.0, out)
 
 
 @numba.njit(cache=True)
 def _extent(polygon, n, axis):
-    """Smallest and largest coordinate along an axis."""
+    """Return the smallest and largest coordinate along an axis."""
     smallest, largest = polygon[0, axis], polygon[0, axis]
     for a in range(1, n):
         smallest = min(smallest, polygon[a, axis])
@@ -76,14 +76,14 @@ def _extent(polygon, n, axis):
 
 @numba.njit(cache=True)
 def _slack(triangle, axis):
-    """More than the rounding of a coordinate interpolated between corners of the triangle."""
+    """Return more than the rounding of a coordinate interpolated between corners of the triangle."""
     smallest, largest = _extent(triangle, 3, axis)
     return SLACK * (1.0 + max(abs(smallest), abs(largest)))
 
 
 @numba.njit(cache=True)
 def _index_range(triangle, part, n, axis, low, high, slack):
-    """First and last cell index that a part of a triangle reaches along an axis.
+    """Return the first and last cell index that a part of a triangle reaches along an axis.
 
     Slack widens the part, whose points may be interpolated, but never past the triangle's own
     corners: those are exact, so a triangle that ends in a grid plane does not mark the layer behind.
@@ -95,7 +95,7 @@ def _index_range(triangle, part, n, axis, low, high, slack):
 
 
 @numba.njit(cache=True)
-def _in_one_cell(triangle):
+def _within_a_cell(triangle):
     for c in range(3):
         index = np.floor(triangle[0, c])
         if np.floor(triangle[1, c]) != index or np.floor(triangle[2, c]) != index:
@@ -114,7 +114,7 @@ def _touched(corners, low, high):
     used = 0
     work, across, along = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
     for triangle in corners:
-        if _in_one_cell(triangle):
+        if _within_a_cell(triangle):
             cells = _grown(cells, used)
             for c in range(3):
                 cells[used, c] = int(np.floor(triangle[0, c]))

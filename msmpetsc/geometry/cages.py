@@ -8,22 +8,22 @@ and interior; the last two are the valid ones.
 import os
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import Route, SortedKeys, together
+from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.grid import Grid
+from msmpetsc.geometry.grid import LIMIT, Grid, decode_morton, encode_morton
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport
 
 BOUNDARY, INTERIOR = 1, 2
 CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
-PACK = np.array([morton.LIMIT**2, morton.LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
+PACK = np.array([LIMIT**2, LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
+TOLERANCE = 0.01  # of a wanted number of cells
+SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
 MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
@@ -44,7 +44,7 @@ class Body:
 class Cages:
     """Valid cells of a body, each rank's share in Morton order.
 
-    table : keys of the cells (geometry.morton)
+    table : keys of the cells (geometry.grid)
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
     """
 
@@ -54,12 +54,12 @@ class Cages:
 
     @property
     def ijk(self) -> np.ndarray:
-        """(n_local, 3) grid index of this rank's cells."""
-        return morton.decode(self.table.keys)
+        """Grid index (n_local, 3) of this rank's cells."""
+        return decode_morton(self.table.keys)
 
 
 def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000) -> Cages:
-    """The valid cells of side ``cell_size`` [m] (collective).
+    """Return the valid cells of side ``cell_size`` [m] (collective).
 
     method : "exact", or "sample" for the paper's sample points
     raises : InputError if there would be more than ``max_cells``
@@ -70,7 +70,7 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
     interior = cells_of_gaps(gaps)
     ijk = np.concatenate([boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(boundary), len(interior)])
-    keys = morton.encode(ijk)
+    keys = encode_morton(ijk)
     table = SortedKeys(body.comm, keys)
     route = Route(body.comm, table.owner(keys))
     order = np.argsort(route.send(keys))
@@ -78,12 +78,12 @@ def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5
 
 
 def count_cells(comm: MPI.Comm, boundary: np.ndarray, gaps: np.ndarray) -> int:
-    """Number of valid cells on all ranks."""
+    """Return the number of valid cells on all ranks (collective)."""
     return comm.allreduce(len(boundary) + int((gaps[:, 3] - gaps[:, 2] + 1).sum()))
 
 
 def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled: the longest comes first."""
+    """Return boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled, the longest first."""
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     _refuse_above(max_cells, _least_cells(body, grid), grid)
@@ -99,7 +99,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.
 
 
 def _least_cells(body: Body, grid: Grid) -> float:
-    """Fewer than there will be, known before they are made."""
+    """Return fewer cells than there will be, known before they are made."""
     return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
 
@@ -119,12 +119,13 @@ def _axes(body: Body) -> np.ndarray:
 def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
     if cells > max_cells:
         raise InputError(
-            f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, above cages.max_cells = {max_cells}"
+            f"cages: a cell size of {grid.cell_size:.3g} m gives {cells:.3g} cells or more, "
+            f"above cages.max_cells = {max_cells}"
         )
 
 
 def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
-    """Triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
+    """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
         corners = grid.to_cells(body.surface.points)[:, axes][body.surface.triangles]
@@ -138,7 +139,7 @@ def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
 
 
 def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
-    """Distinct boundary cells (b, 3) of the slab in lexicographic order.
+    """Return the distinct boundary cells (b, 3) of the slab in lexicographic order.
 
     The paper's samples of a triangle may lie in another slab than its rank's, but then the
     triangle was sent there too.
@@ -149,15 +150,19 @@ def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np
         cells = MARK[method](corners[start : start + CHUNK], low, high)
         keys.append(np.unique(cells @ PACK))
     packed = np.unique(np.concatenate(keys))
-    return np.stack([packed // PACK[0], packed // PACK[1] % morton.LIMIT, packed % morton.LIMIT], axis=1)
+    return np.stack([packed // PACK[0], packed // PACK[1] % LIMIT, packed % LIMIT], axis=1)
 
 
 def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
-    """Interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size
-    (Jacobson et al. 2013). Time follows the bounding box here, memory does not.
+    """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
 
+    (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
     """
+    try:
+        import igl
+    except ImportError:
+        raise InputError("an open mesh needs libigl: pip install msmpetsc[mesh]; or close its holes") from None
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = boundary @ PACK
@@ -172,3 +177,49 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
         inside = cells[np.abs(winding) > 0.5]
         gaps.append(inside[:, [0, 1, 2, 2]])  # a gap of one cell each
     return np.concatenate(gaps)
+
+
+def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000) -> float:
+    """Return the cell size [m] that gives ``count`` cells within 1%, or the nearest with a warning (collective).
+
+    The number of cells falls about as a power of the size, so this is a secant search in logarithms,
+    kept inside the bracket found so far: the number is a step function and not quite monotone.
+
+    raises : InputError if ``count`` is more than ``max_cells``, or than memory can hold
+    """
+    if count > max_cells:
+        raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
+    refuse_beyond_memory(body.comm, count)
+    excess = {}  # log(size) -> log(cells / count)
+    guess = np.log(_first_guess(body, count))
+    for _ in range(SEARCH_LIMIT):
+        boundary, gaps = slab_cells(body, Grid.covering(body.bounds, np.exp(guess)), method, 20 * max_cells)
+        excess[guess] = np.log(count_cells(body.comm, boundary, gaps) / count)
+        nearest = min(excess, key=lambda size: abs(excess[size]))
+        if abs(np.expm1(excess[nearest])) <= TOLERANCE:
+            return float(np.exp(nearest))
+        guess = _next_guess(excess, nearest)
+    cells = round(count * np.exp(excess[nearest]))
+    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, cells)
+    return float(np.exp(nearest))
+
+
+def _first_guess(body: Body, count: int) -> float:
+    """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
+    roots = np.roots([count, 0, -0.75 * body.report.area, -abs(body.report.volume)])
+    return float(roots.real.max())
+
+
+def _next_guess(excess: dict[float, float], nearest: float) -> float:
+    """Return where the secant through the two best tries meets zero, else the middle of the bracket."""
+    slope = -2.5  # between that of a shell and that of a solid
+    if len(excess) > 1:
+        second = min((size for size in excess if size != nearest), key=lambda size: abs(excess[size]))
+        secant = (excess[nearest] - excess[second]) / (nearest - second)
+        slope = secant if -5 < secant < -1 else slope
+    guess = nearest - excess[nearest] / slope
+    low = max((size for size in excess if excess[size] > 0), default=-np.inf)
+    high = min((size for size in excess if excess[size] < 0), default=np.inf)
+    if low < guess < high and guess not in excess:
+        return guess
+    return (low + high) / 2 if np.isfinite(low + high) else guess

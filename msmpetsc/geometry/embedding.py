@@ -1,4 +1,7 @@
-"""The embedding W: one sparse matrix that carries the surface along, surface = W @ positions (paper 3.1)."""
+"""The embedding W: one sparse matrix that carries the surface along, surface = W @ positions (paper 3.1).
+
+``stencil_weights`` is the one interface to the kinds of embedding, in geometry.mvc and geometry.smoothing.
+"""
 
 from dataclasses import dataclass
 
@@ -7,10 +10,16 @@ from mpi4py import MPI
 from scipy.sparse import coo_array
 
 from msmpetsc.comm import Route, SortedKeys
-from msmpetsc.geometry import morton
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.block import ITSELF
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.stencil import stencil_weights
+from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.geometry.mvc import mvc_weights
+from msmpetsc.geometry.smoothing import affine_weights, cages_weights
 
+KINDS = ("mvc", "cages", "affine")
+ROUNDING = 1e-9  # how far outside its cell a point may be computed to lie
+ON_FACE = 1e-14  # nearer than this to a face of its cell, a point is on it
 CHUNK = 1 << 15  # points at once: their 64 weights each take 16 MB
 # offsets of the 3 x 3 x 3 cells and the 4 x 4 x 4 nodes around a cell, in the order of stencil_weights
 CELLS_AROUND = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
@@ -30,12 +39,12 @@ class Embedding:
 
     @property
     def points(self) -> int:
-        """Surface points of this rank."""
+        """Number of surface points of this rank."""
         return len(self.indptr) - 1
 
 
 def embed(points: np.ndarray, cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
-    """W for surface points (collective).
+    """Return W for surface points (collective).
 
     points    : (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells
     nodes     : the lattice's node numbers by grid key
@@ -44,10 +53,10 @@ def embed(points: np.ndarray, cages: Cages, nodes: SortedKeys, kind: str, smooth
     comm = cages.table.comm
     total = comm.allreduce(len(points))
     row, ijk, u = _to_cells(points, cages)
-    cell_keys, cell = np.unique(morton.encode(ijk), return_inverse=True)
-    around = morton.decode(cell_keys)[:, None, :]
-    neighbours = cages.table.find(morton.encode(around + CELLS_AROUND)) >= 0
-    numbers = nodes.find(morton.encode(around + NODES_AROUND))
+    cell_keys, cell = np.unique(encode_morton(ijk), return_inverse=True)
+    around = decode_morton(cell_keys)[:, None, :]
+    neighbours = cages.table.find(encode_morton(around + CELLS_AROUND)) >= 0
+    numbers = nodes.find(encode_morton(around + NODES_AROUND))
     entries = [_entries(u, neighbours, numbers, cell, row, kind, smoothing, part) for part in _parts(len(u))]
     rows, columns, weights = (np.concatenate(part) for part in zip(*entries, strict=True))
     return _gather_rows(comm, rows, columns, weights, total, nodes.total)
@@ -57,7 +66,7 @@ def _to_cells(points: np.ndarray, cages: Cages) -> tuple[np.ndarray, np.ndarray,
     """Send each point to its cell's rank: its number there, its cell (p, 3), its coordinates in the cell (p, 3)."""
     at = cages.grid.to_cells(points)
     ijk = np.floor(at).astype(np.int64)
-    route = Route(cages.table.comm, cages.table.owner(morton.encode(ijk)))
+    route = Route(cages.table.comm, cages.table.owner(encode_morton(ijk)))
     return route.send(np.arange(len(points))), route.send(ijk), route.send(at - ijk)
 
 
@@ -75,7 +84,7 @@ def _entries(
     smoothing: float,
     part: slice,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nonzero weights of some points as rows, columns and values."""
+    """Return the nonzero weights of some points as rows, columns and values."""
     weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
     point, node = np.nonzero(weights)
     return row[part][point], numbers[cell[part]][point, node], weights[point, node]
@@ -87,7 +96,40 @@ def _gather_rows(
     """Bring rows to the ranks that keep them: equal contiguous ranges."""
     first = total * np.arange(comm.size + 1) // comm.size
     route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
-    here = slice(first[comm.rank], first[comm.rank + 1])
-    shape = (int(here.stop - here.start), nodes)
-    csr = coo_array((route.send(weights), (route.send(rows) - here.start, route.send(columns))), shape=shape).tocsr()
+    start, stop = first[comm.rank], first[comm.rank + 1]
+    shape = (int(stop - start), nodes)
+    csr = coo_array((route.send(weights), (route.send(rows) - start, route.send(columns))), shape=shape).tocsr()
     return Embedding(csr.indptr, csr.indices, csr.data)
+
+
+def stencil_weights(kind: str, u: np.ndarray, neighbours: np.ndarray, smoothing: float = 1.0) -> np.ndarray:
+    """Return the weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
+
+    u          : (p,3) coordinates in the cell, in [0,1]
+    neighbours : (p,27) bool; column (dx+1)*9 + (dy+1)*3 + (dz+1): the cell at that offset is valid. 13 is the cell
+    smoothing  : h of Eq. 9, in (0,1]; used by "cages"
+    result     : column ix*16 + iy*4 + iz: the node at offset (ix-1, iy-1, iz-1) from the cell's low corner
+
+    kind "mvc": mean value coordinates in the cell, continuous (Eq. 1-6); "cages": smooth blends of the coordinates in
+    joined cells (Eq. 7-9); "affine": smooth blends of affine maps, the most accurate. A row sums to 1, reproduces
+    linear fields and is exactly 0 at nodes of no valid cell. Nothing but the result grows with p.
+    Raises InputError for an unknown kind or smoothing, ValueError for points outside their cell or cells not valid.
+    """
+    if kind not in KINDS:
+        raise InputError(f"embedding '{kind}' is not one of {', '.join(KINDS)}")
+    if not 0.0 < smoothing <= 1.0:
+        raise InputError(f"smoothing of the embedding is {smoothing:g}: it lies in (0, 1]")
+    if not np.all((u >= -ROUNDING) & (u <= 1.0 + ROUNDING)):
+        raise ValueError("a point lies outside its cell")
+    if not np.all(neighbours[:, ITSELF]):
+        raise ValueError("a point lies in a cell that is not valid")
+    u = np.ascontiguousarray(np.where(u < ON_FACE, 0.0, np.where(u > 1.0 - ON_FACE, 1.0, u)))
+    neighbours = np.ascontiguousarray(neighbours, bool)  # one memory layout: the kernels are compiled once
+    weights = np.empty((len(u), 64))
+    if kind == "mvc":
+        mvc_weights(u, weights)
+    elif kind == "cages":
+        cages_weights(u, neighbours, smoothing, weights)
+    else:
+        affine_weights(u, neighbours, weights)
+    return weights

@@ -1,12 +1,17 @@
-"""The uniform grid that a surface is laid into (paper section 4.1)."""
+"""The uniform grid that a surface is laid into (paper section 4.1), and the Morton order of its cells and nodes.
+
+In Morton order, cells and nodes near in space are near in number, so a contiguous range of keys is compact.
+"""
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.morton import LIMIT
 
+BITS = 21  # an axis: three of them fill 63 bits of a key
+LIMIT = 1 << BITS
 SAME = 1e-9  # cells: a body that is this close to a whole number of cells long has that number
 
 
@@ -20,7 +25,7 @@ class Grid:
 
     @classmethod
     def covering(cls, bounds: np.ndarray, cell_size: float) -> "Grid":
-        """The grid that starts at the low corner of ``bounds`` (2, 3) [m].
+        """Return the grid that starts at the low corner of ``bounds`` (2, 3) [m].
 
         Raises InputError for a cell size too small to number the cells along an axis.
         """
@@ -33,14 +38,66 @@ class Grid:
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 
     def to_cells(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
+        """Return points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
         inside = np.nextafter(self.shape.astype(float), 0)
         return np.clip((points - self.origin) / self.cell_size, 0, inside)
 
     def node_positions(self, ijk: np.ndarray) -> np.ndarray:
-        """Positions [m] of grid nodes (..., 3)."""
+        """Return the positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
 
     def nearest_nodes(self, points: np.ndarray) -> np.ndarray:
-        """Grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
+        """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
         return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
+
+
+@numba.njit(cache=True)
+def _spread(x):
+    """Return the bits of x with two zeros between each two."""
+    x &= 0x1FFFFF
+    x = (x | x << 32) & 0x1F00000000FFFF
+    x = (x | x << 16) & 0x1F0000FF0000FF
+    x = (x | x << 8) & 0x100F00F00F00F00F
+    x = (x | x << 4) & 0x10C30C30C30C30C3
+    return (x | x << 2) & 0x1249249249249249
+
+
+@numba.njit(cache=True)
+def _gather(x):
+    """Return the bits that ``_spread`` has parted."""
+    x &= 0x1249249249249249
+    x = (x | x >> 2) & 0x10C30C30C30C30C3
+    x = (x | x >> 4) & 0x100F00F00F00F00F
+    x = (x | x >> 8) & 0x1F0000FF0000FF
+    x = (x | x >> 16) & 0x1F00000000FFFF
+    return (x | x >> 32) & 0x1FFFFF
+
+
+@numba.njit(cache=True)
+def _encode(ijk, keys):
+    for n in range(len(ijk)):
+        keys[n] = -1
+        if 0 <= ijk[n, 0] < LIMIT and 0 <= ijk[n, 1] < LIMIT and 0 <= ijk[n, 2] < LIMIT:
+            keys[n] = _spread(ijk[n, 0]) | _spread(ijk[n, 1]) << 1 | _spread(ijk[n, 2]) << 2
+
+
+@numba.njit(cache=True)
+def _decode(keys, ijk):
+    for n in range(len(keys)):
+        ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)
+
+
+def encode_morton(ijk: np.ndarray) -> np.ndarray:
+    """Return the Morton key of each grid index, (..., 3) int -> (...,) int64; -1 outside 0..LIMIT - 1."""
+    rows = np.ascontiguousarray(ijk, np.int64).reshape(-1, 3)
+    keys = np.empty(len(rows), np.int64)
+    _encode(rows, keys)
+    return keys.reshape(np.shape(ijk)[:-1])
+
+
+def decode_morton(keys: np.ndarray) -> np.ndarray:
+    """Return the grid index of each Morton key, (...,) int64 -> (..., 3) int64."""
+    flat = np.ascontiguousarray(keys, np.int64).reshape(-1)
+    ijk = np.empty((len(flat), 3), np.int64)
+    _decode(flat, ijk)
+    return ijk.reshape(*np.shape(keys), 3)

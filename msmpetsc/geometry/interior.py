@@ -29,19 +29,20 @@ class Slab:
 
     @classmethod
     def of(cls, rank: int, size: int, planes: int) -> "Slab":
+        """Return the slab of a rank among ``size`` of them."""
         used = min(size, planes)
         return cls(planes * min(rank, used) // used, planes * min(rank + 1, used) // used, planes)
 
     @staticmethod
     def owner(plane: np.ndarray, size: int, planes: int) -> np.ndarray:
-        """Rank whose slab holds each plane."""
+        """Return the rank whose slab holds each plane."""
         used = min(size, planes)
         edges = planes * np.arange(1, used, dtype=np.int64) // used
         return np.searchsorted(edges, plane, side="right")
 
 
 def enclosed_gaps(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarray:
-    """Gaps that no path of face neighbours joins with the outside (collective).
+    """Return the gaps that no path of face neighbours joins with the outside (collective).
 
     boundary : (b, 3) int64 distinct boundary cells of this rank's slab, in lexicographic order
     returns  : (g, 4) int64 rows (i, j, k first, k last) of this slab
@@ -55,7 +56,7 @@ def enclosed_gaps(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarra
 
 
 def cells_of_gaps(gaps: np.ndarray) -> np.ndarray:
-    """The cells of gaps (i, j, k first, k last), (c, 3) int64."""
+    """Return the cells of gaps (i, j, k first, k last), (c, 3) int64."""
     length = gaps[:, 3] - gaps[:, 2] + 1
     cells = np.repeat(gaps[:, :3], length, axis=0)
     cells[:, 2] += np.arange(len(cells)) - np.repeat(np.cumsum(length) - length, length)
@@ -73,9 +74,9 @@ def _next_plane(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarray:
 
 
 def _join(comm: MPI.Comm, gaps: np.ndarray, label: np.ndarray, own: np.ndarray, slab: Slab) -> np.ndarray:
-    """Labels made global and equal wherever components of neighbouring slabs are one."""
+    """Return the labels made global and equal wherever components of neighbouring slabs are one."""
     count = int(label.max(initial=EXTERIOR))
-    offset = comm.exscan(count) or 0
+    offset = comm.exscan(count) or 0  # type: ignore[attr-defined]  # an intracommunicator
     label = np.where(label == EXTERIOR, EXTERIOR, label + offset)
     theirs = _to_previous(comm, label[own & (gaps[:, 0] == slab.first)])
     pairs = np.unique(np.stack([label[~own], theirs], axis=1), axis=0)
@@ -104,7 +105,7 @@ def _union(parent, a, b):
 
 @numba.njit(cache=True)
 def _columns(cells):
-    """Where each column (i, j) starts in the sorted cells, with the end appended."""
+    """Return where each column (i, j) starts in the sorted cells, with the end appended."""
     start = np.empty(len(cells) + 1, np.int64)
     n = 0
     for c in range(len(cells)):
@@ -117,7 +118,7 @@ def _columns(cells):
 
 @numba.njit(cache=True)
 def _gaps(cells, start):
-    """All gaps (i, j, k first, k last), and where those of each column begin."""
+    """Return all gaps (i, j, k first, k last), and where those of each column begin."""
     gaps = np.empty((len(cells), 4), np.int64)
     begin = np.zeros(len(start), np.int64)
     n = 0
@@ -134,7 +135,7 @@ def _gaps(cells, start):
 
 @numba.njit(cache=True)
 def _find_column(cells, start, i, j):
-    """Number of the column (i, j), -1 where it has no boundary cell."""
+    """Return the number of the column (i, j), -1 where it has no boundary cell."""
     low, high = 0, len(start) - 1
     while low < high:
         middle = (low + high) // 2
@@ -149,23 +150,26 @@ def _find_column(cells, start, i, j):
 
 
 @numba.njit(cache=True)
-def _meet(parent, gaps, begin, cells, start, column, other):
-    """Join the gaps of a column with what lies beside them in the neighbouring column ``other``."""
+def _meet(parent, gaps, begin, cells, start, column, neighbour):
+    """Join the gaps of a column with what touches them in the column ``neighbour``."""
     for g in range(begin[column], begin[column + 1]):
-        if other < 0:
+        if neighbour < 0:
             _union(parent, EXTERIOR, g + 1)
             continue
-        if gaps[g, 2] < cells[start[other], 2] or gaps[g, 3] > cells[start[other + 1] - 1, 2]:
+        if gaps[g, 2] < cells[start[neighbour], 2] or gaps[g, 3] > cells[start[neighbour + 1] - 1, 2]:
             _union(parent, EXTERIOR, g + 1)
-        for h in range(begin[other], begin[other + 1]):
+        for h in range(begin[neighbour], begin[neighbour + 1]):
             if gaps[h, 2] <= gaps[g, 3] and gaps[h, 3] >= gaps[g, 2]:
                 _union(parent, g + 1, h + 1)
 
 
 @numba.njit(cache=True)
 def _flood(cells, first, last, lowest):
-    """Gaps and their labels: EXTERIOR, or 1, 2, ... a component. Planes first..last-1 are owned, plane
-    ``last`` may be there as a halo: its own neighbours beyond it are its owner's business."""
+    """Return gaps and their labels: EXTERIOR, or 1, 2, ... a component.
+
+    Planes first..last-1 are owned, plane ``last`` may be given as a halo: its own neighbours beyond it are its
+    owner's business.
+    """
     start = _columns(cells)
     gaps, begin = _gaps(cells, start)
     parent = np.arange(len(gaps) + 1)

@@ -18,14 +18,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from msmpetsc.geometry.block import ITSELF
-from msmpetsc.geometry.squares import AROUND, CELLS, EDGE, EDGES, NODES, OF_CORNER, SQUARE
+from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
 
 FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with its leading terms removed
 
 
 class View(NamedTuple):
-    """What a point p sees of its block: see new_view and look_from. The last two are filled where a cage asks."""
+    """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
 
     planes: np.ndarray  # (3,4) heights of the block's grid planes over p
     angles: np.ndarray  # (144,) g_jk of the grid edges; 0 = not yet
@@ -34,12 +33,12 @@ class View(NamedTuple):
 
 @numba.njit(cache=True)
 def new_view():
-    """A View, to be used point after point."""
+    """Return a View, to be used point after point."""
     return View(np.empty((3, 4)), np.empty(144), np.empty((108, 4)))
 
 
 @numba.njit(cache=True)
-def look_from(u, view):
+def set_view(u, view):
     """Make the view that of the point u (3,)."""
     for axis in range(3):
         for i in range(4):
@@ -50,7 +49,7 @@ def look_from(u, view):
 
 @numba.njit(cache=True)
 def edge_angle(edge, view):
-    """g_jk of a grid edge: the angle that it subtends from p over |e_j x e_k|."""
+    """Return g_jk of a grid edge: the angle that it subtends from p over |e_j x e_k|."""
     if view.angles[edge] == 0.0:
         axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
         distance2 = view.planes[(axis + 1) % 3, j] ** 2 + view.planes[(axis + 2) % 3, k] ** 2
@@ -61,7 +60,7 @@ def edge_angle(edge, view):
 
 @numba.njit(cache=True)
 def turn_from_plane(c, length2, dot, d2):
-    """Sign(c) times (beta |c| / |e_j x e_k| - the angle that the edge subtends from p's foot in the plane).
+    """Return sign(c) times (beta |c| / |e_j x e_k| - the angle that the edge subtends from p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. The angles of a triangle that does not hold the
     foot sum to 0, so these differences, each of order d2, sum to 2 m_n without cancelling.
@@ -76,7 +75,7 @@ def turn_from_plane(c, length2, dot, d2):
 
 @numba.njit(cache=True)
 def triangle_sums(a0, a1, b0, b1, d, g):
-    """m_n / d of the two triangles (00,10,11) and (00,11,01) of a square; g: see square_weights."""
+    """Return m_n / d of the two triangles (00,10,11) and (00,11,01) of a square; g: see square_weights."""
     c = a0 - b0
     first = -b0 * g[0] + a1 * g[1] - c * g[4]
     second = b1 * g[2] - a0 * g[3] + c * g[4]
@@ -95,7 +94,7 @@ def triangle_sums(a0, a1, b0, b1, d, g):
 
 @numba.njit(cache=True)
 def square_weights(a0, a1, b0, b1, d, g):
-    """Unnormalised weights (w00, w10, w11, w01) of a unit square whose normal is its plane's axis (Eq. 3-5).
+    """Return the unnormalised weights (w00, w10, w11, w01) of a unit square whose normal is its plane's axis (Eq. 3-5).
 
     (a0, b0) and (a1, b1): low and high corner, relative to p, along the next two axes; d: the plane's height over
     p, not 0; g: g_jk of the edges 00-10, 10-11, 01-11, 00-01 and 00-11.
@@ -110,7 +109,7 @@ def square_weights(a0, a1, b0, b1, d, g):
 
 @numba.njit(cache=True)
 def square_frame(square, view):
-    """(a0, a1, b0, b1, d) of a square in the block, as in square_weights."""
+    """Return (a0, a1, b0, b1, d) of a square in the block, as in square_weights."""
     axis, plane, j, k = SQUARE[square, 0], SQUARE[square, 1], SQUARE[square, 2], SQUARE[square, 3]
     a, b = (axis + 1) % 3, (axis + 2) % 3
     planes = view.planes
@@ -118,7 +117,7 @@ def square_frame(square, view):
 
 
 @numba.njit(cache=True)
-def see_square(square, view):
+def set_square(square, view):
     """Put the weights of a square into the view; 0 where its plane holds p, which is not on it."""
     a0, a1, b0, b1, d = square_frame(square, view)
     if d == 0.0:
@@ -139,14 +138,14 @@ def see_square(square, view):
 
 @numba.njit(cache=True)
 def square_limit(a, b):
-    """Normalised weights (w00, w10, w11, w01) at (a, b) on a square: barycentric in the triangle there."""
+    """Return the normalised weights (w00, w10, w11, w01) at (a, b) on a square: barycentric in the triangle there."""
     low, high = min(a, b), max(a, b)
     return 1.0 - high, max(a - b, 0.0), low, max(b - a, 0.0)
 
 
 @numba.njit(cache=True)
 def set_limit(square, view, weights):
-    """Weights of p on the cage's surface, if it lies on this closed square; returns whether it does."""
+    """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does."""
     a0, a1, b0, b1, d = square_frame(square, view)
     if d != 0.0 or not (a0 <= 0.0 <= a1 and b0 <= 0.0 <= b1):
         return False
@@ -159,7 +158,7 @@ def set_limit(square, view, weights):
 
 @numba.njit(cache=True)
 def joined_cage(corner, valid, view, weights):
-    """Mean value coordinates of p in the union of the valid cells around a corner (L_v of Eq. 8; Eq. 1-2).
+    """Set the mean value coordinates of p in the union of the valid cells around a corner (L_v of Eq. 8; Eq. 1-2).
 
     corner 0..7; valid (27,) bool; view: of p; weights (64,): result.
     The 8 cells around the corner have 36 squares; those with one valid side are the cage's surface, so a corner
@@ -175,7 +174,7 @@ def joined_cage(corner, valid, view, weights):
             if set_limit(square, view, weights):
                 return
             if np.isnan(view.squares[square, 0]):
-                see_square(square, view)
+                set_square(square, view)
             for i in range(4):
                 weights[NODES[square, i]] += outwards * view.squares[square, i]
     weights /= weights.sum()
@@ -183,10 +182,10 @@ def joined_cage(corner, valid, view, weights):
 
 @numba.njit(cache=True)
 def mvc_weights(u, weights):
-    """Mean value coordinates of points in their own cells: u (p,3) in [0,1]; weights (p,64), result."""
+    """Set the mean value coordinates of points in their own cells: u (p,3) in [0,1]; weights (p,64), result."""
     alone = np.zeros(27, np.bool_)
     alone[ITSELF] = True
     view = new_view()
     for p in range(len(u)):
-        look_from(u[p], view)
+        set_view(u[p], view)
         joined_cage(0, alone, view, weights[p])

@@ -1,4 +1,4 @@
-"""Preparing a surface: named steps that mend, reduce, join or place it."""
+"""Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.step_cache import cached
@@ -27,7 +26,7 @@ def prepare(
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
-    """The surface after the steps, then scaled, then placed.
+    """Return the surface after the steps, then scaled, then moved.
 
     steps : each the name of a step, or {name: value} for one that takes a value (see STEPS)
     size  : longest side of the bounding box [m]; scaled about the origin
@@ -70,7 +69,8 @@ def union(surface: Surface) -> Surface:
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
-        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
+        _solid(Surface(surface.points, surface.triangles[labels == part]), part)
+        for part in range(labels.max() + 1)
     ]
     mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
@@ -78,14 +78,12 @@ def union(surface: Surface) -> Surface:
 
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
-    try:
-        from pymeshfix import MeshFix
-    except ImportError:
-        raise InputError("repair needs pymeshfix: pip install msmpetsc[repair]") from None
+    import pymeshfix  # of the extra "repair"
+
     surface = merge(surface)
     if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
         raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
-    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:
@@ -134,6 +132,8 @@ def orient(surface: Surface) -> Surface:
 
 def rotate(surface: Surface, turn: dict) -> Surface:
     """Turn about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
+    from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
+
     axis = np.asarray(turn["axis"], float)
     if not axis.any():
         raise InputError("the axis has no direction")
@@ -149,7 +149,7 @@ TAKES_VALUE = ("simplify", "rotate")
 
 
 def _apply(surface: Surface, name: str, value: object) -> Surface:
-    """One step, its failures as InputError with its name."""
+    """Carry out a step, its failures as InputError with its name."""
     if name not in STEPS:
         raise InputError(f"prepare: no step '{name}' (there are: {', '.join(STEPS)})")
     if (value is not None) != (name in TAKES_VALUE):
@@ -167,19 +167,19 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
 
 
 def _bounds(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest coordinates of the points in use, (3,) each."""
+    """Return the lowest and highest coordinates of the points in use, (3,) each."""
     points = surface.points[np.unique(surface.triangles)]
     return points.min(axis=0), points.max(axis=0)
 
 
 def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
-    """The surface of these triangles and only their points, in the order they had."""
+    """Return the surface of these triangles and only their points, in the order they had."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
 def _part_labels(surface: Surface) -> np.ndarray:
-    """(f,) number of the connected part of each triangle; points of equal position connect."""
+    """Return the number (f,) of the connected part of each triangle; points of equal position connect."""
     triangles = first_of_equal(surface.points)[surface.triangles]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
     n = len(surface.points)
@@ -210,7 +210,7 @@ def _two_triangles_an_edge(surface: Surface) -> bool:
 
 
 def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each of the (f, 3) merged triangles its patch, and whether to flip it.
+    """Return for each of the (f, 3) merged triangles its patch, and whether to flip it.
 
     Every triangle stands twice in a graph, as it is and flipped; neighbours are linked in the
     two ways that agree. A patch then makes two components, each the other one flipped: take
@@ -222,11 +222,11 @@ def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(edge, kind="stable")
     first = np.flatnonzero(np.diff(edge[order], prepend=-1))
     pairs = first[np.diff(first, append=len(order)) == 2]
-    one, other = order[pairs], order[pairs + 1]
-    against = f * ((start < end)[one] == (start < end)[other])  # same direction: flip one of them
-    one, other = one // 3, other // 3
-    rows = np.concatenate([one, one + f])
-    columns = np.concatenate([other + against, other + f - against])
+    a, b = order[pairs], order[pairs + 1]
+    against = f * ((start < end)[a] == (start < end)[b])  # same direction: flip one of them
+    a, b = a // 3, b // 3
+    rows = np.concatenate([a, a + f])
+    columns = np.concatenate([b + against, b + f - against])
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * f, 2 * f))
     _, label = connected_components(graph, directed=False)
     as_is, flipped = label[:f], label[f:]

@@ -1,38 +1,14 @@
-"""Surface meshes: read from a file, measured, and checked to enclose a volume."""
+"""Surface meshes: measured, and checked to enclose a volume."""
 
-import gzip
-import json
-import lzma
-import re
-import struct
-import warnings
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from io import BytesIO, StringIO
-from logging import CRITICAL, getLogger
-from pathlib import Path
-from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
-import trimesh
-from trimesh.resolvers import FilePathResolver
 
-from msmpetsc.errors import InputError, one_line
-from msmpetsc.scene.reading import lies_below
-
-Arrays = tuple[np.ndarray, np.ndarray]  # points (v,3), faces (f,3 or 4)
+from msmpetsc.errors import InputError
 
 # Coordinates are often stored in single precision (1.2e-7): thinner than this, relative to its
 # longest side, a body cannot be told from a flat sheet. A plate of 1:1000 lies far above.
 FLAT = 1e-6
-MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
-MOST_INSTANCED, LEAST_ROWS = 10, 2**20  # the rows of a glTF: so many times its bytes, or so many
-GRIDS = re.compile(
-    rb"STRUCTURED_POINTS|(?<!UN)STRUCTURED_GRID|RECTILINEAR_GRID", re.IGNORECASE
-)  # of VTK: flat, or of hexahedra
 
 
 @dataclass(frozen=True)
@@ -49,7 +25,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfaceReport:
-    """What a surface is like.
+    """Measures of a surface, and counts of its faults.
 
     Edges are counted after merging points of equal position (so the loose triangles of an STL
     may be closed) and dropping the triangles that this leaves with two equal corners.
@@ -74,31 +50,6 @@ class SurfaceReport:
         return self.boundary_edges == 0
 
 
-def read_surface(path: str | Path) -> Surface:
-    """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU or VTK as triangles, in the file's own unit.
-
-    Polygons are cut into triangles, the parts of a GLB are joined, of tetrahedra the outer
-    surface is taken. All but glTF, VTU and VTK may be compressed (``.gz``).
-
-    Raises InputError, one line naming the file, if it holds no usable mesh.
-    """
-    path = Path(path)
-    kind, data = _kind(path), _content(path)
-    try:
-        with _silence():
-            _refuse_claims(kind, data)
-            points, faces = _READERS[kind](path, data)
-            if faces.ndim != 2 or faces.shape[1] != 3:
-                faces = trimesh.geometry.triangulate_quads(faces)
-    except ModuleNotFoundError:  # a reader's package: says which extra brings it
-        raise
-    except Exception as error:  # on garbage the readers raise whatever comes
-        reason = one_line(error, 120)
-        raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
-    _check_arrays(path, points, faces)
-    return Surface(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64))
-
-
 def examine(surface: Surface) -> SurfaceReport:
     """Measure volume, area and edges of a surface."""
     corners = surface.points[surface.triangles]  # (f, 3 corners, 3)
@@ -118,7 +69,7 @@ def examine(surface: Surface) -> SurfaceReport:
 
 
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
-    """Warnings about a surface whose inside is in doubt; none for a clean one.
+    """Return warnings about a surface whose inside is in doubt; none for a clean one.
 
     Flatness is measured along the principal axes, so that a tilted sheet is seen too. A closed
     surface is judged by its mean thickness, 2 |volume| / area, relative to its longest side.
@@ -140,35 +91,39 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 
 def _warnings(report: SurfaceReport) -> list[str]:
-    """One line for each doubtful property of the surface, with its remedy."""
-    found = []
+    """Return a line for each doubtful property of the surface, with its remedy."""
+    warnings = []
     if report.boundary_edges:
-        found.append(
+        warnings.append(
             f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding "
             'number will decide what is inside; prepare = ["repair"] closes holes'
         )
     if report.nonmanifold_edges:
-        found.append(f"{report.nonmanifold_edges} edges have more than two triangles")
+        warnings.append(f"{report.nonmanifold_edges} edges have more than two triangles")
     if report.inconsistent_edges:
-        found.append(
+        warnings.append(
             f"{report.inconsistent_edges} edges have triangles wound against each other: "
             'prepare = ["orient"] mends that'
         )
     if report.volume < 0:
-        found.append(f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them')
-    return found
+        warnings.append(
+            f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them'
+        )
+    return warnings
 
 
 def merged_triangles(surface: Surface) -> np.ndarray:
-    """(g, 3) triangles over merged points: equal positions share the number of the first of
-    them, triangles left with fewer than three corners are dropped."""
+    """Return the triangles (g, 3) over merged points.
+
+    Equal positions have the number of the first of them; triangles left with fewer than three corners are dropped.
+    """
     triangles = first_of_equal(surface.points)[surface.triangles]
     a, b, c = triangles.T
     return triangles[(a != b) & (b != c) & (c != a)]
 
 
 def first_of_equal(points: np.ndarray) -> np.ndarray:
-    """(v,) for each point the lowest number of a point of exactly the same position."""
+    """Return for each point (v,) the lowest number of a point of exactly the same position."""
     order = np.lexsort(points.T)  # stable: equal points stay in the order of their numbers
     sorted_points = points[order]
     starts = np.ones(len(points), bool)
@@ -178,9 +133,11 @@ def first_of_equal(points: np.ndarray) -> np.ndarray:
     return first
 
 
-def edge_use(triangles: np.ndarray) -> Arrays:
-    """For each undirected edge, how many triangles use it, and how many of those run along it
-    from its lower to its higher point number. Both (e,)."""
+def edge_use(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each undirected edge (e,) how many triangles use it, and how many of those run along it upwards.
+
+    Upwards is from its lower to its higher point number.
+    """
     if len(triangles) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
@@ -189,242 +146,3 @@ def edge_use(triangles: np.ndarray) -> Arrays:
     key = np.sort((low * (triangles.max() + 1) + high) * 2 + (start < end))
     first = np.flatnonzero(np.diff(key >> 1, prepend=-1))
     return np.diff(first, append=len(key)), np.add.reduceat(key & 1, first)
-
-
-def _check_arrays(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
-    """Raise InputError unless the arrays make a mesh."""
-    if len(triangles) == 0:
-        raise InputError(f"{path}: holds no triangles")
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise InputError(f"{path}: its points are not of three numbers each")
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: has coordinates that are NaN or infinite")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise InputError(
-            f"{path}: a triangle names a point outside 0..{len(points) - 1}: "
-            f"{triangles.min() if triangles.min() < 0 else triangles.max()}"
-        )
-
-
-def _kind(path: Path) -> str:
-    """The format by the file's name, '.gz' aside; InputError if it is not one we read."""
-    name = path.name.lower()
-    kind = Path(name.removesuffix(".gz")).suffix.removeprefix(".")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not a mesh file")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is a pipe or a device, not a mesh file")
-    if kind not in _READERS:
-        raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
-    if name.endswith(".gz") and kind in _NEED_PATH:
-        raise InputError(f"{path}: {kind.upper()} is not read compressed: gunzip it first")
-    return kind
-
-
-def _content(path: Path) -> bytes:
-    """The file's bytes, decompressed."""
-    try:
-        data = path.read_bytes()
-        data = _decompressed(data) if data.startswith(b"\x1f\x8b") else data
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, EOFError, MemoryError, gzip.zlib.error) as error:
-        reason = getattr(error, "strerror", None) or error or "too large for the memory"
-        raise InputError(f"{path}: cannot be read ({reason})") from error
-    if not data:
-        raise InputError(f"{path}: is empty")
-    return data
-
-
-def _decompressed(data: bytes) -> bytes:
-    """Not more than a mesh can shrink: gzip packs zeros a thousandfold."""
-    most = max(LEAST_LIMIT, MOST_PACKED * len(data))
-    with gzip.open(BytesIO(data)) as file:
-        found = file.read(most + 1)
-    if len(found) > most:
-        raise OSError(f"decompressed it is more than {MOST_PACKED} times as long")
-    return found
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep what the readers print, log or warn from the terminal; half-read numbers are errors."""
-    log = getLogger("trimesh")
-    level = log.level
-    log.setLevel(CRITICAL)
-    try:
-        with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("error", message="string or file could not be read")
-            yield
-    finally:
-        log.setLevel(level)
-
-
-def _refuse_claims(kind: str, data: bytes) -> None:
-    """Raise ValueError for a file whose reader would make far more of it than it holds."""
-    if _claimed_rows(kind, data) > len(data):
-        raise ValueError("its header claims more than the file holds")
-    if kind == "vtk" and GRIDS.search(data):
-        raise ValueError("it holds a grid of points, not a surface")
-    if kind == "vtu" and b"\0" in data[:4]:
-        raise ValueError("it is not UTF-8 text")
-    if kind == "vtu" and data.count(b"offset") * len(data) > max(LEAST_LIMIT, MOST_PACKED * len(data)):
-        raise ValueError("too many of its arrays are appended: they may share their bytes")
-    if kind in ("gltf", "glb") and _instanced_rows(kind, data) > max(LEAST_ROWS, MOST_INSTANCED * len(data)):
-        raise ValueError("it repeats its meshes too often")
-
-
-def _gltf(kind: str, data: bytes) -> dict:
-    return json.loads(data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
-
-
-def _instanced_rows(kind: str, data: bytes) -> int:
-    """Rows of the points and corners of all meshes, wherever nodes put them."""
-    tree = _gltf(kind, data)
-    counts = [accessor["count"] for accessor in tree.get("accessors", [])]
-
-    def rows_of(part: dict) -> int:
-        points, corners = part["attributes"]["POSITION"], part.get("indices")
-        return counts[points] + (0 if corners is None else counts[corners])
-
-    rows = [sum(map(rows_of, mesh["primitives"])) for mesh in tree.get("meshes", [])]
-    return sum(rows) + sum(rows[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node)
-
-
-def _claimed_rows(kind: str, data: bytes) -> int:
-    """How many rows (points, faces) the header claims, each of at least a byte: some readers
-    allocate them before they look for them."""
-    if kind == "ply":
-        header = data[: data.find(b"end_header")]
-        return sum(map(int, re.findall(rb"^element\s+\w+\s+(\d+)", header, re.MULTILINE)))
-    if kind == "vtk":
-        sections = re.findall(rb"^(?:POINTS|CELLS|CELL_TYPES|POLYGONS)\s+(\d+)", data, re.MULTILINE)
-        return sum(map(int, sections))
-    if kind in ("gltf", "glb"):
-        # an accessor of no buffer view stands for that many zeros
-        accessors = _gltf(kind, data).get("accessors", [])
-        return sum(a["count"] for a in accessors if "bufferView" not in a)
-    return 0
-
-
-def _read_ply(path: Path, data: bytes) -> Arrays:
-    try:
-        mesh = trimesh.exchange.ply.load_ply(BytesIO(data), fix_texture=False, skip_materials=True)
-    except ValueError as error:
-        if "unexpected length" not in str(error):
-            raise
-        return _read_mixed_ply(data)
-    stored = mesh["metadata"]["_ply_raw"]
-    for name in ("vertex", "face"):  # a truncated ASCII file just has fewer rows
-        rows = stored.get(name, {}).get("data", ())
-        rows = next(iter(rows.values())) if isinstance(rows, dict) else rows
-        if len(rows) != stored.get(name, {}).get("length", 0):
-            raise ValueError(f"truncated: {len(rows)} of {stored[name]['length']} {name} rows")
-    faces = mesh.get("faces")
-    return mesh.get("vertices", np.zeros((0, 3))), np.zeros((0, 3)) if faces is None else faces
-
-
-def _read_mixed_ply(data: bytes) -> Arrays:
-    """A binary PLY whose faces differ in their number of corners, which trimesh does not read."""
-    import meshio  # of the extra "mesh"
-
-    mesh = meshio.ply.read(BytesIO(data))
-    polygons = [face for block in mesh.cells for face in block.data]
-    return mesh.points, trimesh.geometry.triangulate_quads(polygons)
-
-
-class _Beside(FilePathResolver):
-    """Hands out the files that a glTF names: those in its folder or below it, links followed, and no others. One that
-    is named again is not read again."""
-
-    def __init__(self, path: Path):
-        super().__init__(path)
-        self._read: dict[str, bytes] = {}
-
-    def get(self, name: str) -> bytes:
-        path = Path(self.parent, name)
-        if not lies_below(Path(self.parent), name) or not path.is_file():
-            raise ValueError(f"it names {name}, which is no file in its folder")
-        if name not in self._read:
-            self._read[name] = path.read_bytes()
-        return self._read[name]
-
-
-class _Unpacker:
-    """In place of the modules zlib and lzma, where a reader unpacks blocks by them: all together to ``most`` bytes."""
-
-    def __init__(self, most: int):
-        self.left = most
-
-    def zlib(self, block: bytes) -> bytes:
-        return self._counted(zlib.decompressobj().decompress(block, self.left + 1))
-
-    def lzma(self, block: bytes) -> bytes:
-        return self._counted(lzma.LZMADecompressor(memlimit=LEAST_LIMIT).decompress(block, self.left + 1))
-
-    def _counted(self, found: bytes) -> bytes:
-        self.left -= len(found)
-        if self.left < 0:
-            raise ValueError(f"decompressed it is more than {MOST_PACKED} times as long")
-        return found
-
-
-def _read_trimesh(path: Path, data: bytes) -> Arrays:
-    kind = _kind(path)
-    scene = trimesh.load_scene(
-        BytesIO(data), file_type=kind, resolver=_Beside(path), process=False, skip_materials=True, maintain_order=True
-    )
-    if not scene.geometry:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    mesh = scene.to_mesh()
-    return mesh.vertices, mesh.faces
-
-
-def _read_meshio(path: Path, data: bytes) -> Arrays:
-    """Outer surface of the tetrahedra, or else triangles and quads, without unused points."""
-    import meshio  # of the extra "mesh"
-
-    unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
-    packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
-    with mock.patch.multiple(meshio.vtu._vtu, **packers):
-        mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
-    cells = mesh.cells_dict
-    if "tetra" in cells:
-        triangles = _outer_triangles(mesh.points, cells["tetra"])
-    else:
-        quads = cells.get("quad", np.zeros((0, 4), np.int64))
-        triangles = np.vstack([cells.get("triangle", np.zeros((0, 3), np.int64)), quads[:, :3], quads[:, [2, 3, 0]]])
-    used, triangles = np.unique(triangles, return_inverse=True)
-    return mesh.points[used], triangles.reshape(-1, 3)
-
-
-def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """(f, 3) the faces of one tetrahedron only, wound outwards. tetrahedra: (c, 4)."""
-    a, b, c, d = points[tetrahedra].swapaxes(0, 1)
-    inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0
-    tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
-    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
-
-
-def _read_mz3(path: Path, data: bytes) -> Arrays:
-    """The mz3 of Surf Ice: 16 bytes of header, int32 triangles, float32 points."""
-    magic, content, faces, points, skip = struct.unpack_from("<HHIII", data)
-    if magic != 0x5A4D or content & 3 != 3:  # bits 0 and 1: has triangles, has points
-        raise ValueError("no mz3 header with triangles and points")
-    start = 16 + skip
-    triangles = np.frombuffer(data, "<i4", 3 * faces, start)
-    coordinates = np.frombuffer(data, "<f4", 3 * points, start + triangles.nbytes)
-    return coordinates.reshape(-1, 3), triangles.reshape(-1, 3)
-
-
-_READERS = {
-    "ply": _read_ply,
-    "mz3": _read_mz3,
-    "vtu": _read_meshio,
-    "vtk": _read_meshio,
-    **dict.fromkeys(("obj", "stl", "off", "glb", "gltf"), _read_trimesh),
-}
-_NEED_PATH = ("gltf", "vtu", "vtk")  # the one names files beside it, the others' readers open it themselves

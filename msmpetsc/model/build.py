@@ -1,6 +1,7 @@
 """From a scene to what is simulated: surface, cages, lattice, embedding, loads, obstacles."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -8,23 +9,19 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
-from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Penalty
 from msmpetsc.model.contact.reflection import Reflection
-from msmpetsc.model.initial_state import State, start_of
+from msmpetsc.model.initial_state import InitialState, initial_state
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.model.loads import Load, spread_by_mass
-from msmpetsc.model.part import cell_materials
-from msmpetsc.model.paths import Path
+from msmpetsc.model.loads import Anchor, Load, Motion, spread_by_mass
 from msmpetsc.model.reach import Reach, Regions, reach_of, regions
-from msmpetsc.model.region import Finder
+from msmpetsc.model.region import Finder, cell_materials
 from msmpetsc.scene.schema import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
@@ -51,47 +48,66 @@ class Model:
     anchors: list[Anchor]
     reflections: list[Reflection]
     penalties: list[Penalty]
-    start: State
+    start: InitialState
     body: Body | None = None
     reaches: tuple[Reach, ...] = ()
 
 
 def build_model(comm: MPI.Comm, scene: Scene) -> Model:
-    """Everything of a scene but its solver (collective). Raises InputError on all ranks."""
+    """Build everything of a scene but its solver (collective). Raises InputError on all ranks."""
     body = read_body(comm, scene)
     cages = fill_cages(body, scene)
-    material = scene.material
     finder = Finder(body, cages, scene.folder)
-    of_cells = cell_materials(material, scene.part, finder)
-    lattice = build_lattice(
-        cages, material.density, material.young_modulus, material.stiffness, material.law_stiffening, of_cells
-    )
+    lattice = _lattice(scene, cages, finder)
     masks = regions(scene, lattice, finder)
     lattice = lattice.pin(_any_of(masks, "pin", lattice.pinned))
     anchors = _anchors(scene, lattice, masks)
-    held = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
-    _check_that_something_moves(comm, lattice, held, anchors)
+    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
+    _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
-    embedding = None
-    if scene.output.surface:
-        points = np.empty((0, 3)) if body.surface is None else body.surface.points
-        embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
     return Model(
-        body.surface,
-        lattice,
-        embedding,
-        _loads(comm, scene, lattice, masks),
-        anchors,
-        _reflections(scene),
-        _penalties(comm, scene, lattice, body),
-        start_of(comm, scene.start, lattice, held, body.bounds),
-        body,
-        reaches,
+        surface=body.surface,
+        lattice=lattice,
+        embedding=_embedding(scene, body, cages, lattice),
+        loads=_loads(comm, scene, lattice, masks),
+        anchors=anchors,
+        reflections=_reflections(scene),
+        penalties=_penalties(comm, scene, lattice, body),
+        start=initial_state(comm, scene.start, lattice, fixed, body.bounds),
+        body=body,
+        reaches=reaches,
+    )
+
+
+def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
+    """Return the model with the arrays that each step works with sent where ``send`` takes them.
+
+    What only prepares steps stays in the memory of the CPU.
+    """
+
+    def sent(obstacle: Obstacle) -> Obstacle:
+        return replace(obstacle, points=send(obstacle.points), normals=send(obstacle.normals))
+
+    lattice, (positions, velocities) = model.lattice, model.start
+    return replace(
+        model,
+        lattice=replace(
+            lattice,
+            nodes=send(lattice.nodes),
+            mass=send(lattice.mass),
+            pinned=send(lattice.pinned),
+            local_cells=send(lattice.local_cells),
+        ),
+        loads=[replace(load, force=send(load.force)) for load in model.loads],
+        anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
+        reflections=[replace(contact, obstacle=sent(contact.obstacle)) for contact in model.reflections],
+        penalties=[replace(contact, obstacle=sent(contact.obstacle)) for contact in model.penalties],
+        start=(send(positions), send(velocities)),
     )
 
 
 def read_body(comm: MPI.Comm, scene: Scene) -> Body:
-    """The prepared surface on rank 0, and on all ranks what they need to know of it (collective)."""
+    """Return the prepared surface on rank 0, and on all ranks what they need to know of it (collective)."""
 
     def read() -> tuple[Surface, tuple]:
         surface = prepare(load(scene.mesh.source, scene.folder), scene.mesh.prepare, scene.mesh.size, scene.mesh.base)
@@ -119,7 +135,7 @@ def _check_in_range(surface: Surface) -> None:
 
 
 def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
-    """A warning of a body whose longest side is unusual, unless the scene says what it is."""
+    """Return a warning of a body whose longest side is unusual, unless the scene says what it is."""
     side = np.ptp(surface.points[np.unique(surface.triangles)], axis=0).max()
     if size is not None or USUAL[0] <= side <= USUAL[1]:
         return []
@@ -128,29 +144,51 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
 
 
 def fill_cages(body: Body, scene: Scene) -> Cages:
-    """The scene's valid cells (collective)."""
+    """Return the scene's valid cells (collective)."""
     cages = scene.cages
-    cell_size = cages.cell_size or choose_cell_size(body, cages.count, cages.method, cages.max_cells)
+    cell_size = cages.cell_size
+    if cages.count is not None:
+        cell_size = choose_cell_size(body, cages.count, cages.method, cages.max_cells)
+    assert cell_size is not None  # the schema has one of the two
     return fill(body, cell_size, cages.method, cages.max_cells)
 
 
+def _lattice(scene: Scene, cages: Cages, finder: Finder) -> Lattice:
+    material = scene.material
+    return build_lattice(
+        cages,
+        material.density,
+        young_modulus=material.young_modulus,
+        stiffness=material.stiffness,
+        stiffening=material.law_stiffening,
+        of_cells=cell_materials(material, scene.part, finder),
+    )
+
+
+def _embedding(scene: Scene, body: Body, cages: Cages, lattice: Lattice) -> Embedding | None:
+    if not scene.output.surface:
+        return None
+    points = np.empty((0, 3)) if body.surface is None else body.surface.points
+    return embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
+
+
 def _any_of(masks: Regions, kind: str, where: np.ndarray) -> np.ndarray:
-    """(l,) bool: the nodes of all regions of this kind, and those of ``where``."""
+    """Return the nodes (l,) bool of all regions of this kind, and those of ``where``."""
     return reduce(np.logical_or, (nodes for key, nodes in masks.items() if key.startswith(kind)), where)
 
 
 def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
-    """A pin is stronger than an anchor, and of two anchors on a node the first."""
+    """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
     anchors, taken = [], lattice.pinned
     for number, anchor in enumerate(scene.anchor):
         where = masks[f"anchor.{number}"] & ~taken
-        anchors.append(Anchor(where, Path.through(anchor.path), anchor.stop))
+        anchors.append(Anchor(where, Motion.through(anchor.path), anchor.stop))
         taken = taken | where
     return anchors
 
 
-def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, held: np.ndarray, anchors: list[Anchor]) -> None:
-    if comm.allreduce(int((~held[: lattice.owned]).sum())) == 0:
+def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: np.ndarray, anchors: list[Anchor]) -> None:
+    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
 

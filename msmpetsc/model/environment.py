@@ -1,4 +1,4 @@
-"""What acts on a body from outside at a time: loads, what leads its nodes, obstacles."""
+"""What acts on a body from outside at a time: loads, anchors, obstacles."""
 
 from functools import reduce
 from itertools import compress
@@ -6,14 +6,14 @@ from itertools import compress
 import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
-from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle, depths
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
+from msmpetsc.model.loads import Anchor
 
 
 class Environment:
-    """Of one model. An implicit step asks once for its end, an explicit one in each substep.
+    """Loads, anchors and obstacles of a model. An implicit step asks once for its end, an explicit one in each substep.
 
     Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
     its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (obstacle.side_of): the
@@ -23,15 +23,16 @@ class Environment:
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
         self.penalties, self.reflections = model.penalties, model.reflections
-        self.obstacles = [one.obstacle for one in (*self.penalties, *self.reflections)]
+        self.obstacles = [p.obstacle for p in self.penalties] + [r.obstacle for r in self.reflections]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
         self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
         nodes = self.lattice.nodes
         self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
-        self._acting = self._load = None
+        self._acting: list[bool] = []
+        self._load = np.zeros((self.lattice.owned, 3), like=nodes)
 
     def load(self, time: float) -> np.ndarray:
-        """External force f_ext (owned, 3) [N], not to be written to."""
+        """Return the external force f_ext (owned, 3) [N], not to be written to."""
         acting = [load.acts_at(time) for load in self.loads]
         if acting != self._acting:
             self._acting, self._load = acting, np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
@@ -40,24 +41,24 @@ class Environment:
         return self._load
 
     def anchors_at(self, time: float) -> list[Anchor]:
-        """The anchors that have not let go."""
+        """Return the anchors that have not let go."""
         return [anchor for anchor in self.anchors if anchor.holds_at(time)]
 
     def fixed_at(self, time: float) -> np.ndarray:
-        """(l,) bool: the nodes that are no unknowns, pinned or held by an anchor."""
+        """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
         return reduce(np.logical_or, (anchor.where for anchor in self.anchors_at(time)), self.lattice.pinned)
 
     def prescribed(self, q: np.ndarray, time: float) -> np.ndarray | None:
-        """q with the anchored nodes where they will be; None if there are none."""
-        held = self.anchors_at(time)
-        if not held:
+        """Return q with the anchored nodes where they will be; None if there are none."""
+        anchors = self.anchors_at(time)
+        if not anchors:
             return None
-        for anchor in held:
-            place = self.lattice.nodes + like(q, anchor.path.at(time))
-            q = np.where(anchor.where[:, None], place, q)
+        for anchor in anchors:
+            target = self.lattice.nodes + like(q, anchor.path.at(time))
+            q = np.where(anchor.where[:, None], target, q)
         return q
 
-    def met(
+    def contact_faces(
         self,
         q: np.ndarray,
         end: np.ndarray,
@@ -66,38 +67,42 @@ class Environment:
         before: np.ndarray | None,
         held: np.ndarray,
     ) -> np.ndarray:
-        """Sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step, which had ``before`` when it began.
+        """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
 
-        held : (n,) bool, the nodes that do not give way: they have none. A plane has but one, which needs no name.
+        A plane has but one face, which needs no name.
+
+        before : (o, n) the sides when the step began
+        held   : (n,) bool, the nodes that do not give way: they have no side
         """
         if not self.has_sides:
             return self.no_sides[:, : len(q)]
         sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.obstacles):
             if obstacle.has_sides:
-                had = None if before is None else before[row]
-                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, had))
+                side_before = None if before is None else before[row]
+                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
         return sides
 
-    def pushes_alike(self, q: np.ndarray, time: float, sides: np.ndarray, others: np.ndarray) -> bool:
-        """Whether penalties press on this rank's nodes at q just the same with other sides."""
-        owned = self.lattice.owned
-        presses = zip(self._presses(time, sides), self._presses(time, others), strict=True)
-        depths = [[np.maximum(press.depths(q[:owned])[0], 0) for press in pair] for pair in presses]
-        return all(bool(np.array_equal(one, other)) for one, other in depths)
+    def same_push(self, q: np.ndarray, time: float, sides_a: np.ndarray, sides_b: np.ndarray) -> bool:
+        """Return whether penalties press on this rank's nodes at q just the same with either sides (o, l)."""
+        rows = q[: self.lattice.owned]
+        states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
+        return all(
+            np.array_equal(np.maximum(a.depths(rows)[0], 0), np.maximum(b.depths(rows)[0], 0)) for a, b in states
+        )
 
     def contact(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray) -> Contact | None:
-        """What presses in the step that starts from q."""
+        """Return what presses in the step that starts from q, friction included; None if nothing does."""
         owned = self.lattice.owned
-        presses = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
-        return Contact(presses, owned) if presses else None
+        states = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
+        return Contact(states, owned) if states else None
 
-    def push(self, time: float, sides: np.ndarray) -> Contact | None:
-        """What presses at a time, without friction."""
-        presses = self._presses(time, sides)
-        return Contact(presses, self.lattice.owned) if presses else None
+    def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
+        """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
+        states = self._states(time, sides)
+        return Contact(states, self.lattice.owned) if states else None
 
-    def _presses(self, time: float, sides: np.ndarray) -> list[ContactState]:
+    def _states(self, time: float, sides: np.ndarray | None) -> list[ContactState]:
         return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def apply_friction(
@@ -112,7 +117,7 @@ class Environment:
         end: float,
         sides: np.ndarray,
     ) -> None:
-        """Friction of obstacles as they stand at ``time``, for a ``duration``, on velocities v (owned, 3) [m/s].
+        """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to v (owned, 3) [m/s].
 
         q, rows, per_mass : (owned, 3) [m]; the nodes that move; (owned,) [1/kg]
         begin, end        : the substep [s] in which an obstacle carries along what it holds
@@ -123,8 +128,10 @@ class Environment:
                 carried = like(q, (path.at(end) - path.at(begin)) / (end - begin))
                 apply_friction(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
 
-    def stiffest_push(self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray) -> np.ndarray:
-        """(owned,) [N/m]: no less than what obstacles add to a node's stiffness from start to ``time``.
+    def contact_stiffness_bound(
+        self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray
+    ) -> np.ndarray:
+        """Return (owned,) [N/m] no less than what obstacles add to a node's stiffness from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
             makes good is counted as inside already
@@ -139,8 +146,10 @@ class Environment:
         return stiffness
 
     def power(self, q: np.ndarray, time: float, begin: float, end: float, sides: np.ndarray) -> float:
-        """Of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m], which move as in the substep from
-        begin to end [W]."""
+        """Return the power [W] of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m].
+
+        begin, end : the substep [s] as in which obstacles move
+        """
         power = 0.0
         for p, side in self._pressing(time, sides):
             way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
@@ -150,25 +159,29 @@ class Environment:
                 power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
         return power
 
-    def appearing(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
-        """Energy [J] of the push of penalties that were not there when a substep began, at its end."""
+    def energy_of_new_obstacles(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
+        """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
         new = [p.at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
-    def dragged(
+    def friction_work_bound(
         self,
         before: tuple[np.ndarray, np.ndarray],
         after: tuple[np.ndarray, np.ndarray],
         time: float,
         time_step: float,
     ) -> float:
-        """No less than the work [J] that the friction of moving obstacles does on this rank's nodes in a step between
-        two positions (owned, 3) [m], with their sides: mu N times how far they go."""
+        """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
+
+        It is mu N times how far they go.
+
+        before, after : positions (owned, 3) [m] and sides (o, owned or more)
+        """
         work = 0.0
         for row, p in enumerate(self.penalties):
             if not p.obstacle.acts_at(time):
                 continue
-            way = np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step))
+            way = float(np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step)))
             if p.friction > 0 and way > 0:
                 for (q, sides), when in ((before, time - time_step), (after, time)):
                     inside, _ = p.at(when, sides[row, : len(q)]).depths(q)
@@ -188,8 +201,9 @@ class Environment:
         held: np.ndarray,
         sides: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """q_n and q_(n-1) after the obstacles that nodes bounce off; the very same arrays if nothing is touched. And
-        the work [J] of these obstacles on this rank's nodes.
+        """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
+
+        The arrays are the very same if nothing is touched.
 
         held : (l,) bool, the nodes that do not give way
         """
@@ -198,7 +212,7 @@ class Environment:
             after, before = reflection.reflect(q, q_previous, time, time_step, side)
             if after is not q:
                 after, before = np.where(free, after, q), np.where(free, before, q_previous)
-                work += self._struck(reflection.obstacle, (after - before) - (q - q_previous), time, time_step)
+                work += self._impulse_work(reflection.obstacle, (after - before) - (q - q_previous), time, time_step)
                 q, q_previous = after, before
         return q, q_previous, work
 
@@ -212,7 +226,7 @@ class Environment:
         held: np.ndarray,
         sides: np.ndarray,
     ) -> tuple[np.ndarray, float]:
-        """The same for an integrator that leaves nodes where they are: q_(n-1) and the work.
+        """Return q_(n-1) and the work [J], as ``reflect`` does, for an integrator that leaves nodes where they are.
 
         a : (l, 3) [m] acceleration times t^2
         """
@@ -221,12 +235,12 @@ class Environment:
             before = reflection.turn(q, q_previous, a, time, time_step, side)
             if before is not q_previous:
                 before = np.where(free, before, q_previous)
-                work += self._struck(reflection.obstacle, q_previous - before, time, time_step)
+                work += self._impulse_work(reflection.obstacle, q_previous - before, time, time_step)
                 q_previous = before
         return q_previous, work
 
-    def _struck(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
-        """Work [J] of an obstacle that changes velocities by change / t: the impulse times its own velocity."""
+    def _impulse_work(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
+        """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""
         if not obstacle.path.leads_away:
             return 0.0
         way = obstacle.path.at(time) - obstacle.path.at(time - time_step)

@@ -6,16 +6,18 @@ from mpi4py import MPI
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.schema import Start, Twist
 
-State = tuple[np.ndarray, np.ndarray]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+InitialState = tuple[np.ndarray, np.ndarray]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 
 
-def at_rest(lattice: Lattice) -> State:
-    """The rest shape, without a copy."""
+def at_rest(lattice: Lattice) -> InitialState:
+    """Return the rest shape, without a copy."""
     return lattice.nodes, np.zeros_like(lattice.nodes)
 
 
-def start_of(comm: MPI.Comm, start: Start | None, lattice: Lattice, held: np.ndarray, bounds: np.ndarray) -> State:
-    """A scene's start (collective).
+def initial_state(
+    comm: MPI.Comm, start: Start | None, lattice: Lattice, held: np.ndarray, bounds: np.ndarray
+) -> InitialState:
+    """Return where nodes are, and how fast, at a scene's start (collective).
 
     held   : (l,) bool, nodes that stay at rest where they are
     bounds : (2, 3) the body's bounding box at rest [m]
@@ -36,9 +38,10 @@ def start_of(comm: MPI.Comm, start: Start | None, lattice: Lattice, held: np.nda
 
 
 def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """q (n, 3) [m] turned about the axis through the middle of the bounds by an angle that grows with the place of the
-    ``nodes`` (n, 3) at rest along the axis: none where the bounds begin, all degrees where they end.
+    """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
 
+    The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin, all degrees where
+    they end.
     Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 - cos(angle))
     """
     a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
@@ -50,9 +53,9 @@ def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) 
 
 
 def uniform(numbers: np.ndarray) -> np.ndarray:
-    """Three random numbers in [0, 1) for each global node number (n,): the same whatever ranks there are.
+    """Return three random numbers in [0, 1) for each global node number (n,), (n, 3), whatever ranks there are.
 
-    SplitMix64 (Steele, Lea and Flood 2014), at its place 3 n + c.
+    SplitMix64 (Steele, Lea and Flood 2014), its number 3 n + c.
     """
     z = (3 * numbers[:, None] + np.arange(1, 4)).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -61,6 +64,9 @@ def uniform(numbers: np.ndarray) -> np.ndarray:
 
 
 def centre_of_mass(comm: MPI.Comm, q: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Of all ranks' owned nodes (3,) [m] (collective). q (l, 3) [m], mass (owned,) [kg]"""
+    """Return the centre of mass (3,) [m] of all ranks' nodes (collective).
+
+    q, mass : (l, 3) [m]; (owned,) [kg]
+    """
     total = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
     return total[:3] / total[3]

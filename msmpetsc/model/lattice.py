@@ -6,19 +6,20 @@ end that it owns. Global node numbers follow Morton order, so they do not depend
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.material import CellMaterial, calibrated_stiffness, edge_stiffness
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-# the place in a 3 x 3 x 3 block of nodes of corner b seen from corner a
+# the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
 NO_CELLS = np.empty((0, 8), np.int64)
@@ -26,13 +27,14 @@ NO_CELLS = np.empty((0, 8), np.int64)
 
 @dataclass(frozen=True)
 class Lattice:
-    """This rank's share. Local node numbers: the ``owned`` nodes first, then the ghosts.
+    """This rank's part of a lattice. Local node numbers: the ``owned`` nodes first, then the ghosts.
 
     table       : global node numbers by grid key; ``table.first`` is the first owned one
     nodes       : (l, 3) rest positions [m]
     ghosts      : (l - owned,) global numbers of the ghost nodes
     mass        : (owned,) [kg]
-    cells       : (c, 8) global corner nodes of the cells this rank owns; cell_kind (c,)
+    cells       : (c, 8) global corner nodes of the cells this rank owns
+    cell_kind   : (c,) geometry.cages' BOUNDARY or INTERIOR
     springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
                   lower-numbered end first, the others to the rank of their lower-numbered end
     rest_length : (s,) [m]
@@ -63,19 +65,20 @@ class Lattice:
 
     @property
     def owned(self) -> int:
+        """Number of nodes that this rank owns."""
         return len(self.mass)
 
     @property
     def global_numbers(self) -> np.ndarray:
-        """(l,) global number of each local node."""
+        """Global number (l,) of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
 
     def stiffest(self, comm: MPI.Comm) -> float:
-        """The greatest stiffness of any spring [N/m] (collective)."""
+        """Return the greatest stiffness of any spring [N/m] (collective)."""
         return comm.allreduce(self.stiffness.max(initial=0), MPI.MAX)
 
     def pin(self, where: np.ndarray) -> "Lattice":
-        """This lattice with the nodes ``where`` (l,) bool held fast."""
+        """Return this lattice with the nodes ``where`` (l,) bool held fast."""
         return replace(self, pinned=self.pinned | where)
 
 
@@ -87,82 +90,129 @@ def build_lattice(
     stiffening: float = 0.0,
     of_cells: Callable[[np.ndarray], CellMaterial] | None = None,
 ) -> Lattice:
-    """Masses and springs of the valid cells (collective).
+    """Build the masses and springs of the valid cells (collective).
 
     density       : [kg/m^3]; each cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
     stiffening    : of the springs' law (model.springs) [-]
-    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.part)
+    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.region)
     """
     h = cages.grid.cell_size
-    corner_keys = morton.encode(cages.ijk[:, None, :] + CORNERS)
+    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
-    cells = table.find(corner_keys)
-    ijk, local_cells, octants = _local_cells(cages, table)
-    ghosts = table.find(morton.encode(ijk[len(table.keys) :]))
-    numbers = np.concatenate([table.first + np.arange(len(table.keys)), ghosts])
-    springs, owned, kind, sharing = _springs(local_cells, numbers, len(table.keys))
-    mass, of_spring = density * h**3 / 8 * octants.sum(axis=1), young_modulus or float(stiffness)
-    of_cell = np.full(len(local_cells), of_spring)
-    if of_cells is not None:
-        made_of = of_cells(ijk[local_cells[:, 0]])
-        mass = h**3 / 8 * _sums_of_nodes(local_cells, made_of.density, len(mass))
-        of_spring = _sums_of_springs(local_cells, made_of.spring, ijk, springs, len(mass)) / sharing
-        of_cell = made_of.spring
+    net = _network(cages, table)
+    given = young_modulus if stiffness is None else stiffness
+    mass, of_spring, of_cell = _sums(net, h, density, given, of_cells)
     if stiffness is None:
-        k, of_cell = calibrated_stiffness(of_spring, h, kind, sharing), edge_stiffness(of_cell, h)
-    else:
-        k = np.full(len(springs), of_spring)
-    first_owned = local_cells[:, 0] < len(table.keys)
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & (stiffening > 0))])
+        of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
+    kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)
     return Lattice(
         table=table,
         cell_size=h,
-        nodes=cages.grid.node_positions(ijk),
-        ghosts=ghosts,
+        nodes=cages.grid.node_positions(net.ijk),
+        ghosts=net.ghosts,
         mass=mass,
-        cells=cells,
+        cells=table.find(corner_keys),
         cell_kind=cages.kind,
-        springs=springs,
-        springs_owned=owned,
-        rest_length=h * np.sqrt(kind),
-        stiffness=k,
-        pinned=np.zeros(len(ijk), bool),
+        springs=net.springs,
+        springs_owned=net.springs_owned,
+        rest_length=h * np.sqrt(net.kind),
+        stiffness=np.broadcast_to(of_spring, len(net.springs)).copy(),
+        pinned=np.zeros(len(net.ijk), bool),
         stiffening=stiffening,
-        local_cells=local_cells[kept],
-        cells_owned=int(first_owned.sum()),
-        cell_stiffness=of_cell[kept],
+        local_cells=net.cells[kept],
+        cells_owned=cells_owned,
+        cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
     )
 
 
-def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The cells around the owned nodes.
+class _Network(NamedTuple):
+    """Nodes, cells and springs of a rank before they are of a material. Fields as in Lattice, or as said here.
 
-    Returns grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
+    ijk     : (l, 3) grid index of the nodes, owned and ghosts
+    octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
+    cells   : (c, 8) local corner nodes of all cells around the owned nodes
+    kind    : (s,) of the springs, their squared lengths in cells
+    sharing : (s,) number of cells that share each spring
+    """
+
+    ijk: np.ndarray
+    octants: np.ndarray
+    ghosts: np.ndarray
+    cells: np.ndarray
+    springs: np.ndarray
+    springs_owned: int
+    kind: np.ndarray
+    sharing: np.ndarray
+
+
+def _network(cages: Cages, table: SortedKeys) -> _Network:
+    """Return this rank's nodes, cells and springs (collective)."""
+    owned = len(table.keys)
+    ijk, cells, octants = _local_cells(cages, table)
+    ghosts = table.find(encode_morton(ijk[owned:]))
+    numbers = np.concatenate([table.first + np.arange(owned), ghosts])
+    return _Network(ijk, octants, ghosts, cells, *_springs(cells, numbers, owned))
+
+
+def _sums(
+    net: _Network,
+    h: float,
+    density: float,
+    given: float | None,
+    of_cells: Callable[[np.ndarray], CellMaterial] | None,
+) -> tuple[np.ndarray, float | np.ndarray, float | np.ndarray]:
+    """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
+
+    given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
+    """
+    assert given is not None
+    if of_cells is None:
+        return density * h**3 / 8 * net.octants.sum(axis=1), given, given
+    owned, made_of = len(net.octants), of_cells(net.ijk[net.cells[:, 0]])
+    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density, owned)
+    of_spring = _sums_of_springs(net.cells, made_of.spring, net.ijk, net.springs, owned) / net.sharing
+    return mass, of_spring, made_of.spring
+
+
+def _kept_cells(local_cells: np.ndarray, owned: int, stiffening: float) -> tuple[np.ndarray, int]:
+    """Return which cells a lattice keeps, those of this rank first, and how many these are.
+
+    The others, of which an owned node is a corner, matter only where the law stiffens.
+    """
+    first_owned = local_cells[:, 0] < owned
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & (stiffening > 0))])
+    return kept, int(first_owned.sum())
+
+
+def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cells around the owned nodes.
+
+    They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
     which of the 8 cells around each owned node are valid, (owned, 8) bool.
     """
-    ijk = morton.decode(table.keys)
-    around = morton.encode(ijk[:, None, :] - CORNERS)
+    ijk = decode_morton(table.keys)
+    around = encode_morton(ijk[:, None, :] - CORNERS)
     octants = cages.table.find(around) >= 0
     cell_keys = np.unique(around[octants])
-    corner_keys = morton.encode(morton.decode(cell_keys)[:, None, :] + CORNERS)
+    corner_keys = encode_morton(decode_morton(cell_keys)[:, None, :] + CORNERS)
     ghost_keys = np.setdiff1d(corner_keys, table.keys)
     keys = np.concatenate([table.keys, ghost_keys])
     order = np.argsort(keys)
     local = order[np.searchsorted(keys, corner_keys, sorter=order)]
-    return morton.decode(keys), local, octants
+    return decode_morton(keys), local, octants
 
 
 def _sums_of_nodes(cells: np.ndarray, values: np.ndarray, owned: int) -> np.ndarray:
-    """Of the cells (c, 8) around each owned node, the sum of their ``values`` (c,), (owned,)."""
+    """Return the sum (owned,) of the ``values`` (c,) of the cells (c, 8) around each owned node."""
     return np.bincount(cells.ravel(), np.repeat(values, 8), owned)[:owned]
 
 
 def _sums_of_springs(
     cells: np.ndarray, values: np.ndarray, ijk: np.ndarray, springs: np.ndarray, owned: int
 ) -> np.ndarray:
-    """Of the cells (c, 8) that share each spring (s, 2), the sum of their ``values`` (c,), (s,).
+    """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
 
     ijk : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
     """
@@ -183,7 +233,7 @@ def _sums_by_direction(cells, values, owned):
 
 @numba.njit(cache=True)
 def _springs(cells, numbers, owned):
-    """Springs between the corners of cells, each once.
+    """Return the springs between the corners of cells, each once.
 
     cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned
     returns : (s, 2) local ends, how many this rank owns, kind (s,), cells sharing each (s,)
@@ -199,8 +249,8 @@ def _springs(cells, numbers, owned):
     count = 0
     for node in range(owned):
         for direction in range(27):
-            other = neighbour[node, direction]
-            count += other >= 0 and direction != 13 and (numbers[other] > numbers[node] or other >= owned)
+            far = neighbour[node, direction]
+            count += far >= 0 and direction != 13 and (numbers[far] > numbers[node] or far >= owned)
     springs = np.empty((count, 2), np.int64)
     kind = np.empty(count, np.int64)
     shared = np.empty(count, np.int64)
@@ -208,17 +258,17 @@ def _springs(cells, numbers, owned):
     for node in range(owned):
         row = neighbour[node]
         for direction in np.argsort(numbers[row]):
-            other = row[direction]
-            if other < 0 or direction == 13:
+            far = row[direction]
+            if far < 0 or direction == 13:
                 continue
-            if numbers[other] > numbers[node]:
-                at = low
+            if numbers[far] > numbers[node]:
+                s = low
                 low += 1
-            elif other >= owned:
+            elif far >= owned:
                 high -= 1
-                at = high
+                s = high
             else:
                 continue
-            springs[at, 0], springs[at, 1] = node, other
-            kind[at], shared[at] = KIND[direction], sharing[node, direction]
+            springs[s, 0], springs[s, 1] = node, far
+            kind[s], shared[s] = KIND[direction], sharing[node, direction]
     return springs, low, kind, shared

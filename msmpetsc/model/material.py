@@ -16,7 +16,11 @@ ISOTROPIC = np.array([0, 40, 16, 9]) / 40
 
 @dataclass(frozen=True)
 class CellMaterial:
-    """density (c,) [kg/m^3]; spring (c,): Young's modulus [Pa], or stiffness [N/m] where the material gives that."""
+    """What cells are made of.
+
+    density : (c,) [kg/m^3]
+    spring  : (c,) Young's modulus [Pa], or stiffness [N/m] where the material gives that
+    """
 
     density: np.ndarray
     spring: np.ndarray
@@ -25,7 +29,7 @@ class CellMaterial:
 def calibrated_stiffness(
     young_modulus: float | np.ndarray, cell_size: float, kind: np.ndarray, cells: np.ndarray
 ) -> np.ndarray:
-    """Spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
+    """Return the spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
 
     Assembled cell by cell, so a spring on the body's boundary has the weight of the cells it bounds.
 
@@ -38,5 +42,5 @@ def calibrated_stiffness(
 
 
 def edge_stiffness(young_modulus: float | np.ndarray, cell_size: float) -> float | np.ndarray:
-    """k1 [N/m] of an edge inside a body of E [Pa], cells of h [m]."""
+    """Return k1 [N/m] of an edge inside a body of E [Pa], cells of h [m]."""
     return 4 / 7 * young_modulus * cell_size

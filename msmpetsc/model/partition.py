@@ -1,4 +1,4 @@
-"""What each of R ranks would hold of a lattice that is built here on one: counted without MPI.
+"""What each of R ranks would hold of a lattice that is built on one: counted without MPI.
 
 The ranks cut cells and nodes, both in Morton order, as comm.SortedKeys does: at splitters of a sample. The sample
 depends on what each rank brings to it, slabs of cells and then the corners of its cells, so that is repeated too.
@@ -9,19 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.comm import sample_of, splitters_of
-from msmpetsc.geometry.cages import Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.interior import Slab
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.scene import schema as scene
+from msmpetsc.scene.schema import CagesTable
 
 MOST = 1 << 40  # cells: the scene's own limit is for runs
 INNER_SPRINGS = 13  # of each cell, where cells have neighbours on all sides
 
 
 @dataclass(frozen=True)
-class Shares:
-    """One number a rank, (R,): whole numbers where they were counted, fractions where they were scaled.
+class Partition:
+    """What each rank holds, one number a rank, (R,): whole where they were counted, fractions where they were scaled.
 
     cells, nodes : that the rank owns
     ghosts       : nodes of others that its springs reach
@@ -38,26 +37,30 @@ class Shares:
 
     @property
     def ranks(self) -> int:
+        """Number of ranks R."""
         return len(self.nodes)
 
     @property
     def springs(self) -> np.ndarray:
-        """(R,) springs that each rank keeps."""
+        """Number of springs (R,) that each rank keeps."""
         return self.inner + self.cut
 
     @property
     def nonzeros(self) -> np.ndarray:
-        """(R,) of A: a row for each node, its diagonal and the other ends of its springs."""
+        """Number of nonzeros (R,) of A: a row for each node, its diagonal and the far ends of its springs."""
         return self.nodes + 2 * self.inner + self.cut
 
     @property
     def all_springs(self) -> float:
-        """Each counted once."""
+        """Number of springs, each counted once."""
         return self.inner.sum() + self.cut.sum() / 2
 
-    def scaled(self, cells: float) -> "Shares":
-        """Those of the same body with more cells on as many ranks: what fills it grows with the cells, the surface
-        with their power 2/3; ghosts and cut springs as they do around a cube of as many nodes as a rank has."""
+    def scaled(self, cells: float) -> "Partition":
+        """Return the partition of the same body with more cells on as many ranks.
+
+        What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs as they do around
+        a cube of as many nodes as a rank has.
+        """
         f = cells / self.cells.sum()
         nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
         springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
@@ -65,41 +68,52 @@ class Shares:
         cut = self.cut * _cut_springs(after) / _cut_springs(before)
         inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
         ghosts = self.ghosts * _shell(after) / _shell(before)
-        return Shares(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
+        return Partition(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
 
 
 def _shell(side: float) -> float:
-    """Nodes around a cube of side^3 nodes."""
+    """Return the number of nodes around a cube of side^3 nodes."""
     return (side + 2) ** 3 - side**3
 
 
 def _cut_springs(side: float) -> float:
-    """Springs from a cube of side^3 nodes to those around it: 26 a node, less twice those within."""
+    """Return the number of springs from a cube of side^3 nodes to those around: 26 a node, less twice those within."""
     return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
 
 
-def shares_of(body: Body, wanted: scene.Cages, ranks: int, most: int) -> tuple[Shares, int]:
-    """The shares of ``ranks`` ranks, and the cells of the lattice that they were counted on: one with about ``most``
-    cells, and scaled, where more are wanted."""
+def partition_of(body: Body, wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
+    """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
+
+    That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
+    """
     h, report = wanted.cell_size, body.report
-    guess = wanted.count or _cells(abs(report.volume), 3 / 4 * report.area, h)  # as choose_cell_size does
+    guess: float
+    if wanted.count is not None:
+        guess = wanted.count
+    else:
+        assert h is not None  # the schema has one of the two
+        guess = _cells(abs(report.volume), 3 / 4 * report.area, h)  # as choose_cell_size does
     size = h if h and guess <= most else choose_cell_size(body, min(wanted.count or most, most), wanted.method, MOST)
     cages = fill(body, size, wanted.method, MOST)
-    shares = count_shares(body, cages, build_lattice(cages, 1.0, 1.0), ranks)
-    found = int(shares.cells.sum())
+    partition = count_partition(body, cages, build_lattice(cages, 1.0, 1.0), ranks)
+    counted = int(partition.cells.sum())
     if guess > most:
-        volume = abs(report.volume) if report.closed else found * size**3
-        shares = shares.scaled(wanted.count or round(_cells(volume, (found * size**3 - volume) / size, h)))
-    return shares, found
+        cells = wanted.count
+        if cells is None:
+            assert h is not None
+            volume = abs(report.volume) if report.closed else counted * size**3
+            cells = round(_cells(volume, (counted * size**3 - volume) / size, h))
+        partition = partition.scaled(cells)
+    return partition, counted
 
 
 def _cells(volume: float, area: float, h: float) -> float:
-    """How many of side h fill a volume and stick out of an area, whose share h decides."""
+    """Return how many cells of side h [m] fill a volume [m^3] and stick out of an area [m^2]."""
     return volume / h**3 + area / h**2
 
 
-def count_shares(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Shares:
-    """The shares of ``ranks`` ranks; cages and lattice are whole, built on one rank."""
+def count_partition(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Partition:
+    """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
     cell_rank = _ranks_of_cells(body, cages, ranks)
     rank = _ranks_of_nodes(lattice, cell_rank, ranks)
     of_end = rank[lattice.springs]
@@ -115,11 +129,11 @@ def count_shares(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Shar
         "cut": to,
         "neighbours": np.unique(holder * ranks + owner) // ranks,
     }
-    return Shares(**{name: np.bincount(found, minlength=ranks) for name, found in counts.items()})
+    return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
 
 
 def _ranks_of_cells(body: Body, cages: Cages, ranks: int) -> np.ndarray:
-    """(c,) rank of each cell; each rank first finds those of its slab along the longest side."""
+    """Return the rank (c,) of each cell; each rank first finds those of its slab along the longest side."""
     axis = int(np.argmax(np.ptp(body.bounds, axis=0)))
     slab = Slab.owner(cages.ijk[:, axis], ranks, int(cages.grid.shape[axis]))
     keys = cages.table.keys
@@ -127,18 +141,18 @@ def _ranks_of_cells(body: Body, cages: Cages, ranks: int) -> np.ndarray:
 
 
 def _ranks_of_nodes(lattice: Lattice, cell_rank: np.ndarray, ranks: int) -> np.ndarray:
-    """(n,) rank of each node; each rank first finds the corners of its cells."""
+    """Return the rank (n,) of each node; each rank first finds the corners of its cells."""
     keys = lattice.table.keys
     return _cut(keys, [keys[np.unique(lattice.cells[part])] for part in _parts(cell_rank, ranks)], ranks)
 
 
 def _parts(rank: np.ndarray, ranks: int) -> list[np.ndarray]:
-    """What each rank has, in ascending order."""
+    """Return what each rank has, in ascending order."""
     return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank, minlength=ranks))[:-1])
 
 
 def _cut(keys: np.ndarray, brought: list[np.ndarray], ranks: int) -> np.ndarray:
-    """Rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
+    """Return the rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
     total = sum(map(len, brought))
     sample = np.concatenate([sample_of(part, total, ranks) for part in brought])
     return np.searchsorted(splitters_of(sample, ranks), keys, side="right")

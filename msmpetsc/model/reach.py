@@ -1,4 +1,4 @@
-"""What the pins, anchors, forces and parts of a scene reach, and which of them do nothing or not what they say.
+"""The nodes that pins, anchors, forces and parts of a scene reach, and which of them do nothing or not what they say.
 
 What could not have any effect at all is refused; what is overruled in part is warned of.
 """
@@ -15,19 +15,21 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.anchor import Anchor
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.paths import SAME, within
+from msmpetsc.model.loads import SAME, Anchor, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene.schema import Force, Obstacle, Scene, Time
+from msmpetsc.scene.schema import Force, ObstacleTable, Scene, Time
 
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Of one table, over all ranks: how many ``nodes`` its region holds, and how many of them are not its own, for
-    they are held by a pin or an anchor that comes before it."""
+    """The nodes of a table's region, over all ranks.
+
+    nodes : how many the region holds
+    held  : how many of them are not the table's own, for a pin or an anchor that comes before it holds them
+    """
 
     key: str
     nodes: int
@@ -35,7 +37,7 @@ class Reach:
 
 
 def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndarray]:
-    """The nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
+    """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
     tables = dict(chain.from_iterable(_keyed(scene, kind) for kind in ("pin", "anchor", "force")))
     return {key: finder.find(key, table.region, lattice) for key, table in tables.items()}
 
@@ -43,7 +45,7 @@ def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndar
 def reach_of(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions, finder: Finder
 ) -> tuple[Reach, ...]:
-    """Of pins, anchors and forces in this order; warns of what is overruled (collective).
+    """Return the reach of pins, anchors and forces in this order; warn of what is overruled (collective).
 
     lattice : with its pins
     anchors : each with the nodes that it leads, those of its region aside that a pin or an earlier anchor has
@@ -79,14 +81,14 @@ def reach_of(
     return tuple(reaches)
 
 
-def _leads_alike(one: Anchor, other: Anchor) -> bool:
-    """Along the same path and as long: on a node of both it makes no difference which of them has it."""
-    same = np.array_equal(one.path.times, other.path.times)
-    return same and np.array_equal(one.path.displacements, other.path.displacements) and one.stop == other.stop
+def _leads_alike(a: Anchor, b: Anchor) -> bool:
+    """Return whether two anchors have the same path and stop: on a node of both it does not matter which has it."""
+    same = np.array_equal(a.path.times, b.path.times)
+    return same and np.array_equal(a.path.displacements, b.path.displacements) and a.stop == b.stop
 
 
 def _warn_of_overruled(reach: Reach, pinned: int, led: int) -> None:
-    """Of an anchor's nodes so many are pinned, and so many led another way by earlier anchors."""
+    """Warn that some of an anchor's nodes are pinned, or led another way by earlier anchors; raise if all are."""
     why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
     why += [f"{led} {'is' if led == 1 else 'are'} led by an anchor before it"] if led else []
     if not why:
@@ -98,14 +100,14 @@ def _warn_of_overruled(reach: Reach, pinned: int, led: int) -> None:
 
 
 def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.ndarray:
-    """The nodes (l,) bool that are not free at any time at which the force acts."""
+    """Return the nodes (l,) bool that are not free at any time at which the force acts."""
     until = math.inf if force.stop is None else force.stop
     lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
     return reduce(np.logical_or, lasting, pinned)
 
 
 def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder) -> None:
-    """Of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
+    """Warn of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
     if not scene.part:
         return
     own = lattice.local_cells[: lattice.cells_owned]
@@ -127,7 +129,7 @@ def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors:
 
 
 def _note_what_never_acts(scene: Scene) -> None:
-    """Of forces and obstacles that are there at the end of no step."""
+    """Warn of forces and obstacles that are there at the end of no step."""
     time = scene.time
     for key, table in chain(_keyed(scene, "force"), _keyed(scene, "obstacle")):
         if _acts_in_a_step(table, time):
@@ -141,12 +143,12 @@ def _note_what_never_acts(scene: Scene) -> None:
 
 
 def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:
-    """The tables of a kind, each with its key: ("force.0", ...)."""
+    """Return the tables of a kind, each with its key: ("force.0", ...)."""
     return ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
 
 
-def _acts_in_a_step(table: Force | Obstacle, time: Time) -> bool:
-    """Whether it is there at the end of a step; or, where steps are taken in substeps, at any time of the run."""
+def _acts_in_a_step(table: Force | ObstacleTable, time: Time) -> bool:
+    """Return whether a table acts at the end of a step; or, where steps have substeps, at any time of the run."""
     if time.integrator == "verlet":
         return table.start < time.duration and (table.stop is None or table.stop > 0)
     first = max(1, math.ceil(table.start / time.step * (1 - SAME)))

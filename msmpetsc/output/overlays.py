@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from msmpetsc.model.paths import Path, within
+from msmpetsc.model.loads import Motion, within
 from msmpetsc.model.region import inside
 from msmpetsc.output.camera import Camera, unit
 from msmpetsc.scene.schema import Region, SceneFile
@@ -89,7 +89,7 @@ def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera
     for obstacle in scene.obstacle:
         if not within(time, obstacle.start, obstacle.stop):
             continue
-        by = Path.through(obstacle.path).at(time)
+        by = Motion.through(obstacle.path).at(time)
         if obstacle.shape == "box":
             glass += _box(np.array(obstacle.box) + by, bodies)
             continue

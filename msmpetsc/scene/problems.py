@@ -15,7 +15,7 @@ from msmpetsc.errors import nearest, printable
 KeyPath = tuple[str | int, ...]
 
 SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
-TOLD = 100  # problems of a file
+MOST_REPORTED = 100  # problems of a file
 
 WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "missing": "required, but missing",
@@ -41,17 +41,17 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
 
 
 def rule(words: str, *others: str) -> PydanticCustomError:
-    """A broken rule in plain words; ``others`` are the keys beside this one that it looks at."""
+    """Return a broken rule in plain words; ``others`` are the further keys that it depends on."""
     return PydanticCustomError("rule", "rule", {"words": words, "others": others})
 
 
 def unknown_name(valid: Iterable[str]) -> PydanticCustomError:
-    """A name that is none of ``valid``."""
+    """Return the problem of a name that is none of ``valid``."""
     return PydanticCustomError("unknown_name", "unknown name", {"valid": list(valid)})
 
 
 def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list[InitErrorDetails]:
-    """The problem, if any, that not exactly one of ``names`` is a key of ``data``."""
+    """Return the problem, if any, that not exactly one of ``names`` is a key of ``data``."""
     if not names or not isinstance(data, dict):
         return []
     given = [name for name in names if name in data]
@@ -63,17 +63,18 @@ def one_of_problems(data: Any, names: tuple[str, ...], known: list[str]) -> list
 
 
 def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]:
-    """The problems of one table, to be raised again together with others.
+    """Return the problems of one table, to be raised again together with others.
 
     known: the table's keys. An unknown key gets them to choose the nearest from, and a missing key that
     an unknown one nearly spells is left out. A list that is too short is one problem, not one an item.
     """
-    found = error.errors(include_url=False)
-    unknown = [e["loc"][0] for e in found if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
-    meant = {_nearest(key, known) for key in unknown[:TOLD]}
+    errors = error.errors(include_url=False)
+    unknown = [e["loc"][0] for e in errors if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
+    meant = {_nearest(key, known) for key in unknown[:MOST_REPORTED]}
     problems: dict[Any, InitErrorDetails] = {}
-    for number, e in enumerate(found):
-        kind, loc, context, identity = e["type"], e["loc"], dict(e.get("ctx", {})), number
+    for number, e in enumerate(errors):
+        kind, loc, context = e["type"], e["loc"], dict(e.get("ctx", {}))
+        identity: Any = number
         if kind == "extra_forbidden" and len(loc) == 1:
             context["valid"] = known
         elif kind == "missing" and isinstance(loc[-1], int):
@@ -87,21 +88,21 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
 
 
 def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]) -> list[str]:
-    """One line for each problem: file, key, what is wrong, and the line in ``text`` or the override at fault."""
+    """Return a line for each problem: file, key, what is wrong, and the line of ``text`` or the override at fault."""
     prefixes = _prefixes(text)
     lines = []
     problems = error.errors(include_url=False)
-    for e in problems[:TOLD]:
+    for e in problems[:MOST_REPORTED]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
         number = _line(e["loc"], prefixes)
         where = f" (--set {as_given(culprit)})" if culprit else f" (line {number})" if number else ""
         lines.append(f"{path}: {_key(e['loc'])}: {_words(e)}{where}")
-    more = len(problems) - TOLD
+    more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 
 
 def as_given(value: Any) -> str:
-    """``value`` on one line, shortened; an override as it was typed."""
+    """Return ``value`` on one line, shortened; an override as it was typed."""
     if isinstance(value, str):
         shown = " ".join(value.split())
     elif isinstance(value, float):
@@ -119,7 +120,7 @@ def _got(value: Any) -> str:
 
 
 def _key(loc: KeyPath) -> str:
-    """The key path as --set takes it; keys that are not bare stand in quotes."""
+    """Return the key path as --set takes it; keys that are not bare stand in quotes."""
     return ".".join(key if re.fullmatch(r"[\w-]+", key) else _got(key) for key in map(str, loc))
 
 
@@ -146,7 +147,7 @@ def _suggestion(word: Any, valid: list[str]) -> str:
 
 
 def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
-    """Whether an override of ``keys`` has a part in the problem: it set the key, a part of it, or its table."""
+    """Return whether an override of ``keys`` has a part in the problem: it set the key, a part of it, or its table."""
     loc, context = e["loc"], e.get("ctx", {})
     if e["type"] == "one_of":
         suspects = [(*loc, name) for name in context["inner"]]
@@ -156,33 +157,33 @@ def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
 
 
 def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
-    """For each statement of a TOML text: the line it starts on, and what the text holds up to its end.
+    """Return for each statement of a TOML text the line it starts on, and what the text holds up to its end.
 
     A statement ends where the text up to there parses.
     """
     lines = text.split("\n")
     if len(lines) > SEARCHED_LINES or len(text) > SEARCHED:
         return []
-    found, start = [], 1
+    statements, start = [], 1
     for end in range(1, len(lines) + 1):
         try:
             data = tomllib.loads("\n".join(lines[:end]) + "\n")
         except tomllib.TOMLDecodeError:
             continue
-        found.append((start, data))
+        statements.append((start, data))
         start = end + 1
-    return found
+    return statements
 
 
 def _line(loc: KeyPath, prefixes: list[tuple[int, dict[str, Any]]]) -> int | None:
-    """Line on which the key first stands, or else the innermost table around it that the file has."""
+    """Return the line on which the key first stands, or else the innermost table around it that the file has."""
     depths = [_depth(data, loc) for _, data in prefixes]
     deepest = max(depths, default=0)
     return prefixes[depths.index(deepest)][0] if deepest else None
 
 
 def _depth(data: Any, loc: KeyPath) -> int:
-    """How many keys of ``loc`` lead somewhere in ``data``."""
+    """Return how many keys of ``loc`` lead somewhere in ``data``."""
     for depth, key in enumerate(loc):
         inside = (isinstance(data, dict) and key in data) or (isinstance(data, list) and key in range(len(data)))
         if not inside:

@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Collection, Iterable
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def scene_of(
     by_user: bool = True,
     to_read: bool = True,
 ) -> Scene:
-    """The same of a text that stood in the file.
+    """Check the text of a scene file as ``load_scene`` does the file.
 
     to_read: whether the files that it names are to be read
     """
@@ -57,7 +58,7 @@ def scene_of(
 
 
 def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
     text = _read(path, kind)
     return text, _parse(path, text)
 
@@ -74,7 +75,7 @@ def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | 
 
 
 def lies_below(folder: Path, name: str) -> bool:
-    """Whether a path from ``folder`` leads to what lies in it, links followed."""
+    """Return whether a path from ``folder`` leads to what lies in it, links followed."""
     path = folder / name
     try:
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # whoever opens it says so
@@ -119,7 +120,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
 
 
 def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
-    """Carry out one "key.path=value" in ``data``; returns the key path."""
+    """Carry out a "key.path=value" in ``data``; returns the key path."""
     try:
         if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text
             raise InputError("is not UTF-8 text")
@@ -131,8 +132,8 @@ def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
             raise InputError("is nested too deeply")
         value = _override_value(raw.strip())
         holder: Any = data
-        for key, following in zip(path, path[1:], strict=False):
-            empty = [] if isinstance(following, int) else {}
+        for key, following in pairwise(path):
+            empty: Any = [] if isinstance(following, int) else {}
             holder = _put(holder, key, empty, replace=False)
         _put(holder, path[-1], value, replace=True)
     except InputError as error:

@@ -31,9 +31,9 @@ def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     longest = max(map(abs, _nonzero(vector)))
-    scaled = [x / longest for x in vector]  # or the squares of very large or small components leave the range
-    length = math.hypot(*scaled)
-    return tuple(x / length for x in scaled)
+    x, y, z = (c / longest for c in vector)  # or the squares of very large or small components leave the range
+    length = math.hypot(x, y, z)
+    return x / length, y / length, z / length
 
 
 Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
@@ -62,7 +62,7 @@ def _printable(name: str) -> str:
 
 
 def _painted(value: Any) -> str | tuple[int, ...]:
-    """A file's name, or numbers of points."""
+    """Return a file's name, or numbers of points."""
     if isinstance(value, str) and 0 < len(value) <= 1000:
         return _printable(value)
     numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
@@ -78,12 +78,12 @@ def _after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
     return stop
 
 
-def _only_for(other: str, value: str) -> Callable[..., Any]:
-    """A validator of a key that has a meaning only where another key of its table has this value."""
+def _only_for(key: str, value: str) -> Callable[..., Any]:
+    """Return the validator of what has a meaning only where another key of its table has this value."""
 
     def check(cls, given: Any, info: ValidationInfo) -> Any:
-        if info.data.get(other, value) != value:
-            raise rule(f'is for {other} = "{value}" only', other)
+        if info.data.get(key, value) != value:
+            raise rule(f'is for {key} = "{value}" only', key)
         return given
 
     return check
@@ -143,7 +143,7 @@ StepName = Literal["merge", "largest_part", "union", "repair", "orient"]
 
 
 def _step(value: Any) -> str | dict[str, Any]:
-    """A step name, or a table of one key, checked and plain."""
+    """Return a step name, or a table of one key, checked and plain."""
     if isinstance(value, dict):
         return StepTable.model_validate(value).model_dump(exclude_none=True)
     if not isinstance(value, str):
@@ -171,7 +171,7 @@ class Mesh(Table):
     base: Vector | None = Field(None, description="where the middle of the bounding box's bottom face stands [m]")
 
 
-class Cages(Table):
+class CagesTable(Table):
     """The grid cells that fill the surface, and how the surface follows them."""
 
     one_of = ("count", "cell_size")
@@ -246,12 +246,15 @@ class Twist(Table):
 
 
 class Start(Table):
-    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order. Nodes that
-    are pinned or led stay where they are."""
+    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order.
+
+    Nodes that are pinned or led stay where they are.
+    """
 
     scale: Vector = Field(
         (1.0, 1.0, 1.0),
-        description="factors along the axes, about the middle of the rest bounding box: 0 collapses, a negative one mirrors [-]",
+        description="factors along the axes, about the middle of the rest bounding box: "
+        "0 collapses, a negative one mirrors [-]",
     )
     twist: Twist | None = Field(None, description="a turn that grows along an axis")
     scatter: float = Field(
@@ -275,7 +278,7 @@ class Keyframe(Table):
 
 
 def _ascending(path: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
-    if any(one.time >= other.time for one, other in pairwise(path)):
+    if any(a.time >= b.time for a, b in pairwise(path)):
         raise rule("must have ascending times")
     return path
 
@@ -284,7 +287,7 @@ Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
 PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
 
 
-class Obstacle(Table):
+class ObstacleTable(Table):
     """What nodes bounce off or are pressed by: a plane, or a box; it may move, and act for a while only."""
 
     shape: Literal["plane", "box"] = Field(description="kind of obstacle")
@@ -308,7 +311,7 @@ class Obstacle(Table):
     _after_start = field_validator("stop")(_after_start)
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Obstacle":
+    def _fits_together(self) -> "ObstacleTable":
         needed = ("box",) if self.shape == "box" else ("point", "normal")
         missing = [name for name in needed if getattr(self, name) is None]
         if missing:
@@ -359,7 +362,7 @@ class Region(Table):
         return relative
 
 
-class Part(Table):
+class PartTable(Table):
     """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
 
     region: Region = Field(description="the cells whose centres lie in it")
@@ -370,13 +373,13 @@ class Part(Table):
     )
 
     @model_validator(mode="after")
-    def _says_something(self) -> "Part":
+    def _says_something(self) -> "PartTable":
         if self.density is None and self.young_modulus is None and self.stiffness is None:
             raise rule("needs density, young_modulus or stiffness")
         return self
 
 
-def _as_the_material(cls, parts: tuple[Part, ...], info: ValidationInfo) -> tuple[Part, ...]:
+def _as_the_material(cls, parts: tuple[PartTable, ...], info: ValidationInfo) -> tuple[PartTable, ...]:
     """Stiffness and Young's modulus are two ways to name all springs: parts must take the material's."""
     material = info.data.get("material")
     for number, part in enumerate(parts):
@@ -410,7 +413,7 @@ class Force(Table):
     _after_start = field_validator("stop")(_after_start)
 
 
-class Anchor(Table):
+class AnchorTable(Table):
     """Nodes that are led along a path, each keeping its place among them."""
 
     region: Region = Field(description="the nodes led")
@@ -457,20 +460,20 @@ class SceneFile(Table):
 
     title: str = Field("", description="for the reader")
     mesh: Mesh = Field(description="the closed surface")
-    cages: Cages = Field(description="the cells that fill it")
+    cages: CagesTable = Field(description="the cells that fill it")
     material: Material = Field(description="what it is made of")
-    part: ListOf[Part] = Field((), description="cells of another material")
+    part: ListOf[PartTable] = Field((), description="cells of another material")
     time: Time = Field(description="time step and duration")
     start: Start | None = Field(None, description="how it is at time 0; at rest in its rest shape if absent")
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
-    obstacle: ListOf[Obstacle] = Field((), description="what nodes bounce off")
+    obstacle: ListOf[ObstacleTable] = Field((), description="what nodes bounce off")
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
-    anchor: ListOf[Anchor] = Field((), description="nodes led along a path")
+    anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
-    solver: Solver = Field(Solver(), description="how a step is solved")
-    safety: Safety = Field(Safety(), description="what is done about a step that fails")
-    output: Output = Field(Output(), description="what is stored")
-    picture: Picture = Field(Picture(), description="how the result is drawn")
+    solver: Solver = Field(Solver.model_validate({}), description="how a step is solved")
+    safety: Safety = Field(Safety.model_validate({}), description="what is done about a step that fails")
+    output: Output = Field(Output.model_validate({}), description="what is stored")
+    picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
     _of_one_kind = field_validator("part")(_as_the_material)
 

@@ -27,7 +27,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.locate import inside_out, place_of_greatest
+from msmpetsc.model.locate import describe_inverted, node_of_greatest
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
 
@@ -147,7 +147,7 @@ class EnergyBalance:
         if ledger.gained > MOST * ledger.put_in:
             raise StepFailed(
                 f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
-                f"{self._worst(v)}{inside_out(self.comm, self.lattice, result.position)}; "
+                f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
                 "try a smaller solver.error (or more iterations), a smaller time.step, or "
                 'safety.on_failure = "fallback"',
                 "energy",
@@ -201,7 +201,9 @@ class EnergyBalance:
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned])
-            + environment.dragged((q[owned], sides), (result.position[owned], after.sides), time, time_step),
+            + environment.friction_work_bound(
+                (q[owned], sides), (result.position[owned], after.sides), time, time_step
+            ),
             result.work,
             result.swing,
         )
@@ -214,4 +216,4 @@ class EnergyBalance:
 
     def _worst(self, vectors: np.ndarray) -> str:
         owned = np.arange(self.lattice.owned)
-        return "worst at " + place_of_greatest(self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1))
+        return "worst at " + node_of_greatest(self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1))

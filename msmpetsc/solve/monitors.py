@@ -6,10 +6,10 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.contact.overlap import overlap
+from msmpetsc.model.contact.obstacle import describe_overlap
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.locate import inverted
+from msmpetsc.model.locate import worst_inverted
 from msmpetsc.solve.energy_balance import MUCH, Ledger
 
 COUNTS = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")  # in checkpoints
@@ -26,7 +26,7 @@ class Monitors:
 
     def inverted(self, index: int, time: float, q: np.ndarray) -> int:
         """Count the cells inside out at q (l, 3) [m] (collective)."""
-        self.now, position = inverted(self.comm, self.lattice, q)
+        self.now, position = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             log.warning(
                 "frame %d (t = %.6g s): %d cell%s inside out, the worst %s; %s",
@@ -58,7 +58,7 @@ class Monitors:
         (collective)."""
         new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
-            overlapping = overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
+            overlapping = describe_overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
             if overlapping:
                 log.warning(
                     "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",

@@ -11,12 +11,11 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model
+from msmpetsc.model.build import Model, to_device
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
-from msmpetsc.model.to_device import placed
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -105,7 +104,7 @@ class Simulation:
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, probes: Probes = Probes()):
-        model = placed(model, sender(comm))
+        model = to_device(model, sender(comm))
         self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
@@ -119,7 +118,7 @@ class Simulation:
         self.monitors = Monitors(comm, model.lattice)
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
-        sides = self.environment.met(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
+        sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.cost = State(q.copy(), q - self.time_step * velocity, sides=sides), FrameCost()
 
     def frames(self) -> Iterator[Frame]:

@@ -23,7 +23,7 @@ import trimesh
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.partition import Shares
+from msmpetsc.model.partition import Partition
 from msmpetsc.scene.schema import Scene
 from msmpetsc.study.case import Case
 from msmpetsc.study.measure import Bench
@@ -109,7 +109,7 @@ class Forecast:
     def _memory_of_byte(self) -> float:
         return max(0.0, _slope(self.coarse.held, self.coarse.memory, self.fine.held, self.fine.memory))
 
-    def memory(self, shares: Shares, points: int = 0, mesh: float = 0.0) -> np.ndarray:
+    def memory(self, shares: Partition, points: int = 0, mesh: float = 0.0) -> np.ndarray:
         """(R,) [byte].
 
         points : of the surface, where it is stored
@@ -136,14 +136,14 @@ class Forecast:
         power = math.log(fine / coarse) / math.log(self.fine.cells / self.coarse.cells)
         return fine * (cells / self.fine.cells) ** min(max(power, 0.0), STEEPEST)
 
-    def computing(self, shares: Shares) -> float:
+    def computing(self, shares: Partition) -> float:
         """[s] a step, of the rank that has most springs."""
         coarse, fine = self.coarse, self.fine
         unit = _line(shares.springs.max(), coarse.springs, coarse.unit, fine.springs, fine.unit)
         cells = shares.cells.sum()
         return units(self.its(cells), self.iterations(cells)) * unit
 
-    def messages(self, shares: Shares, network: Network) -> float:
+    def messages(self, shares: Partition, network: Network) -> float:
         """[s] a step, of the rank whose ghosts take longest."""
         cells = shares.cells.sum()
         its, iterations = self.its(cells), self.iterations(cells) + 1

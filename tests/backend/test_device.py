@@ -84,7 +84,7 @@ def test_messages_are_staged_on_the_cpu_where_mpi_knows_no_gpus(options, knows: 
     try:
         with (
             patch.object(device, "what_is_missing", lambda: None),
-            patch.object(cuda, "take_one", lambda rank: None),
+            patch.object(cuda, "use_device", lambda rank: None),
             patch.object(device, "_mpi_knows_gpus", lambda: knows),
         ):
             assert device.sender(MPI.COMM_SELF) is cuda.send
@@ -99,6 +99,8 @@ def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path
     if device.what_is_missing():
         pytest.skip(device.what_is_missing())
     options["mat_type"] = "seqaijcusparse"
-    with patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array):
-        with pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"):
-            play(block_scene(tmp_path, **FALL))
+    with (
+        patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array),
+        pytest.raises(InputError, match="-mat_type seqaijcusparse: the run computes on the CPU"),
+    ):
+        play(block_scene(tmp_path, **FALL))

@@ -17,7 +17,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import build_model, fill_cages, read_body
-from msmpetsc.model.partition import Shares, count_shares
+from msmpetsc.model.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.linear.system import assemble
@@ -53,12 +53,12 @@ def own_log():
     log.handlers, log.level = before
 
 
-def counted(scene: Path, cells: int, ranks: int) -> Shares:
-    """What count_shares says."""
+def counted(scene: Path, cells: int, ranks: int) -> Partition:
+    """What count_partition says."""
     read = load_scene(scene, [f"cages.count={cells}"])
     body = read_body(SELF, read)
     cages = fill_cages(body, read)
-    return count_shares(body, cages, build_model(SELF, read).lattice, ranks)
+    return count_partition(body, cages, build_model(SELF, read).lattice, ranks)
 
 
 def test_the_counts_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
@@ -102,10 +102,10 @@ def test_scaled_to_itself_nothing_changes(scene: Path):
 # Where integers end
 
 
-def a_cube(side: int) -> Shares:
+def a_cube(side: int) -> Partition:
     nodes, cells = (side + 1) ** 3, side**3
     springs = 3 * side * (side + 1) ** 2 + 6 * side**2 * (side + 1) + 4 * side**3
-    return Shares(*(np.array([float(value)]) for value in (cells, nodes, 0, springs, 0, 0)))
+    return Partition(*(np.array([float(value)]) for value in (cells, nodes, 0, springs, 0, 0)))
 
 
 def test_the_number_of_cells_at_which_unknowns_end():
@@ -170,7 +170,7 @@ def test_substeps_of_verlet_grow_as_the_side():
 
 def test_messages_cost_latency_and_bandwidth():
     """Two ranks of 1000 ghosts, one neighbour each."""
-    two = Shares(*(np.array([v, v], float) for v in (1e4, 1e4, 1000, 1e5, 1e4, 1)))
+    two = Partition(*(np.array([v, v], float) for v in (1e4, 1e4, 1000, 1e5, 1e4, 1)))
     found = Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 10))
     exchanges, sums = 10 + 4 * 3, 3 * 10 + 10 * 3
     assert found.messages(two, Network(1e-6, 1e9)) == pytest.approx(exchanges * (1e-6 + 24e-6) + sums * 2e-6)

@@ -7,6 +7,7 @@ Enclosed cells: scipy.ndimage.label on the dense grid.
 """
 
 import os
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -21,12 +22,12 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import morton
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, fill
-from msmpetsc.geometry.cell_size import choose_cell_size
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
 from msmpetsc.geometry.prepare import compact, prepare
-from msmpetsc.geometry.surface import Surface, examine, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface, examine
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))
@@ -38,25 +39,25 @@ SIDE = 6  # cells of the small grid of the boundary tests
 
 
 @settings(deadline=None)
-@given(arrays(np.int64, (9, 3), elements=st.integers(0, morton.LIMIT - 1)))
+@given(arrays(np.int64, (9, 3), elements=st.integers(0, LIMIT - 1)))
 def test_morton_round_trip_in_the_order_of_the_interleaved_bits(ijk):
-    keys = morton.encode(ijk)
-    assert np.array_equal(morton.decode(keys), ijk)
+    keys = encode_morton(ijk)
+    assert np.array_equal(decode_morton(keys), ijk)
     bits = ["".join(f"{k:021b}"[b] + f"{j:021b}"[b] + f"{i:021b}"[b] for b in range(21)) for i, j, k in ijk.tolist()]
     assert keys.tolist() == [int(b, 2) for b in bits]
 
 
-@given(st.integers(0, morton.LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
+@given(st.integers(0, LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
 def test_morton_keeps_the_order_along_each_axis(at, axis, ijk):
     low, high = ijk.copy(), ijk.copy()
     low[axis], high[axis] = at, at + 1
-    assert morton.encode(low) < morton.encode(high)
+    assert encode_morton(low) < encode_morton(high)
 
 
 def test_morton_is_minus_one_outside():
-    outside = np.array([[-1, 0, 0], [0, morton.LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
-    assert (morton.encode(outside) == -1).all()
-    assert morton.encode(outside[:, None]).shape == (4, 1)
+    outside = np.array([[-1, 0, 0], [0, LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
+    assert (encode_morton(outside) == -1).all()
+    assert encode_morton(outside[:, None]).shape == (4, 1)
 
 
 # --- boundary cells ---
@@ -121,7 +122,7 @@ def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
     a, b, c = corners
     points = a + i[:, None] * (b - a) + j[:, None] * (c - a)
     marked = touched_cells(corners[None], np.zeros(3, np.int64), np.full(3, 301))
-    assert np.isin(morton.encode(np.floor(points).astype(np.int64)), morton.encode(marked)).all()
+    assert np.isin(encode_morton(np.floor(points).astype(np.int64)), encode_morton(marked)).all()
 
 
 def through_grid_points(count: int) -> np.ndarray:
@@ -294,6 +295,12 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
 
 
+def test_an_open_box_without_libigl_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "igl", None)
+    with pytest.raises(InputError, match=r"pip install msmpetsc\[mesh\]"):
+        fill(aligned_box(lid=False), 0.1)
+
+
 def test_the_longest_side_may_be_any():
     whole = fill(aligned_box(), 0.1).ijk
     for turns in (1, 2):
@@ -329,12 +336,12 @@ def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_
 
 
 def test_too_many_cells_are_refused():
-    with pytest.raises(InputError, match="above cages.max_cells = 149"):
+    with pytest.raises(InputError, match=r"above cages.max_cells = 149"):
         fill(aligned_box(), 0.1, max_cells=149)
     assert len(fill(aligned_box(), 0.1, max_cells=150).kind) == 150
-    with pytest.raises(InputError, match="above cages.max_cells"):
+    with pytest.raises(InputError, match=r"above cages.max_cells"):
         fill(aligned_box(), 1e-5)  # at once: 1.5e14 cells are not tried
-    with pytest.raises(InputError, match="cages.cell_size: 1e-08 m would cut the body into 1e"):
+    with pytest.raises(InputError, match=r"cages.cell_size: 1e-08 m would cut the body into 1e"):
         fill(aligned_box(), 1e-8)
 
 
@@ -372,5 +379,5 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
 
 
 def test_more_cells_than_allowed_are_not_sought():
-    with pytest.raises(InputError, match="cages.count: 151 is more than cages.max_cells = 150"):
+    with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
         choose_cell_size(aligned_box(), 151, max_cells=150)

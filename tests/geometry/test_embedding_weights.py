@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.stencil import KINDS, stencil_weights
+from msmpetsc.geometry.embedding import KINDS, stencil_weights
 
 STUDY = runpy.run_path(str(ROOT / "scripts" / "embedding_study.py"))
 NODES, BLOCK = STUDY["NODES"], STUDY["BLOCK"]

@@ -23,7 +23,8 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import repair
-from msmpetsc.geometry.surface import Surface, check_encloses, examine, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.model.build import read_body
 from msmpetsc.scene.reading import load_scene
 
@@ -62,9 +63,12 @@ def gltf() -> bytes:
     binary = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
     uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
     tree = {
-        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
+        "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
         "buffers": [{"uri": uri, "byteLength": len(binary)}],
-        "bufferViews": [{"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4},
+        ],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 8},
             {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 36},
@@ -165,7 +169,7 @@ def test_a_tiny_archive_cannot_fill_the_memory(tmp_path):
 def test_what_crashes_the_repair_library_is_refused_before():
     points, triangles = np.array(BOX.vertices), np.array(BOX.faces, np.int64)
     points[3, 1] = -4e27
-    with pytest.raises(InputError, match="coordinates beyond 1e[+]12"):
+    with pytest.raises(InputError, match=r"coordinates beyond 1e[+]12"):
         repair(Surface(points, triangles))
 
 
@@ -203,7 +207,8 @@ def test_a_mesh_opens_no_other_file(tmp_path, opened, kind):
 GLTF = (
     '{"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "buffers": [{"uri": "%s",'
     ' "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}], "accessors": [{"bufferView": 0,'
-    ' "componentType": 5126, "type": "VEC3", "count": 3}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}'
+    ' "componentType": 5126, "type": "VEC3", "count": 3}], "meshes": [{"primitives":'
+    ' [{"attributes": {"POSITION": 0}}]}]}'
 )
 
 
@@ -263,14 +268,16 @@ def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:
     numbers = base64.b64encode(header) + base64.b64encode(block * blocks)
     return (
         b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" compressor="vtk%sDataCompressor">'
-        b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points><DataArray type="Float32" Name="Points" '
+        b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points>'
+        b'<DataArray type="Float32" Name="Points" '
         b'NumberOfComponents="3" format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
         % (compressor.encode(), points * blocks, numbers)
     )
 
 
 def vtk(kind: str) -> bytes:
-    return f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET {kind}\nDIMENSIONS 330 330 330\nORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 1\n".encode()
+    header = f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET {kind}\nDIMENSIONS 330 330 330\n"
+    return (header + "ORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 1\n").encode()
 
 
 def shared_vtu(arrays: int) -> bytes:

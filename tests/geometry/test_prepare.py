@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import STEPS, prepare
+from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.registry import find
-from msmpetsc.geometry.surface import Surface, examine, read_surface
+from msmpetsc.geometry.surface import Surface, examine
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -113,14 +114,22 @@ def test_repair_and_orient_make_the_bunny_of_holes_solid():
 
 def test_repair_that_loses_the_body_is_refused():
     pytest.importorskip("pymeshfix")
-    with pytest.raises(InputError, match="'repair'.*area was left"):
+    with pytest.raises(InputError, match=r"'repair'.*area was left"):
         prepare(real("lung_parts.ply"), ["repair"])
 
 
-def test_repair_without_its_package_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymeshfix", None)
-    with pytest.raises(InputError, match=r"pip install msmpetsc\[repair\]"):
-        prepare(box(), ["repair"])
+@pytest.mark.parametrize(
+    ("step", "package", "extra"),
+    [
+        ("repair", "pymeshfix", "repair"),
+        ("union", "manifold3d", "mesh"),
+        ({"simplify": 8}, "fast_simplification", "mesh"),
+    ],
+)
+def test_a_step_without_its_package_says_what_to_install(monkeypatch, step: str | dict, package: str, extra: str):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"pip install msmpetsc\[{extra}\]"):
+        prepare(box(), [step])
 
 
 def test_simplify_reduces_and_stays_closed():
@@ -167,7 +176,7 @@ def test_orient_refuses_a_one_sided_surface():
     """A Möbius band of five triangles, each sharing two points with the next."""
     band = np.array([[i, (i + 1) % 5, (i + 2) % 5] for i in range(5)])
     points = np.random.default_rng(1).random((5, 3))
-    with pytest.raises(InputError, match="'orient'.*one side only"):
+    with pytest.raises(InputError, match=r"'orient'.*one side only"):
         prepare(Surface(points, band), ["orient"])
 
 

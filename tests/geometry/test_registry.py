@@ -20,8 +20,9 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import registry
 from msmpetsc.geometry.prepare import STEPS
-from msmpetsc.geometry.registry import MODELS, Download, Model, Packaged, fetch, load, locate
-from msmpetsc.geometry.surface import examine, read_surface
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.registry import MODELS, Download, NamedMesh, Packaged, fetch, load, locate
+from msmpetsc.geometry.surface import examine
 
 
 def sha256(content: bytes) -> str:
@@ -62,7 +63,7 @@ def toy(site, tmp_path, monkeypatch):
     monkeypatch.setenv("MSMPETSC_MESH_DIR", str(tmp_path / "meshes"))
     monkeypatch.setattr(registry.pooch, "os_cache", lambda project: tmp_path / "cache" / project)
     monkeypatch.syspath_prepend(tmp_path / "packages")
-    model = Model(
+    model = NamedMesh(
         copy="toybox.ply",
         copy_sha256=sha256(COPY),
         licence="free",
@@ -85,7 +86,7 @@ def install(folder: Path, content: bytes) -> Path:
 
 
 def test_the_copy_goes_before_the_fetched_before_the_package(toy):
-    with pytest.raises(InputError, match="^mesh 'toybox' is not here: msmpetsc fetch toybox$"):
+    with pytest.raises(InputError, match=r"^mesh 'toybox' is not here: msmpetsc fetch toybox$"):
         locate("toybox", toy)
     packaged = install(toy, ORIGINAL)
     assert locate("toybox", toy) == packaged and "toypackage" not in sys.modules
@@ -153,11 +154,11 @@ def test_a_fetched_file_is_checked(toy, site):
 def test_a_failed_connection_is_one_line(toy, site, monkeypatch, capfd):
     folder, _ = site
     (folder / "box.stl").unlink()
-    with pytest.raises(InputError, match="cannot fetch .*HTTP status 404.*toypackage"):
+    with pytest.raises(InputError, match=r"cannot fetch .*HTTP status 404.*toypackage"):
         fetch("toybox")
     closed = Download("http://127.0.0.1:9/box.stl", sha256(ORIGINAL))  # nothing answers there
     monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=(closed,)))
-    with pytest.raises(InputError, match="cannot fetch .*ConnectionError") as caught:
+    with pytest.raises(InputError, match=r"cannot fetch .*ConnectionError") as caught:
         fetch("toybox")
     assert "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
@@ -170,7 +171,7 @@ def test_paths_are_relative_to_the_scene(tmp_path):
     assert examine(load("mine.ply", tmp_path)).volume == pytest.approx(1)
     with pytest.raises(InputError, match="did you mean 'dragon'"):
         locate("dargon", tmp_path)
-    with pytest.raises(InputError, match="no file: .*none.ply"):
+    with pytest.raises(InputError, match=r"no file: .*none.ply"):
         locate("none.ply", tmp_path)
 
 

@@ -16,13 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.surface import (
-    Surface,
-    check_encloses,
-    examine,
-    first_of_equal,
-    read_surface,
-)
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface, check_encloses, examine, first_of_equal
 
 # name: points, triangles, boundary edges, non-manifold edges (from the notes that come with them)
 REAL = {

@@ -3,7 +3,7 @@
 import numpy as np
 
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 
 STILL = Motion.through(())
 

@@ -132,7 +132,7 @@ def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path:
             assert second is not first and second.ksp.getTolerances()[0] == 1e-8
             simulation.refuse_unused_options(at_end=True)
             database.setValue("ksp_tpye", "cg")
-            with capsys.disabled(), pytest.raises(InputError, match="-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout
+            with capsys.disabled(), pytest.raises(InputError, match=r"-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout
                 simulation.refuse_unused_options(at_end=True)
         assert database.getString("ksp_rtol") == "1e-8"
     finally:

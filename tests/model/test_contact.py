@@ -11,7 +11,7 @@ from obstacles import box, plane
 
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -114,8 +114,8 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
 def test_both_regimes_of_friction_are_among_the_cases():
     for name, holds in {"sticking": True, "slipping": False}.items():
         contact, q, _ = pressed(CASES[f"plane, {name}"])
-        apply_friction = contact.presses[0].apply_friction
-        assert ((apply_friction.slip(q)[1] < apply_friction.stick) == holds).all()
+        friction = contact.states[0].friction
+        assert ((friction.slip(q)[1] < friction.stick) == holds).all()
 
 
 def test_a_node_in_two_obstacles_gets_both():
@@ -146,7 +146,7 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
     """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at s = u/e < 1."""
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)  # 0.5 and 0.2 m/s
     start = np.array([[0.0, 0, -0.2]])
-    carried = start + [0.05, 0.02, 0]
+    carried = start + np.array([0.05, 0.02, 0])
     for stick, share in {2.0: 2 * 0.25 - 0.25**2, 0.5: 1.0, 0.01: 1.0}.items():  # e = 0.2, 0.05, 0.001
         contact = Contact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
         np.testing.assert_allclose(gradient(contact, carried), [[0, 0, -20]], atol=1e-12)
@@ -222,7 +222,7 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(msmpetsc, tmp_path: P
 def test_a_ground_of_a_thousand_springs_is_stood_on(tmp_path: Path, preset: str):
     """Whose push on y, in the first step, is more than 1e4 times the weight."""
     stiff, solver = GROUND | {"stiffness": 1400 * STIFFEST}, {"preset": preset, "error": 1e-3}
-    model, frames = play(grounded(tmp_path, [0, 0, -G], 20, 0.05, stiff, solver=solver))
+    _, frames = play(grounded(tmp_path, [0, 0, -G], 20, 0.05, stiff, solver=solver))
     depth = np.maximum(-frames[-1].position[:, 2], 0)
     assert 1400 * STIFFEST * depth.sum() == pytest.approx(MASS * G, rel=0.01)
 
@@ -328,14 +328,14 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
         v, v_plane = -0.3, 0.5
         np.testing.assert_allclose((after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)])
         np.testing.assert_array_equal((after[1], after_before[1]), (q[1], before[1]))
-    leaving = q + [0, 0, 0.06]  # 0.9 m/s up, faster than the plane: is not held back
+    leaving = q + np.array([0, 0, 0.06])  # 0.9 m/s up, faster than the plane: is not held back
     np.testing.assert_array_equal(Reflection(floor, 1.0).reflect(leaving[:1], before[:1], 0.5, T)[0], leaving[:1])
 
 
 def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
     cube = box([0, 0, 0], [1, 1, 1])
     q = np.array([[0.1, 0.5, 0.4], [0.5, 0.95, 0.5], [0.5, 0.5, -0.1]])
-    before = q + [[-0.2, 0.05, 0], [0, 0.1, 0.1], [0, 0, -0.1]]
+    before = q + np.array([[-0.2, 0.05, 0], [0, 0.1, 0.1], [0, 0, -0.1]])
     after, after_before = Reflection(cube, 1.0).reflect(q, before, 1.0, T)
     v = q - before
     np.testing.assert_allclose(after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15)

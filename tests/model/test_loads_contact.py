@@ -14,8 +14,7 @@ from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.lattice import build_lattice
-from msmpetsc.model.loads import Load, spread_by_mass
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Load, Motion, spread_by_mass
 from msmpetsc.model.region import inside
 from msmpetsc.scene.schema import Region
 

@@ -86,10 +86,10 @@ def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
 def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path, heard):
     twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
     with pytest.raises(
-        InputError, match="anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"
+        InputError, match=r"anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"
     ):
         build(tmp_path, anchor=twice)
-    with pytest.raises(InputError, match="anchor.0: of the 15 nodes in its region 15 are pinned: it leads none"):
+    with pytest.raises(InputError, match=r"anchor.0: of the 15 nodes in its region 15 are pinned: it leads none"):
         build(tmp_path, anchor=twice[:1], pin=[{"region": LEFT_HALF}])
     build(tmp_path, anchor=[twice[0], twice[0]])
     assert heard() == []  # both say the same of every node
@@ -100,7 +100,8 @@ def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):
     build(tmp_path, anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}], pin=[{"region": low_edge}])
     assert heard() == [
         ("WARNING", "anchor.0: of the 15 nodes in its region 1 is pinned, which it does not lead"),
-        ("WARNING", "anchor.1: of the 25 nodes in its region 5 are pinned and 4 are led by an anchor before it, which it does not lead"),
+        ("WARNING", "anchor.1: of the 25 nodes in its region 5 are pinned and 4 are led by an anchor before it, "
+                    "which it does not lead"),
     ]  # fmt: skip
 
 
@@ -120,7 +121,7 @@ def test_a_part_that_changes_nothing_is_warned_of(tmp_path, heard):
     assert heard() == [("WARNING", "part.0 has no effect: later parts give all that it gives, on all its 8 cells")]
     build(tmp_path, part=[stiffer, {"region": LEFT_HALF, "density": 700.0}])
     assert heard() == []  # its stiffness counts
-    with pytest.raises(InputError, match="part.0.region holds the centre of no cell"):
+    with pytest.raises(InputError, match=r"part.0.region holds the centre of no cell"):
         build(tmp_path, part=[part | {"region": {"box": [[5, 5, 5], [6, 6, 6]]}}])
 
 

@@ -1,4 +1,4 @@
-"""Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and what energy comes of it."""
+"""Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and the energy of both."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from msmpetsc.model.contact.obstacle import depths
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.environment import Environment
-from msmpetsc.model.paths import Path as Motion
+from msmpetsc.model.loads import Motion
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.energy_balance import Ledger
@@ -67,7 +67,7 @@ def test_a_plate_that_moves_past_a_node_meets_it_on_the_side_it_came_from():
     rising = box([-5, -5, 0], [5, 5, 0.001], RISING)
     node, beside = np.array([[0.0, 0, 0.2], [6.0, 0, 0.2]]), np.array([[0.0, 0, 0.2], [6.0, 0, 0.2]])
     assert rising.sides(node, beside, 0.005, 0.005).tolist() == [TOP, 0]
-    away = node + [0, 0, 0.9]  # faster than the plate
+    away = node + np.array([0, 0, 0.9])  # faster than the plate
     assert rising.sides(node, away, 0.005, 0.005).tolist() == [0, 0]
 
 
@@ -152,7 +152,7 @@ def test_no_node_gets_past_a_thin_plate(
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: str):
-    """A plate that moves and one at rest, the body seen from it: every place, with friction. Verlet's substeps differ."""
+    """A plate that moves and one at rest, the body seen from it: with friction. Verlet's substeps differ."""
     tables = {"solver": {"preset": "newton", "error": 1e-10}}
     positions = []
     for moving in (False, True):
@@ -175,8 +175,8 @@ def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
 
 @pytest.mark.parametrize("integrator", ["bdf2", "verlet"])
 def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path, integrator: str):
-    """One that pushes from below, one that reflects from the side and strikes the nodes of some ranks alone: places, and
-    the energy that is known of them. A third has nodes inside, which one rank tells, and not again when the run goes on.
+    """One pushes from below, one reflects from the side and strikes the nodes of some ranks alone: positions, and the
+    energy that is known of them. A third has nodes inside, which one rank reports, and not again on resuming.
     """
     time = {"step": 0.004, "duration": 0.06, "integrator": integrator}
     pushing = {"shape": "box", "box": [[-9, -9, -0.02], [9, 9, -0.019]], "response": "penalty", "friction": 0.3}
@@ -201,7 +201,7 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
     """As the test has it: the first step never is, its halves are."""
     path, alike, asked = (
         against_a_plate(tmp_path, "implicit-euler", "penalty", 20.0, False),
-        Environment.pushes_alike,
+        Environment.same_push,
         [],
     )
 
@@ -209,7 +209,7 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words_or_is_halved(tmp_pa
         asked.append(0)
         return len(asked) > MOST_SOLVES and alike(around, *given)
 
-    monkeypatch.setattr(Environment, "pushes_alike", stuck)
+    monkeypatch.setattr(Environment, "same_push", stuck)
     with pytest.raises(StepFailed, match=r"frame 1 \(t = 0.004 s\) has nodes that pass through .*; try a smaller"):
         play(path)
     asked.clear()

@@ -95,7 +95,8 @@ STUDY = '[[scene]]\nname = "a"\nfile = "scene.toml"\nset = ["{}"]\n[[sweep]]\nop
     "options",
     [
         "-pc_type python -pc_python_type evil.Solver", "-ksp_type python", "-dll_append evil.so", "-options_file x",
-        "-ksp_view :stolen.txt", "-log_view :x", "-o important.h5", "--overwrite", "-ksp_monitor", "-debug_terminal xterm",
+        "-ksp_view :stolen.txt", "-log_view :x", "-o important.h5", "--overwrite", "-ksp_monitor",
+        "-debug_terminal xterm",
         "-ksp_rtol ../x", "-on_error_attach_debugger", "-mat_view binary", "evil.py",
     ],
 )  # fmt: skip
@@ -109,7 +110,7 @@ def test_a_study_chooses_solvers_and_no_more(folder, options):
 
 def test_a_study_names_no_mesh_outside(folder):
     (folder / "study.toml").write_text(STUDY.format("mesh.source=../out.ply", "-pc_type jacobi -ksp_rtol 1e-2"))
-    with pytest.raises(InputError, match="mesh.source"):
+    with pytest.raises(InputError, match=r"mesh.source"):
         cases(load_study(folder / "study.toml"), folder, False)
 
 

@@ -218,7 +218,8 @@ MISTAKES = [
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
         "{ painted = [1, -2] }",
-        "pin.1.region.painted: must be a list of point numbers, from 0, or the name of a file that has them, got [1, -2]",
+        "pin.1.region.painted: must be a list of point numbers, from 0, or the name of a file that has them, "
+        "got [1, -2]",
     ),
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
@@ -326,7 +327,7 @@ def test_broken_toml_names_the_line(tmp_path):
 def test_no_file_a_folder_and_no_utf8(tmp_path):
     with pytest.raises(InputError, match=r"none\.toml: no such scene file$"):
         load_scene(tmp_path / "none.toml")
-    with pytest.raises(InputError, match="is a folder, not a scene file$"):
+    with pytest.raises(InputError, match=r"is a folder, not a scene file$"):
         load_scene(tmp_path)
     (tmp_path / "latin.toml").write_bytes('title = "für"'.encode("latin-1"))
     with pytest.raises(InputError, match=r"latin\.toml: is not UTF-8 text \(byte 10\)$"):

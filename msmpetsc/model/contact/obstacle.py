@@ -4,12 +4,16 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from mpi4py import MPI
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import greatest, like
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.model.paths import Path, within
-from msmpetsc.scene import schema as scene
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.model.loads import Motion, within
+from msmpetsc.model.locate import node_of_greatest
+from msmpetsc.scene.schema import ObstacleTable
 
+TOUCHING = 1e-6  # cells: no depth, but what was rounded
 OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
 ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
 
@@ -21,31 +25,32 @@ class Obstacle:
     points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side
     path            : how it moves
     start, stop     : it is there while start <= time < stop [s]; None: to the end
-    key             : of its table in the scene, for what is told
+    key             : of its table in the scene, for messages
     """
 
     points: np.ndarray
     normals: np.ndarray
-    path: Path
+    path: Motion
     start: float = 0.0
     stop: float | None = None
     key: str = "obstacle"
 
     @classmethod
-    def of(cls, told: scene.Obstacle, key: str = "obstacle") -> "Obstacle":
-        """The obstacle of a scene."""
-        if told.shape == "box":
-            points = np.repeat(np.array(told.box), 3, axis=0)  # the faces that meet at each of the two corners
+    def of(cls, table: ObstacleTable, key: str = "obstacle") -> "Obstacle":
+        """Return the obstacle of a scene's table."""
+        if table.shape == "box":
+            points = np.repeat(np.array(table.box), 3, axis=0)  # the faces that meet at each of the two corners
             normals = np.concatenate([-np.eye(3), np.eye(3)])
         else:
-            points, normals = np.array([told.point]), np.array([told.normal])
-        return cls(points, normals, Path.through(told.path), told.start, told.stop, key)
+            points, normals = np.array([table.point]), np.array([table.normal])
+        return cls(points, normals, Motion.through(table.path), table.start, table.stop, key)
 
     def acts_at(self, time: float) -> bool:
+        """Return whether the obstacle is there at a time [s]."""
         return within(time, self.start, self.stop)
 
     def points_at(self, time: float) -> np.ndarray:
-        """A point of each face (f, 3) [m] at a time."""
+        """Return a point of each face (f, 3) [m] at a time [s]."""
         return self.points + like(self.points, self.path.at(time)) if self.path.leads_away else self.points
 
     @property
@@ -56,26 +61,26 @@ class Obstacle:
     def sides(
         self, q: np.ndarray, end: np.ndarray, time: float, time_step: float, before: np.ndarray | None = None
     ) -> np.ndarray:
-        """``side_of`` nodes that move straight from q to ``end`` (n, 3) [m] in the step that ends at ``time``, (n,).
+        """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3) [m] in a step ending at ``time``.
 
-        before : (n,) those they had when it began. What the obstacle appears around is met by the face nearest to it.
+        before : (n,) the sides when it began. A node that the obstacle appears around gets the face nearest to it.
         """
-        found = no_sides(q)
+        sides = no_sides(q)
         if not self.acts_at(time):
-            return found
+            return sides
         begin = max(time - time_step, 0.0)
         if not self.acts_at(begin):
             q, begin = end, time
         _sides_of(
             len(q), q, end, self.points_at(begin), self.points_at(time), self.normals,
-            no_sides(q) if before is None else before, found,
+            no_sides(q) if before is None else before, sides,
         )  # fmt: skip
-        return found
+        return sides
 
 
 @numba.njit(cache=True)
 def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) -> float:
-    """How far x (3,) lies behind a face [m]; negative in front of it."""
+    """Return how far x (3,) lies behind a face [m]; negative in front of it."""
     distance = 0.0
     for c in range(3):
         distance -= normals[face, c] * (x[c] - points[face, c])
@@ -84,8 +89,10 @@ def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 
 @numba.njit(cache=True)
 def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> tuple[float, int]:
-    """How deep x (3,) lies behind the face of its ``side``, and that face; without a side, how deep in the solid [m],
-    and the face that is nearest; not positive outside."""
+    """Return how deep x (3,) lies behind the face of its ``side`` [m], and that face.
+
+    Without a side: how deep in the solid, not positive outside, and the nearest face.
+    """
     if side > 0:
         return behind(x, points, normals, side - 1), side - 1
     least, face = np.inf, 0
@@ -105,21 +112,23 @@ def _depth_of(first, count, step, q, points, normals, sides, least, face):
 def depths(
     q: np.ndarray, points: np.ndarray, normals: np.ndarray, sides: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``depth`` of positions (n, 3) with their ``sides`` (n,): (n,) [m], and the faces (n,)."""
+    """Return ``depth`` of positions (n, 3) with their ``sides`` (n,): depths (n,) [m] and faces (n,)."""
     least, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
     _depth_of(len(q), q, points, normals, no_sides(q) if sides is None else sides, least, face)
     return least, face
 
 
 def no_sides(q: np.ndarray) -> np.ndarray:
-    """Of nodes (n, 3) that are in contact with nothing, (n,)."""
+    """Return the sides (n,) of nodes (n, 3) that are in contact with nothing."""
     return np.zeros(len(q), np.int8, like=q)
 
 
 @numba.njit(cache=True)
 def _stays(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) -> bool:
-    """Whether x lies behind a face and has not slid off it past another, the opposite one aside: that of a thin plate
-    may be passed."""
+    """Return whether x lies behind a face and has not slid off it past another.
+
+    The opposite face is left aside: that of a thin plate may be passed.
+    """
     if behind(x, points, normals, face) <= 0.0:
         return False
     for f in range(len(points)):
@@ -135,7 +144,7 @@ def _stays(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 def side_of(
     x: np.ndarray, end: np.ndarray, points: np.ndarray, points_end: np.ndarray, normals: np.ndarray, side: int
 ) -> int:
-    """1 + the face by which a node is in contact on its straight way from x to ``end`` (3,), 0 if it meets none.
+    """Return 1 + the face by which a node is in contact on its straight way from x to ``end`` (3,), 0 if it meets none.
 
     points, points_end : (f, 3) where the faces are meanwhile; as seen from the solid, too, the way is straight
     side               : by which it was before: it keeps that until it is out of the solid
@@ -145,21 +154,44 @@ def side_of(
     inside, face = depth(x, points, normals, 0)
     if inside > 0.0:
         return face + 1
-    enter, leave, side = -1.0, 1.0, 0  # shares of the way
+    enter, leave, side = -1.0, 1.0, 0  # fractions of the way
     for f in range(len(points)):
-        here, there = behind(x, points, normals, f), behind(end, points_end, normals, f)
-        if here <= 0.0:
-            if there < 0.0 or there == here:
+        first, last = behind(x, points, normals, f), behind(end, points_end, normals, f)
+        if first <= 0.0:
+            if last < 0.0 or last == first:
                 return 0
-            share = here / (here - there)
-            if share > enter:
-                enter, side = share, f + 1
-        elif there <= 0.0:
-            leave = min(leave, here / (here - there))
+            crossing = first / (first - last)
+            if crossing > enter:
+                enter, side = crossing, f + 1
+        elif last <= 0.0:
+            leave = min(leave, first / (first - last))
     return side if enter <= leave + ROUNDED else 0
 
 
 @kernel
-def _sides_of(first, count, step, q, end, points, points_end, normals, sides, found):
+def _sides_of(first, count, step, q, end, points, points_end, normals, before, sides):
     for i in range(first, count, step):
-        found[i] = side_of(q[i], end[i], points, points_end, normals, sides[i])
+        sides[i] = side_of(q[i], end[i], points, points_end, normals, before[i])
+
+
+def describe_overlap(
+    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: np.ndarray, held: np.ndarray, time: float
+) -> str | None:
+    """Describe the free nodes that lie inside an obstacle as it stands at a time [s]; None if none does (collective).
+
+    A scene seldom means that, and what reflects leaves them inside.
+
+    q, held : (l, 3) [m]; (l,) bool, the nodes that are not free
+    """
+    owned = slice(lattice.owned)
+    inside, _ = depths(q[owned], obstacle.points_at(time), obstacle.normals)
+    rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~held[owned])
+    count = comm.allreduce(len(rows))
+    if not count:
+        return None
+    deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
+    nodes = f"{count} node{'s' if count > 1 else ''}"
+    worst = node_of_greatest(comm, lattice, rows, inside[rows])
+    return (
+        f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {worst}"
+    )

@@ -31,11 +31,11 @@ class Penalty:
     stick: float
 
     def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
-        """The obstacle at a time, without friction; ``sides`` (owned or more,) of the nodes."""
+        """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
         return ContactState(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
 
     def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
-        """The obstacle in the step that ends at ``time`` and starts from q (owned, 3) [m]."""
+        """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m]."""
         if self.friction == 0:
             return self.at(time, sides)
         points, normals = self.obstacle.points_at(time), self.obstacle.normals
@@ -44,16 +44,18 @@ class Penalty:
         nodes = np.flatnonzero(inside > 0)
         carried = q[nodes] + (points - before)[0]
         limit = self.friction * self.stiffness * inside[nodes]
-        apply_friction = Friction(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
-        return ContactState(points, normals, self.stiffness, apply_friction, sides)
+        friction = Friction(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
+        return ContactState(points, normals, self.stiffness, friction, sides)
 
 
 @dataclass(frozen=True)
 class Friction:
     """Friction of one step.
 
-    nodes (a,), normal (a, 3); carried (a, 3): where they are if they do not slip [m]; limit (a,): mu N [N];
-    stick: e [m]
+    nodes   : (a,) those in contact; normal (a, 3) of the faces
+    carried : (a, 3) where they are if they do not slip [m]
+    limit   : (a,) mu N [N]
+    stick   : e [m]
     """
 
     nodes: np.ndarray
@@ -63,13 +65,13 @@ class Friction:
     stick: float
 
     def slip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """u (a, 3) and its length (a,) [m]."""
+        """Return the slip u (a, 3) and its length (a,) [m]."""
         moved = q[self.nodes] - self.carried
         u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
         return u, np.linalg.norm(u, axis=1)
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
+        """Return mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
         (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
         moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
         longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
@@ -80,15 +82,16 @@ class Friction:
         return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
 
     def slope(self, u: np.ndarray) -> np.ndarray:
-        """f'(u) / u, (a,) [1/m]."""
+        """Return f'(u) / u, (a,) [1/m]."""
         return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        """Add the friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 
     def blocks(self, q: np.ndarray, true: bool) -> np.ndarray:
-        """mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
+        """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
         The second part is not positive; unless ``true`` it is left out, which is no less than the Hessian.
         """
@@ -104,21 +107,26 @@ class Friction:
 
 @dataclass(frozen=True)
 class ContactState:
-    """An obstacle where a step ends: points and normals of its faces (f, 3), stiffness [N/m], friction, if any, and by
-    which face each node came in (obstacle.side_of); None: the nearest."""
+    """An obstacle where a step ends.
+
+    points, normals : of its faces (f, 3)
+    stiffness       : [N/m] on each node
+    friction        : of the step, if any
+    sides           : (owned or more,) by which face each node came in (obstacle.side_of); None: the nearest
+    """
 
     points: np.ndarray
     normals: np.ndarray
     stiffness: float
-    apply_friction: Friction | None
+    friction: Friction | None
     sides: np.ndarray | None = None
 
     def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of positions (n, 3), and the faces that push, (n,) each."""
+        """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
         return depths(q, self.points, self.normals, self.sides)
 
     def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What kernels take: points, normals and the sides of positions (n, 3)."""
+        """Return what kernels take: points, normals and the sides of positions (n, 3)."""
         return self.points, self.normals, no_sides(q) if self.sides is None else self.sides
 
 
@@ -128,61 +136,62 @@ class Contact:
     Gradient and Hessian act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
     """
 
-    def __init__(self, presses: list[ContactState], owned: int):
-        self.presses, self.owned = presses, owned
+    def __init__(self, states: list[ContactState], owned: int):
+        self.states, self.owned = states, owned
 
     def energy(self, q: np.ndarray) -> float:
-        """Of the push alone, [J]: friction stores none."""
+        """Return the energy [J] of the push alone: friction stores none."""
         energy = 0.0
-        for press in self.presses:
-            inside = np.maximum(press.depths(q[: self.owned])[0], 0)
-            energy += 0.5 * press.stiffness * float(inside @ inside)
+        for state in self.states:
+            inside = np.maximum(state.depths(q[: self.owned])[0], 0)
+            energy += 0.5 * state.stiffness * float(inside @ inside)
         return energy
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """Energy at q less energy at base, friction included [J]."""
+        """Return the energy at q less that at base, friction included [J]."""
         total = 0.0
-        for press in self.presses:
+        for state in self.states:
             parts = np.empty(self.owned, like=q)
-            _change_of(self.owned, q, base, *press.faces(q), press.stiffness, parts)
+            _change_of(self.owned, q, base, *state.faces(q), state.stiffness, parts)
             total += float(parts.sum())
-            if press.apply_friction:
-                total += float(press.apply_friction.change(q, base))
+            if state.friction:
+                total += float(state.friction.change(q, base))
         return total
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
-        for press in self.presses:
-            _add_gradient_of(self.owned, q, *press.faces(q), press.stiffness, gradient)
-            if press.apply_friction:
-                press.apply_friction.add_gradient(q, gradient)
+        for state in self.states:
+            _add_gradient_of(self.owned, q, *state.faces(q), state.stiffness, gradient)
+            if state.friction:
+                state.friction.add_gradient(q, gradient)
 
     def hessian(self, q: np.ndarray, true: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Nodes in contact (a,), each once, and their blocks (a, 3, 3) [N/m], positive semidefinite: of each push and
-        each friction, the sum of which it is.
+        """Yield of each push and each friction the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
+
+        The Hessian is the sum of all; each block is positive semidefinite.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
             Hessian, nothing along a slip, would let nodes run to and fro
         """
-        for press in self.presses:
-            inside, face = press.depths(q[: self.owned])
+        for state in self.states:
+            inside, face = state.depths(q[: self.owned])
             pressed = np.flatnonzero(inside > 0)
-            yield pressed, press.stiffness * _squares(press.normals[face[pressed]])
-            if press.apply_friction:
-                yield press.apply_friction.nodes, press.apply_friction.blocks(q, true)
+            yield pressed, state.stiffness * _squares(state.normals[face[pressed]])
+            if state.friction:
+                yield state.friction.nodes, state.friction.blocks(q, true)
 
     def bound(self, q: np.ndarray) -> np.ndarray:
-        """(owned,) [N/m]: no less than each node's block, and constant while the same nodes are in contact."""
+        """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes are in contact."""
         bound = np.zeros(self.owned, like=q)
-        for press in self.presses:
-            bound += press.stiffness * (press.depths(q[: self.owned])[0] > 0)
-            if press.apply_friction:
-                bound[press.apply_friction.nodes] += 2 * press.apply_friction.limit / press.apply_friction.stick
+        for state in self.states:
+            bound += state.stiffness * (state.depths(q[: self.owned])[0] > 0)
+            if state.friction:
+                bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
         return bound
 
 
 def _squares(vectors: np.ndarray) -> np.ndarray:
-    """v v^T of each (a, 3), (a, 3, 3)."""
+    """Return v v^T of each of the vectors (a, 3), (a, 3, 3)."""
     return vectors[:, :, None] * vectors[:, None, :]
 
 
@@ -232,16 +241,19 @@ def _friction_of(first, count, step, rows, q, points, normals, sides, carried, i
 def apply_friction(
     rows: np.ndarray,
     q: np.ndarray,
-    press: ContactState,
+    state: ContactState,
     carried: np.ndarray,
     impulse: float,
     per_mass: np.ndarray,
     v: np.ndarray,
 ) -> None:
-    """Coulomb friction as a change of velocity: at the rows that are inside, v along the face, as seen from an obstacle
-    that moves at ``carried`` (3,) [m/s], falls by no more than the friction's impulse a mass, mu N dt / m, and not
-    below nothing: so what holds does not creep, however long the substep.
+    """Apply Coulomb friction as a change of velocity to the rows that are inside.
 
-    impulse : mu k dt [kg/s], times the depth the impulse
+    v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s], falls by no more than
+    the friction's impulse a mass, mu N dt / m, and not below nothing: so what holds does not creep, however long the
+    substep.
+
+    impulse  : mu k dt [kg/s], times the depth the impulse
+    per_mass : (n,) [1/kg]
     """
-    _friction_of(len(rows), rows, q, *press.faces(q), carried, impulse, per_mass, v)
+    _friction_of(len(rows), rows, q, *state.faces(q), carried, impulse, per_mass, v)

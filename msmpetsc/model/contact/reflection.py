@@ -29,7 +29,7 @@ class Reflection:
         time_step: float,
         sides: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """q_n and q_(n-1) after contact at ``time`` [s], that of q_n; (n, 3) [m] each.
+        """Return q_n and q_(n-1) after contact at ``time`` [s], that of q_n; (n, 3) [m] each.
 
         Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
         the obstacle, goes on into it, the normal part of q_n goes back by that of v_n, which becomes -e times itself.
@@ -42,13 +42,13 @@ class Reflection:
             return q, q_previous
         if sides is None and self.obstacle.has_sides:
             sides = self.obstacle.sides(q_previous, q, time, time_step)
-        at, normal = self._behind(q, time, sides)
-        if len(at) == 0:
+        rows, normal = self._behind(q, time, sides)
+        if len(rows) == 0:
             return q, q_previous
-        back = np.minimum(self._speed(q[at] - q_previous[at], normal, time, time_step), 0)[:, None] * normal
+        back = np.minimum(self._speed(q[rows] - q_previous[rows], normal, time, time_step), 0)[:, None] * normal
         q, q_previous = q.copy(), q_previous.copy()
-        q[at] -= back
-        q_previous[at] += self.restitution * back
+        q[rows] -= back
+        q_previous[rows] += self.restitution * back
         return q, q_previous
 
     def turn(
@@ -60,34 +60,40 @@ class Reflection:
         time_step: float,
         sides: np.ndarray,
     ) -> np.ndarray:
-        """q_(n-1) (n, 3) [m] so that velocities are reversed but nodes stay where they are, behind the face until they
-        have gone back through it: no spring is stretched, no energy comes in.
+        """Return q_(n-1) (n, 3) [m] so that velocities are reversed but nodes stay where they are.
+
+        They are behind the face until they have gone back through it: no spring is stretched, no energy comes in.
 
         a : (n, 3) [m] acceleration times t^2. Where that presses a node on, half of it is the least way back in a step,
             or the node would sink in with e < 1; but no node leaves faster than it came.
         """
         if not self.obstacle.acts_at(time):
             return q_previous
-        at, normal = self._behind(q, time, sides)
-        if len(at) == 0:
+        rows, normal = self._behind(q, time, sides)
+        if len(rows) == 0:
             return q_previous
-        speed = np.minimum(self._speed(q[at] - q_previous[at], normal, time, time_step), 0)
-        least = np.maximum(-0.5 * (a[at] * normal).sum(axis=1), 0)
+        speed = np.minimum(self._speed(q[rows] - q_previous[rows], normal, time, time_step), 0)
+        least = np.maximum(-0.5 * (a[rows] * normal).sum(axis=1), 0)
         away = np.minimum(-speed, np.maximum(-self.restitution * speed, least))
         q_previous = q_previous.copy()
-        q_previous[at] += (speed - away)[:, None] * normal
+        q_previous[rows] += (speed - away)[:, None] * normal
         return q_previous
 
     def _behind(self, q: np.ndarray, time: float, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """The nodes (k,) on or behind the faces that they met, and these faces' normals (k, 3)."""
+        """Return the nodes (k,) on or behind the faces of their ``sides``, and these faces' normals (k, 3)."""
         obstacle = self.obstacle
         inside, face = depths(q, obstacle.points_at(time), obstacle.normals, sides)
-        behind = (inside >= 0) & (sides > 0) if obstacle.has_sides else inside >= 0
-        at = np.flatnonzero(behind)
-        return at, obstacle.normals[face[at]]
+        behind = inside >= 0
+        if sides is not None and obstacle.has_sides:
+            behind &= sides > 0
+        rows = np.flatnonzero(behind)
+        return rows, obstacle.normals[face[rows]]
 
     def _speed(self, v: np.ndarray, normal: np.ndarray, time: float, time_step: float) -> np.ndarray:
-        """Of displacements v (k, 3) [m] in a step the part along the normals, as seen from the obstacle, (k,) [m]."""
+        """Return the part along the normals of displacements v (k, 3) [m] in a step, (k,) [m].
+
+        They are as seen from the obstacle.
+        """
         path = self.obstacle.path
         if path.leads_away:
             v = v - like(v, path.at(time) - path.at(time - time_step))

@@ -43,7 +43,7 @@ class ContactFaces:
 
     def _crossed(self, end: np.ndarray) -> np.ndarray:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
-        return self.environment.met(self.q, end, self.time, self.time_step, self.before, self.fixed)
+        return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
 
     def problem(self) -> StepProblem:
         """The step with the faces as they are known now."""
@@ -74,5 +74,5 @@ class ContactFaces:
         """Whether penalties press on any node at x otherwise with ``sides``."""
         if not (self.environment.has_sides and self.environment.penalties):
             return False
-        alike = self.environment.pushes_alike(x, self.time, self.sides, sides)
+        alike = self.environment.same_push(x, self.time, self.sides, sides)
         return self.comm.allreduce(not alike, MPI.LOR)

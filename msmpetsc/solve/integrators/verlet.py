@@ -157,7 +157,7 @@ class Verlet:
     def _meet(self, state: State, time: float) -> None:
         """The sides of a state."""
         before = None if state.sides is None else state.sides[:, : self.lattice.owned]
-        self.sides = self.environment.met(self.q, self.q, time, 0.0, before, self.fixed)
+        self.sides = self.environment.contact_faces(self.q, self.q, time, 0.0, before, self.fixed)
 
     def _take(self, count: int, start: float, time: float) -> None:
         """All substeps of a step."""
@@ -167,7 +167,7 @@ class Verlet:
         for begin, end in pairwise(times):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
-            self.work += self.environment.appearing(self.q, begin, end, self.sides)
+            self.work += self.environment.energy_of_new_obstacles(self.q, begin, end, self.sides)
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
@@ -223,7 +223,7 @@ class Verlet:
         then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
-        self.sides = self.environment.met(self.before, self.q, end, end - begin, self.sides, self.fixed)
+        self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
         after, before, work = self.environment.reflect(self.q, self.before, end, end - begin, self.fixed, self.sides)
         self.work += work
         if after is not self.q:
@@ -246,7 +246,8 @@ class Verlet:
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
         pushed = (
-            self.environment.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
+            self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)[self.free]
+            * self.per_mass[self.free]
         )
         return self.comm.allreduce(greatest(pushed), MPI.MAX)
 

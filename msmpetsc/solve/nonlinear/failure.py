@@ -7,7 +7,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.locate import inside_out, place_of_greatest
+from msmpetsc.model.locate import describe_inverted, node_of_greatest
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
 if TYPE_CHECKING:
@@ -54,5 +54,5 @@ def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
 def _worst(functional: StepFunctional, iterate: Iterate) -> str:
     """Words on where F pulls farthest, and what is inside out (collective)."""
     comm, lattice = functional.comm, functional.lattice
-    worst = place_of_greatest(comm, lattice, *functional.pull(iterate.f))
-    return f", worst at {worst}{inside_out(comm, lattice, iterate.q)}"
+    worst = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
+    return f", worst at {worst}{describe_inverted(comm, lattice, iterate.q)}"

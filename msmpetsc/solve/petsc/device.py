@@ -43,7 +43,7 @@ def sender(comm: MPI.Comm) -> Callable[[np.ndarray], np.ndarray]:
         lacking = what_is_missing()
         if lacking:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
-    cuda.take_one(PETSc.COMM_WORLD.rank)
+    cuda.use_device(PETSc.COMM_WORLD.rank)
     if AWARE not in PETSc.Options().getAll() and not _mpi_knows_gpus():
         # PETSc has read its options: this is where it keeps the answer. With another it stops at the first device use.
         ctypes.c_bool.in_dll(petsc_library(), AWARE).value = False

@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
 def try_all(args: argparse.Namespace, target: float) -> list:
     """The trials, each told of when it is done."""
     from msmpetsc.solve.presets import PRESETS
-    from msmpetsc.study.measure import Bench
     from msmpetsc.study.plan import Planner
     from msmpetsc.study.process import Processes
+    from msmpetsc.study.runner import Bench
 
     signal.signal(signal.SIGTERM, stop)
     processes = Processes()
@@ -97,7 +97,7 @@ def tell_what_was_reached(trials: Sequence, target: float) -> None:
 
 def tell_answer(args: argparse.Namespace, best) -> None:
     """Lines to paste and a command that says the same, or the file changed."""
-    from msmpetsc.study.case import launcher
+    from msmpetsc.study.cases import launcher
     from msmpetsc.study.scene_lines import lines, overrides, put_into
 
     print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")

@@ -25,11 +25,10 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.partition import Shares
 from msmpetsc.scene.schema import Scene
-from msmpetsc.study.case import Case
-from msmpetsc.study.measure import Bench
-from msmpetsc.study.metrics import Row
-from msmpetsc.study.overrides import content, inline
+from msmpetsc.study.cases import Case, digest, inline
 from msmpetsc.study.process import Processes
+from msmpetsc.study.runner import Bench
+from msmpetsc.study.table import Row
 
 COARSE, FINE = 1000, 20_000  # cells of the two runs, at most
 LONGEST = 300.0  # [s] a run
@@ -190,7 +189,7 @@ def forecast(
 
 def _known(file: Path, options: str, scene: Scene, frames: int) -> Path:
     """Where the figures of these runs on this processor are kept."""
-    what = [content(file, scene), scene.text, options, frames, __version__, _processor(), COARSE, FINE]
+    what = [digest(file, scene), scene.text, options, frames, __version__, _processor(), COARSE, FINE]
     name = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:16]
     return Path(pooch.os_cache("msmpetsc")) / "trials" / f"{name}.json"
 
@@ -234,6 +233,6 @@ def _case(file: Path, changes: Sequence[str], options: str, scene: Scene, mesh: 
         f"time.duration={min(frames, time.steps) * time.step!r}", "output.surface=false", "output.every=1",
     )  # fmt: skip
     return Case(
-        scene.title or file.stem, file, "", all_changes, time.integrator, "", options, cells, time.step, None, None,
-        None, timeout=LONGEST,
+        scene=scene.title or file.stem, file=file, content="", set=all_changes, integrator=time.integrator,
+        options=options, cells=cells, time_step=time.step, timeout=LONGEST,
     )  # fmt: skip

@@ -13,14 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
-from msmpetsc.study.charts.cells import curves
+from msmpetsc.study.charts.cells import curves, figure6_charts, growth_charts, is_cholesky
 from msmpetsc.study.charts.convergence import convergence_charts
-from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
-from msmpetsc.study.charts.growth import growth_charts
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts, winners
-from msmpetsc.study.charts.style import looks
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, winners
+from msmpetsc.study.charts.style import curve_styles
 from msmpetsc.study.report import write_report
-from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, succeeded, typed
+from msmpetsc.study.table import NUMBERS, TEXT, read_table, records, succeeded, typed
 
 VOID = {"meta", "br"}  # elements of HTML that need no end
 
@@ -43,10 +41,6 @@ def write_table(folder: Path, rows: list[dict[str, str]], columns: tuple[str, ..
     return folder
 
 
-def typed_rows(*rows: dict[str, str]) -> list:
-    return [typed(row) for row in rows]
-
-
 ERRORS = [
     case("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
     case("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
@@ -61,7 +55,7 @@ SWEEP = [
         ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
         ("cg", "anderson", (0.02, 0.09, 0.5), 40),
     )
-    for n, time in zip((1000, 10000, 100000), times)
+    for n, time in zip((1000, 10000, 100000), times, strict=True)
 ]
 TRACES = [
     {
@@ -141,21 +135,21 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
-    rows = typed_rows(*(case("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))))
-    assert [row["time_frame"] for row in front_rows(rows, STEP)] == [3, 1]
+    rows = typed(case("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3)))
+    assert list(front_rows(rows, STEP)["time_frame"]) == [3, 1]
 
 
 # What the charts show
 
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
-    rows = succeeded(typed_rows(*ERRORS))
-    assert [(row["label"], row["error"]) for row in (cheapest(rows, STEP, e) for e in (1e-1, 5e-3, 1e-4))] == [
+    rows = succeeded(typed(ERRORS))
+    assert [(row["label"], row["error"]) for row in (winners(rows, STEP, e)[0] for e in (1e-1, 5e-3, 1e-4))] == [
         ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
     ]  # fmt: skip
-    assert cheapest(rows, STEP, 1e-6) is None
-    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    assert winners(rows, STEP, 1e-6) == []
+    assert winners(rows, TRAJECTORY, 0.2)[0]["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
     assert step[3] == "1e-6 or less: nothing measured reaches it."
@@ -176,11 +170,11 @@ NOISY = [  # of those that reach 1e-2 the first overlaps with two others, not wi
 
 
 def test_the_cheapest_names_all_within_its_noise():
-    rows = succeeded(typed_rows(*NOISY))
+    rows = succeeded(typed(NOISY))
     assert [row["label"] for row in winners(rows, STEP, 1e-2)] == ["newton", "pipecg", "anderson"]
     assert [row["label"] for row in winners(rows, STEP, 1e-3)] == ["anderson", "lbfgs"]
     assert winners(rows, STEP, 1e-6) == []
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert step[1] == (
         "1e-2 or less: newton, 10 ms [9 ms to 21 ms] a frame (reached 4e-3); "
@@ -191,9 +185,9 @@ def test_the_cheapest_names_all_within_its_noise():
 
 
 def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_path: Path, text: str):
-    rows = succeeded(typed_rows(*ERRORS))
+    rows = succeeded(typed(ERRORS))
     assert [row["label"] for row in winners(rows, STEP, 1e-1)] == ["anderson"]
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     unknown = "Each was run once: how much its time varies is not known"
     assert all(lines[-1].startswith(unknown) for lines in chart.findings.values())
     assert f"<dt>Repeats</dt><dd>1. {unknown}" in text
@@ -202,11 +196,16 @@ def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = typed_rows(
-        *NOISY,
-        *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm") for n, t in ((10, 0.1), (99, 1.0))),
+    rows = typed(
+        [
+            *NOISY,
+            *(
+                repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm")
+                for n, t in ((10, 0.1), (99, 1.0))
+            ),
+        ]
     )
-    named = looks(row["label"] for row in rows)
+    named = curve_styles(rows["label"])
     (pareto,), (figure6,), (growth,) = (
         pareto_charts(rows, named),
         figure6_charts(rows, named),
@@ -234,7 +233,7 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     assert "least of the repeats: 9 ms\ngreatest of the repeats: 21 ms" in spaced(
         str(next(iter(pareto.points["over the step error, time step 10\N{NO-BREAK SPACE}ms"].values()))[0])
     )
-    once = pareto_charts(typed_rows(*ERRORS), looks(row["label"] for row in ERRORS))[0]
+    once = pareto_charts(typed(ERRORS), curve_styles(row["label"] for row in ERRORS))[0]
     assert not any(whiskers(axes) for axes in once.figure.axes)
 
 
@@ -251,14 +250,14 @@ def test_within_the_noise_nothing_overtakes(ends: tuple[float, float], expected:
         repeated("cholesky", 0.009, 0.01, 0.02, scene="bunny", cells=1000, preset="fast-msm"),
         *(repeated("cg", ends[0], 0.5, ends[1], scene="bunny", cells=n) for n in (1000, 100000)),
     ]
-    (chart,) = figure6_charts(typed_rows(*rows), looks(["cholesky", "cg"]))
+    (chart,) = figure6_charts(typed(rows), curve_styles(["cholesky", "cg"]))
     ((line,),) = chart.findings.values()
     assert line.startswith(expected)
 
 
 def test_what_failed_is_listed_and_counts_nowhere():
-    rows = typed_rows(*ERRORS)
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    rows = typed(ERRORS)
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     assert [row["label"] for row in chart.failed] == ["paper"]
     shown = {point.label for groups in chart.points.values() for group in groups.values() for point in group}
     assert shown == {"newton", "anderson", "verlet"}
@@ -266,8 +265,8 @@ def test_what_failed_is_listed_and_counts_nowhere():
 
 def test_only_equal_time_steps_are_compared_by_the_step_error():
     longer = case("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
-    rows = typed_rows(*ERRORS, longer)
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    rows = typed([*ERRORS, longer])
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     panels = chart.points.items()
     shown = {spaced(panel): {p.label for group in groups.values() for p in group} for panel, groups in panels}
     assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
@@ -285,9 +284,12 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
 )
 def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
     counts = (1000, 10000, 100000)
-    cg = [case("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4) for n, time in zip(counts, times)]
-    rows = typed_rows(*SWEEP[:3], *cg)
-    (chart,) = figure6_charts(rows, looks(["cholesky", "cg"]))
+    cg = [
+        case("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4)
+        for n, time in zip(counts, times, strict=True)
+    ]
+    rows = typed([*SWEEP[:3], *cg])
+    (chart,) = figure6_charts(rows, curve_styles(["cholesky", "cg"]))
     ((line,),) = chart.findings.values()
     assert line.startswith(expected)
 
@@ -302,20 +304,21 @@ def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
     ],
 )
 def test_what_counts_as_cholesky(preset: str, options: str, expected: bool):
-    assert is_cholesky(typed({"preset": preset, "options": options})) is expected
+    (row,) = records(typed([{"preset": preset, "options": options}]))
+    assert is_cholesky(row) is expected
 
 
 def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = typed_rows(*(case("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000)))
-    assert {name: [row["cells"] for row in rows] for name, rows in curves(rows).items()} == {
+    rows = typed(case("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000))
+    assert {name: list(rows["cells"]) for name, rows in curves(rows).items()} == {
         "cg, error 1e-2": [1000, 2000],
         "cg, error 1e-4": [1000, 2000],
     }
 
 
 def test_every_method_has_its_own_look():
-    assert len(set(looks(map(str, range(40))).values())) == 40
-    assert looks(["a", "b", "a"])["b"] == looks(["a", "b"])["b"]
+    assert len(set(curve_styles(map(str, range(40))).values())) == 40
+    assert curve_styles(["a", "b", "a"])["b"] == curve_styles(["a", "b"])["b"]
 
 
 # The page
@@ -396,12 +399,12 @@ def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
 
 def test_a_table_without_some_columns_is_read(tmp_path: Path):
     write_table(tmp_path, ERRORS, ("label", "status", "command"))
-    assert read_rows(tmp_path)[0]["true_error"] is None
+    assert records(read_table(tmp_path))[0]["true_error"] is None
     assert "newton" in write_report(tmp_path).read_text()
 
 
 def test_a_folder_without_a_table_is_named(tmp_path: Path):
-    with pytest.raises(InputError, match="no table.csv"):
+    with pytest.raises(InputError, match=r"no table\.csv"):
         write_report(tmp_path)
 
 
@@ -410,7 +413,7 @@ def test_of_several_traces_of_a_method_the_furthest_is_shown():
         return {"scene": "a", "label": "b", "trace": {"iteration": [0, 1], "seconds": [0, 1], "position_error": errors}}
 
     traces = [entry(0.5, 0.1), entry(0.5, 1e-6), entry(0.5, 1e-3)]
-    (chart,) = convergence_charts(traces, looks(["b"]), {})
+    (chart,) = convergence_charts(traces, curve_styles(["b"]), {})
     points = chart.points["over the iterations"].values()
     assert [[point.numbers["step error"][1] for point in group] for group in points] == [[0.5, 1e-6]]
 

@@ -36,6 +36,7 @@ from msmpetsc.model.to_device import placed
 from msmpetsc.output.writer import finished, open_result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.presets import find_preset
@@ -168,17 +169,17 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
     stepper = Stepper(MPI.COMM_SELF, model.lattice, time_step, find_preset("newton"))
     stepper.set_up()
     q = model.lattice.nodes * 1.01  # stretched, so that the Hessian is positive
-    stepper.functional.begin(q, q, np.zeros((model.lattice.owned, 3), like=q), None, None)
-    stepper.hessian.linearise(q, None)
-    stepper.operator.assemble()
-    three = ThreeColumns(stepper.matrix, stepper.unknowns)
-    x, y, elasticity = stepper.x, stepper.f, stepper.elasticity
+    stepper.functional.begin(StepProblem(q, q, np.zeros((model.lattice.owned, 3), like=q)))
+    stepper.jacobian.hessian.linearise(q, None)
+    stepper.jacobian.operator.assemble()
+    three = ThreeColumns(stepper.jacobian.matrix, stepper.unknowns)
+    x, y, elasticity = stepper.x, stepper.work, stepper.functional.elasticity
     stepper.unknowns.from_nodes(np.sin(40 * q), x)
     pc, gradient = stepper.ksp.getPC(), np.zeros_like(q)
     found = {
         "gradient": seconds_of(lambda: elasticity.add_gradient(q, gradient)),
         "change of energy": seconds_of(lambda: elasticity.change(q, q)),
-        "Hessian product": seconds_of(lambda: stepper.operator.mult(x, y)),
+        "Hessian product": seconds_of(lambda: stepper.jacobian.operator.mult(x, y)),
         "A, by PETSc": seconds_of(lambda: three.mult(None, x, y)),
         "preconditioner": seconds_of(lambda: pc.apply(x, y)),
         "CG iteration": iteration(stepper),
@@ -188,7 +189,7 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
         around = elasticity.springs
         tables = around.other, around.stiffness
         found["A, by a kernel"] = seconds_of(lambda: laplacian_around(len(q), q, *tables, gradient))
-        product = stepper.hessian.mult
+        product = stepper.jacobian.hessian.mult
         found["Hessian product in a graph"] = in_a_graph(lambda: product(None, x, y))
     three.destroy(None)
     stepper.destroy()
@@ -207,7 +208,7 @@ def iteration(stepper: Stepper) -> float:
     ksp.setTolerances(rtol=1e-300, atol=1e-300, max_it=ITERATIONS)
     right = stepper.x.duplicate()
     stepper.x.copy(right)
-    found = seconds_of(lambda: ksp.solve(right, stepper.f), 3)
+    found = seconds_of(lambda: ksp.solve(right, stepper.work), 3)
     its = ksp.getIterationNumber()
     right.destroy()
     return found / its

@@ -167,7 +167,7 @@ def measured_in(path: Path, number: int) -> dict:
     from msmpetsc.errors import InputError, StepFailed
     from msmpetsc.model.build import build_model
     from msmpetsc.scene.reading import load_scene
-    from msmpetsc.solve.instrumentation import Measured
+    from msmpetsc.solve.instrumentation import Probes
     from msmpetsc.solve.simulate import Simulation
 
     logging.disable(logging.WARNING)
@@ -177,7 +177,7 @@ def measured_in(path: Path, number: int) -> dict:
     signal.alarm(SECONDS)
     try:
         model = build_model(MPI.COMM_SELF, scene)
-        with Simulation(MPI.COMM_SELF, scene, model, Measured(true_error=1)) as simulation:
+        with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
             for frame in simulation.frames():
                 if frame.index:
                     steps.append([float(frame.step_error), float(frame.true_error), int(frame.ksp_its)])

@@ -21,6 +21,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
 
@@ -190,7 +191,7 @@ def steps(
     stepper = Stepper(COMM, lattice, t, find_preset(preset), error=error)
     try:
         for load in loads:
-            q, before = stepper.step(q, 2 * q - before, load).position, q
+            q, before = stepper.step(StepProblem(q, 2 * q - before, load)).position, q
             yield q, before
     finally:
         stepper.destroy()

@@ -36,7 +36,7 @@ from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
-    from msmpetsc.solve.instrumentation import Measured
+    from msmpetsc.solve.instrumentation import Probes
 
 
 def add_parser(commands: argparse._SubParsersAction) -> None:
@@ -200,16 +200,16 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     return 0
 
 
-def what_is_measured(args: argparse.Namespace) -> "Measured":
+def what_is_measured(args: argparse.Namespace) -> "Probes":
     """Raises InputError for numbers of steps that are none."""
-    from msmpetsc.solve.instrumentation import Measured, begin_timing
+    from msmpetsc.solve.instrumentation import Probes, begin_timing
 
     refuse_below_one(args, "true_error", "trace")
     if args.trace is not None and args.measure is None:
         raise InputError("--trace needs --measure, the file that it is written to")
     if args.measure:
         begin_timing()
-    return Measured(args.true_error, args.trace)
+    return Probes(args.true_error, args.trace)
 
 
 def refuse_steps_beyond(steps: int, args: argparse.Namespace, taken: int) -> None:

@@ -1,6 +1,6 @@
 """All that the next step depends on beside the scene: saved and restored, a run goes on as if it had never stopped.
 
-Each part of a run that remembers something has ``save`` and ``restore``. What PETSc's solvers remember is not
+Each part of a run that remembers something has ``save`` and ``restore``, and names what it stores. What PETSc's solvers remember is not
 among it: they begin each step anew (solve.nonlinear.step).
 """
 
@@ -26,6 +26,13 @@ class Checkpoint:
     step: int = 0
     rows: dict[str, np.ndarray] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
+
+    def keep(self, rows: dict[str, np.ndarray] | None = None, numbers: dict[str, float] | None = None) -> None:
+        """Store a part's rows and numbers; no two parts may store one name."""
+        for kept, given in ((self.rows, rows or {}), (self.numbers, numbers or {})):
+            if twice := kept.keys() & given.keys():
+                raise ValueError(f"two parts of a checkpoint store {', '.join(sorted(twice))}")
+            kept.update(given)
 
     def row(self, name: str) -> np.ndarray:
         """Raises InputError where there is none."""

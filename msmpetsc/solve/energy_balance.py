@@ -38,7 +38,11 @@ FLOOR = 1e-10  # of the energy that presses every spring to a point: what roundi
 
 @dataclass(frozen=True)
 class Energies:
-    """Of one time; kinetic of all nodes, ``free`` of those that are no one's to move [J], momentum (3,) [kg m/s]."""
+    """Energies at one time [J].
+
+    kinetic  : of all nodes; ``free`` of those that nothing prescribes
+    momentum : (3,) [kg m/s]
+    """
 
     kinetic: float
     free: float
@@ -49,14 +53,20 @@ class Energies:
 
     @property
     def inner(self) -> float:
+        """All but the potential of loads [J]."""
         return self.free + self.elastic + self.contact
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """put_in: the most that the body had by right; gained: from nowhere, and not lost since, negative where a swing may
-    give back; steady: the same without a known swing; last: in the last step; bounced: what nodes gained that bounced off
-    its end [J]."""
+    """Energies that a run keeps account of [J].
+
+    put_in  : the most that the body had by right
+    gained  : from nowhere, and not lost since; negative where a swing may give back
+    steady  : the same without a known swing
+    last    : gained in the last step
+    bounced : what nodes gained that bounced off its end
+    """
 
     put_in: float = 0.0
     gained: float = 0.0
@@ -66,12 +76,17 @@ class Ledger:
 
     @property
     def share(self) -> float:
-        """Of all energy, what came from nowhere."""
+        """Share of all energy that came from nowhere."""
         return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
 
 
 class EnergyBalance:
-    """Keeps the ledger of a run. swings: whether the integrator's energy does."""
+    """Examiner of a run's steps, who keeps its ledger.
+
+    swings   : whether the integrator's energy does
+    energies : of the last step's result
+    gained   : from nowhere [J], since the frame stored before
+    """
 
     def __init__(
         self,
@@ -82,42 +97,65 @@ class EnergyBalance:
         swings: bool = False,
     ):
         self.credit = CREDIT if swings else 0.0
-        self.comm, self.lattice, self.around, self.elasticity = comm, lattice, environment, elasticity
-        self.ledger, self.known = Ledger(), None
+        self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
+        self.ledger, self.gained = Ledger(), 0.0
+        self.energies: Energies | None = None
+        self.known: tuple[np.ndarray, float] | None = (
+            None  # positions that the last step ended at, their elastic energy [J]
+        )
         springs = slice(lattice.springs_owned)
         self.floor = FLOOR * comm.allreduce(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
-    def energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray) -> Energies:
-        """Of positions (l, 3) [m] and velocities (l, 3) [m/s] as things stand at ``time``, sides too (collective)."""
-        lattice, around = self.lattice, self.around
+    def start(self, state: State, time_step: float) -> None:
+        """Know the energies of the state that a run begins with (collective)."""
+        self.energies = self._energies(state.q, state.velocity(time_step), 0.0, state.sides)
+
+    def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray) -> Energies:
+        """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
+        lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        at, contact, v = q[owned], around.push(time, sides), v[owned]
-        momenta, free = lattice.mass[:, None] * v, ~around.fixed_at(time)[owned]
+        at, contact, v = q[owned], environment.push(time, sides), v[owned]
+        momenta, free = lattice.mass[:, None] * v, ~environment.fixed_at(time)[owned]
         sums = self._sums(
             0.5 * np.vdot(momenta, v),
             0.5 * np.vdot(momenta * free[:, None], v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
-            -np.vdot(around.load(time), at),
+            -np.vdot(environment.load(time), at),
             *momenta.sum(axis=0),
         )
-        return Energies(*sums[:5], sums[5:])
+        return Energies(
+            **dict(zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)),
+            momentum=sums[5:],
+        )
 
-    def check(
-        self, before: State, result: StepResult, after: State, time: float, time_step: float
-    ) -> tuple[Energies, Energies, Ledger]:
-        """Energies of a step's result and of the state ``after`` it, and the ledger with that (collective).
+    def examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> None:
+        """Examine a step from ``before`` to ``after`` that ended at ``time``, and take it into the ledger (collective).
 
         Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
         """
         v = (result.position - result.previous) / time_step
-        solved = ended = self.energies(result.position, v, time, after.sides)
+        solved = ended = self._energies(result.position, v, time, after.sides)
         if not np.isfinite(solved.kinetic + solved.inner):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
         bounces = self._bounces(result, after)
         if bounces:
-            ended = self.energies(after.q, after.velocity(time_step), time, after.sides)
-        start, pushed, work, struck, swing = self._start(before, result, after, time, time_step)
+            ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
+        sums = self._start(before, result, after, time, time_step)
+        ledger = self._entered(solved, ended, sums, bounces)
+        if ledger.gained > MOST * ledger.put_in:
+            raise StepFailed(
+                f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
+                f"{self._worst(v)}{inside_out(self.comm, self.lattice, result.position)}; "
+                'try a smaller solver.error (or more iterations), a smaller time.step, or safety.on_failure = "fallback"',
+                "energy",
+            )
+        self.energies, self.known, self.ledger = solved, (after.q, ended.elastic), ledger
+        self.gained += ledger.last
+
+    def _entered(self, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
+        """The ledger with a step; sums (5,) of _start."""
+        start, pushed, work, struck, swing = sums
         ledger = self.ledger
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
@@ -125,52 +163,43 @@ class EnergyBalance:
         put_in = max(put_in, solved.inner - max(ledger.gained + gained, 0.0))
         least = -self.credit * put_in
         steady = max(least, ledger.steady + gained - swing)
-        ledger = Ledger(put_in, max(least, ledger.gained + gained), steady, gained, bounced)
-        if ledger.gained > MOST * put_in:
-            raise StepFailed(
-                f"gained {ledger.gained:.2e} J from nowhere, of {put_in:.2e} J that were there: "
-                f"{self._worst(v)}{inside_out(self.comm, self.lattice, result.position)}; "
-                'try a smaller solver.error (or more iterations), a smaller time.step, or safety.on_failure = "fallback"',
-                "energy",
-            )
-        return solved, ended, ledger
+        return Ledger(put_in, max(least, ledger.gained + gained), steady, gained, bounced)
 
-    def keep(self, ended: Energies, ledger: Ledger, after: State) -> None:
-        """The step is taken."""
-        self.known, self.ledger = (after.q, ended.elastic), ledger
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store the ledger."""
+        checkpoint.keep(numbers={**vars(self.ledger), "energy_gained": self.gained})
 
-    def save(self, saved: Checkpoint) -> None:
-        saved.numbers |= vars(self.ledger)
-
-    def restore(self, saved: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
         most = np.finfo(float).max
-        self.ledger = Ledger(**{name: saved.number(name, 0.0, -most, most) for name in vars(Ledger())})
+        self.ledger = Ledger(**{name: checkpoint.number(name, 0.0, -most, most) for name in vars(Ledger())})
+        self.gained = checkpoint.numbers.get("energy_gained", 0.0)
 
     def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""
-        if not self.around.reflections:
+        if not self.environment.reflections:
             return False
         own = after.q is not result.position or after.q_previous is not result.previous
         return self.comm.allreduce(own, MPI.LOR)
 
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> np.ndarray:
-        """Of the right side of the balance the energies, and the push in them, the work of loads and of obstacles that
-        drag, and that which the step counted itself; and its swing [J] (collective)."""
-        lattice, around = self.lattice, self.around
+        """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of obstacles
+        that drag, and that which the step counted itself; and its swing (collective)."""
+        lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
-        prescribed = around.prescribed(before.q, time)
+        prescribed = environment.prescribed(before.q, time)
         q, v = before.q if prescribed is None else prescribed, before.velocity(time_step)[owned]
-        free = ~around.fixed_at(time)[owned]
+        free = ~environment.fixed_at(time)[owned]
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
-        contact = around.push(when, sides)
-        sides = around.no_sides if sides is None else sides
+        contact = environment.push(when, sides)
+        sides = environment.no_sides if sides is None else sides
         known = self.known is not None and q is self.known[0]
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
-            np.vdot(around.load(time), result.position[owned] - q[owned])
-            + around.dragged((q[owned], sides), (result.position[owned], after.sides), time, time_step),
+            np.vdot(environment.load(time), result.position[owned] - q[owned])
+            + environment.dragged((q[owned], sides), (result.position[owned], after.sides), time, time_step),
             result.work,
             result.swing,
         )
@@ -178,7 +207,7 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: float) -> np.ndarray:
-        """Over all ranks; the values may be on a GPU."""
+        """Sums over all ranks; the values may be on a GPU."""
         return self.comm.allreduce(np.array([float(value) for value in values]))
 
     def _worst(self, vectors: np.ndarray) -> str:

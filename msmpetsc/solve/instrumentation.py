@@ -1,4 +1,4 @@
-"""What is measured of a run beside its frames: true errors, the way of one step, where the time went."""
+"""Measurements of a run beside its frames: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -13,8 +13,8 @@ EVENTS = {"factor": "PCSetUp", "local": LOCAL_EVENT, "ksp": "KSPSolve"}
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What a run is asked for.
+class Probes:
+    """Probes of a run's steps.
 
     true_error : every so many steps the true error is measured; None for never
     trace      : the step whose iterates are followed; None for none
@@ -24,12 +24,13 @@ class Measured:
     trace: int | None = None
 
     def asks(self, index: int) -> bool:
+        """Whether the true error of a step is to be measured."""
         return index == self.trace or (self.true_error is not None and index % self.true_error == 0)
 
 
 @dataclass
 class Trace:
-    """The iterates of a step: at each its number, the KSP iterations and seconds so far, positions (l, 3) [m]."""
+    """Iterates of a step: at each its number, the KSP iterations and seconds so far, positions (l, 3) [m]."""
 
     iteration: list[int] = field(default_factory=list)
     ksp_its: list[int] = field(default_factory=list)
@@ -37,28 +38,28 @@ class Trace:
     positions: list[np.ndarray] = field(default_factory=list)
 
     def follow(self, stepper: Stepper) -> None:
-        """From now on, which is when the step begins."""
+        """Take the iterates from now on, which is when the step begins."""
         begin, before = perf_counter(), stepper.all_its()
 
-        def observe(stepper: Stepper) -> None:
+        def observe(q: np.ndarray) -> None:
             nonlocal begin
             now = perf_counter()
             self.iteration.append(len(self.iteration))
             self.ksp_its.append(stepper.all_its() - before)
             self.seconds.append(now - begin)
-            self.positions.append(stepper.functional.q.copy())
+            self.positions.append(q)
             begin += perf_counter() - now  # not of the step
 
         stepper.observer = observe
 
-    def told(self, index: int, errors: np.ndarray) -> dict:
-        """As plain lists, with the errors (k, 2) of the iterates."""
+    def as_lists(self, index: int, errors: np.ndarray) -> dict:
+        """The trace as plain lists, with the errors (k, 2) of the iterates."""
         lists = {"iteration": self.iteration, "ksp_its": self.ksp_its, "seconds": self.seconds}
         return {"frame": index, **lists, "position_error": errors[:, 0].tolist(), "energy_error": errors[:, 1].tolist()}
 
 
 def begin_timing() -> None:
-    """PETSc's events are timed from here on."""
+    """Have PETSc time its events from here on."""
     PETSc.Log.begin()
 
 

@@ -1,5 +1,5 @@
-"""What is looked for in each frame and said once: cells inside out, steps that ended far from their solution, energy
-that came from nowhere, nodes inside an obstacle that comes to be there."""
+"""Monitors of a run, which warn once: of cells inside out, steps that ended far from their solution, energy that came
+from nowhere, and nodes inside an obstacle that comes to be there."""
 
 import numpy as np
 from mpi4py import MPI
@@ -12,11 +12,12 @@ from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import inverted
 from msmpetsc.solve.energy_balance import MUCH, Ledger
 
+COUNTS = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")  # in checkpoints
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 
 
-class Watch:
-    """Of one run. All ranks tell the same, rank 0 is heard."""
+class Monitors:
+    """Monitors of one run. All ranks warn alike, rank 0 is heard."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
@@ -24,19 +25,19 @@ class Watch:
         self.worst_error = self.worst_gain = 0.0
 
     def inverted(self, index: int, time: float, q: np.ndarray) -> int:
-        """The number of cells inside out at q (l, 3) [m] (collective)."""
-        self.now, place = inverted(self.comm, self.lattice, q)
+        """Count the cells inside out at q (l, 3) [m] (collective)."""
+        self.now, position = inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
             log.warning(
                 "frame %d (t = %.6g s): %d cell%s inside out, the worst %s; %s",
-                index, time, self.now, "s are" if self.now > 1 else " is", place, self._remedy(),
+                index, time, self.now, "s are" if self.now > 1 else " is", position, self._remedy(),
             )  # fmt: skip
         self.frames += self.now > 0
         self.most = max(self.most, self.now)
         return self.now
 
     def error(self, index: int, time: float, error: float) -> None:
-        """The estimated error of a frame's steps."""
+        """Take note of the estimated error of a frame's steps."""
         if not error <= FAR:
             if not self.far:
                 off = (
@@ -52,19 +53,19 @@ class Watch:
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
-    def overlaps(self, index: int, around: Environment, q: np.ndarray, time: float, time_step: float) -> None:
-        """Where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
-        new = [o for o in around.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
+    def overlaps(self, index: int, environment: Environment, q: np.ndarray, time: float, time_step: float) -> None:
+        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
+        new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
-            found = overlap(self.comm, self.lattice, obstacle, q, around.fixed_at(time), time)
-            if found:
+            overlapping = overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
+            if overlapping:
                 log.warning(
                     "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",
-                    index, time, found,
+                    index, time, overlapping,
                 )  # fmt: skip
 
     def gain(self, index: int, time: float, ledger: Ledger) -> None:
-        """What the body has from nowhere after a step."""
+        """Take note of what the body has from nowhere after a step."""
         if not ledger.share <= MUCH:
             if not self.gaining:
                 log.warning(
@@ -75,18 +76,20 @@ class Watch:
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)
 
-    def save(self, saved: Checkpoint) -> None:
-        saved.numbers |= {"frames_inverted": self.frames, "most_inverted": self.most, "now_inverted": self.now}
-        saved.numbers |= {"frames_far": self.far, "worst_error": self.worst_error}
-        saved.numbers |= {"frames_gaining": self.gaining, "worst_gain": self.worst_gain}
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what was seen so far."""
+        counts = dict(zip(COUNTS, (self.frames, self.most, self.now, self.far, self.gaining), strict=True))
+        checkpoint.keep(numbers={**counts, "worst_error": self.worst_error, "worst_gain": self.worst_gain})
 
-    def restore(self, saved: Checkpoint) -> None:
-        names = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")
-        self.frames, self.most, self.now, self.far, self.gaining = (saved.count(name) for name in names)
-        self.worst_error, self.worst_gain = (saved.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain"))
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
+        self.frames, self.most, self.now, self.far, self.gaining = map(checkpoint.count, COUNTS)
+        self.worst_error, self.worst_gain = (
+            checkpoint.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain")
+        )
 
     def sum_up(self) -> None:
-        """At the end of a run: how often it was."""
+        """Say at the end of a run how often it was."""
         if self.frames:
             left = f"{self.now} still are" if self.now else "none is at the end"
             log.warning("cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left)

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, nearest
-from msmpetsc.solve.petsc.errors import refusal
+from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.library import Integer, library_file, open_viewer, petsc_library
 from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
 
@@ -81,7 +81,9 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
     for prefix, (preset, budget) in solvers.items():
         names, objects = set_defaults(preset, prefix, budget), []
         try:
-            with refusal("PETSc refuses its options", others=Exception):  # of what it is to load, a Python file maybe
+            with petsc_errors(
+                "PETSc refuses its options", others=Exception
+            ):  # of what it is to load, a Python file maybe
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
                     objects.append(kind().create(PETSc.COMM_SELF))
                     objects[-1].setOptionsPrefix(prefix)
@@ -153,7 +155,7 @@ def _check_what_is_read_at_the_end(given: dict[str, str]) -> None:
     checks |= {name: open_viewer for name in VIEWERS_READ_AT_THE_END}
     for name in sorted(checks.keys() & {name for name, value in given.items() if value}):
         try:
-            with refusal(f"-{name} {given[name]}"):
+            with petsc_errors(f"-{name} {given[name]}"):
                 checks[name](name)
         except InputError:
             PETSc.Options().delValue(name)  # for PETSc ends now, too

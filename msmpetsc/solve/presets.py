@@ -225,8 +225,42 @@ def _quoted(value: str | None) -> str:
 
 
 def forget_defaults(names: set[str]) -> None:
-    """Take them out again: another preset may follow, and -options_left is to show the user's own."""
+    """Take options out again: another preset may follow, and -options_left is to show the user's own."""
     in_use.subtract(names)
     for name in names:
         if not in_use[name]:
             PETSc.Options().delValue(name)
+
+
+class SolverOptions:
+    """A preset's options in PETSc's database while its solver lives.
+
+    prefix : of the solver's options
+    names  : of those that are the preset's own, prefix included
+    """
+
+    def __init__(self, preset: Preset, prefix: str, budget: int):
+        self.prefix, self.names = prefix, set_defaults(preset, prefix, budget)
+        self.hidden: dict[str, str | None] = {}
+
+    def hide(self, name: str) -> None:
+        """Keep an option of the user's from all objects that are made from now on."""
+        database = PETSc.Options()
+        if self.prefix + name in database.getAll():
+            self.hidden[self.prefix + name] = database.getAll()[self.prefix + name]
+            database.delValue(self.prefix + name)
+
+    def is_default(self, name: str) -> bool:
+        """Whether an option is the preset's own, not the user's."""
+        return self.prefix + name in self.names
+
+    def is_given(self, name: str) -> bool:
+        """Whether an option stands in the database, the user's or the preset's."""
+        return self.prefix + name in PETSc.Options().getAll()
+
+    def withdraw(self) -> None:
+        """Leave the database as the user has it."""
+        for name, value in self.hidden.items():
+            PETSc.Options().setValue(name, value)
+            PETSc.Options().getString(name)  # it has been of use
+        forget_defaults(self.names)

@@ -3,17 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from mpi4py import MPI
-
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.environment import Environment
-from msmpetsc.scene import schema as scene
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
+from msmpetsc.scene.schema import Scene, Solver, Time
+from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.nonlinear.step import StepResult
 
 DEEPEST = 10  # halvings: 1024 pieces of a step
@@ -21,12 +17,12 @@ ROBUST = "newton-projected"
 PREFIX = "fallback_"  # of the PETSc options of that
 WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
 
-Attempt = Callable[[ImplicitEuler | Verlet, State, float, float], tuple[StepResult, State]]
+MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # the string: prefix of its PETSc options
 
 
 @dataclass
-class Done:
-    """About one step: shorter steps taken in its place, whether the robust method solved it, and what it all cost."""
+class StepCost:
+    """Cost of one step: shorter steps taken in its place, whether the robust method solved it, and what all that took."""
 
     substeps: int = 0
     fallbacks: int = 0
@@ -35,23 +31,26 @@ class Done:
     ksp_its: int = 0
 
     def add(self, result: StepResult) -> None:
+        """Count one more solve."""
         self.error = max(self.error, result.error)
         self.iterations += result.iterations
         self.ksp_its += result.ksp_its
 
 
-class Rescue:
-    """Of one run. Solvers are made when they are needed, and kept while they are.
+class Recovery:
+    """Recovers the failed steps of one run. Integrators are made when they are needed, and kept while they are.
 
-    attempt : (integrator, state, time, time step) -> result and state of a step that ends at ``time``, or StepFailed
+    make    : makes an integrator
+    balance : examines each step that one takes
     """
 
-    def __init__(self, comm: MPI.Comm, model: Model, environment: Environment, wanted: scene.Scene, attempt: Attempt):
-        self.comm, self.model, self.around, self.scene, self.attempt = comm, model, environment, wanted, attempt
-        self.on_failure, self.time_step = wanted.safety.on_failure, wanted.time.step
-        self.spare: dict[int, ImplicitEuler | Verlet] = {}  # by how often the step is halved
-        self.rescued = 0  # steps
+    def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance):
+        self.time, self.solver, self.make, self.balance = scene.time, scene.solver, make, balance
+        self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
+        self.spare: dict[int, Integrator] = {}  # by how often the step is halved
+        self.recovered = 0  # steps
         self.level = 0  # that the next step begins with: a hard moment is seldom over at once
+        self.deepest = 0  # level of the step in progress
 
     @property
     def is_on(self) -> bool:
@@ -63,87 +62,90 @@ class Rescue:
         """Prefixes of PETSc options that may still be used."""
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
-    def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State, Done]:
-        """The step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises StepFailed."""
-        if self.on_failure == "stop":
+    def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State, StepCost]:
+        """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises StepFailed."""
+        if failure and self.on_failure == "stop":
             raise failure
-        if not self.rescued:
-            told = str(failure).split("; try ")[0]
-            log.warning("t = %.6g s: the step %s: it is %s", time, told, WORDS[self.on_failure])
-        self.rescued += 1
+        if not self.recovered:
+            reason = str(failure).split("; try ")[0]
+            log.warning("t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure])
+        self.recovered += 1
         for integrator in self.spare.values():
             integrator.forget()  # so that a checkpoint need not remember them
-        done = Done()
+        cost = StepCost()
         if self.on_failure == "fallback":
-            result, after = self._take(0, state, time, done)
-            done.fallbacks = 1
+            result, after = self._take(0, state, time, cost)
+            cost.fallbacks = 1
         else:
-            result, after = self._in_pieces(state, time, max(self.level, 1) if failure else self.level, done)
-        result = replace(result, error=done.error, iterations=done.iterations, ksp_its=done.ksp_its)
-        return result, after, done
+            result, after = self._in_pieces(state, time, max(self.level, 1) if failure else self.level, cost)
+        result = replace(result, error=cost.error, iterations=cost.iterations, ksp_its=cost.ksp_its)
+        return result, after, cost
 
-    def save(self, saved: Checkpoint) -> None:
-        saved.numbers |= {"level": self.level, "rescued": self.rescued}
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next step depends on."""
+        checkpoint.keep(numbers={"level": self.level, "rescued": self.recovered})
 
-    def restore(self, saved: Checkpoint) -> None:
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
         if self.on_failure == "substep":
-            self.level = saved.count("level", DEEPEST)
+            self.level = checkpoint.count("level", DEEPEST)
         if self.on_failure != "stop":  # else it was another scene that asked for it
-            self.rescued = saved.count("rescued")
+            self.recovered = checkpoint.count("rescued")
 
     def sum_up(self) -> None:
-        """At the end of a run: how often it was."""
-        if self.rescued:
-            log.warning("%d step%s %s", self.rescued, "s were" if self.rescued > 1 else " was", WORDS[self.on_failure])
+        """Say at the end of a run how many steps were recovered."""
+        if self.recovered:
+            were = "s were" if self.recovered > 1 else " was"
+            log.warning("%d step%s %s", self.recovered, were, WORDS[self.on_failure])
 
-    def _in_pieces(self, state: State, time: float, level: int, done: Done) -> tuple[StepResult, State]:
-        """All of a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
+    def _in_pieces(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:
+        """Take a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
         self.deepest = level
         pieces, start = 2**level, time - self.time_step
         for piece in range(1, pieces + 1):
-            result, state = self._piece(state, start + piece * self.time_step / pieces, level, done)
+            result, state = self._piece(state, start + piece * self.time_step / pieces, level, cost)
         self.level = self.deepest if self.deepest > level else level - 1
         if self.level == 0:
-            self._forget()
+            self.destroy()
         return result, state
 
-    def _piece(self, state: State, time: float, level: int, done: Done) -> tuple[StepResult, State]:
+    def _piece(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:
         self.deepest = max(self.deepest, level)
         try:
-            result, after = self._take(level, state, time, done)
-            done.substeps += 1
+            result, after = self._take(level, state, time, cost)
+            cost.substeps += 1
             return result, after
         except StepFailed as failure:
             if level == DEEPEST:
                 raise StepFailed(f"{failure} (and failed in {2**level} pieces)", failure.kind) from None
         half = self.time_step / 2 ** (level + 1)
-        _, state = self._piece(state, time - half, level + 1, done)
-        return self._piece(state, time, level + 1, done)
+        _, state = self._piece(state, time - half, level + 1, cost)
+        return self._piece(state, time, level + 1, cost)
 
-    def _take(self, level: int, state: State, time: float, done: Done) -> tuple[StepResult, State]:
-        """One step of t / 2^level; states outside are of steps of t."""
+    def _take(self, level: int, state: State, time: float, cost: StepCost) -> tuple[StepResult, State]:
+        """Take one step of t / 2^level; states outside are of steps of t."""
         short = self.time_step / 2**level
         if level not in self.spare:
             self.spare[level] = self._new(short)
             self.spare[level].set_up()
-        result, after = self.attempt(self.spare[level], state.over(self.time_step, short), time, short)
-        done.add(result)
-        result = replace(
-            result, previous=State(result.position, result.previous).over(short, self.time_step).q_previous
-        )
-        return result, after.over(short, self.time_step)
+        before = state.over(self.time_step, short)
+        result, after = self.spare[level].advance(before, time)
+        self.balance.examine(before, result, after, time, short)
+        cost.add(result)
+        previous = State(result.position, result.previous).over(short, self.time_step).q_previous
+        return replace(result, previous=previous), after.over(short, self.time_step)
 
-    def _new(self, short: float) -> ImplicitEuler | Verlet:
-        time, solver = self.scene.time.model_copy(update={"step": short}), self.scene.solver
-        if self.on_failure == "fallback":
-            solver = scene.Solver(preset=ROBUST, error=solver.error)
-            return ImplicitEuler(self.comm, self.model, self.around, time, solver, prefix=PREFIX)
-        kind = Verlet if time.integrator == "verlet" else ImplicitEuler
-        return kind(self.comm, self.model, self.around, time, solver)
+    def _new(self, short: float) -> Integrator:
+        """Another integrator: implicit Euler's, or Verlet's where that is the scene's and its steps become shorter."""
+        is_fallback = self.on_failure == "fallback"
+        name = "verlet" if self.time.integrator == "verlet" and not is_fallback else "implicit-euler"
+        time = self.time.model_copy(update={"step": short, "integrator": name})
+        if is_fallback:
+            return self.make(time, Solver(preset=ROBUST, error=self.solver.error), PREFIX)
+        return self.make(time, self.solver, "")
 
-    def _forget(self) -> None:
+    def destroy(self) -> None:
+        """Destroy the integrators (collective)."""
         for integrator in self.spare.values():
             integrator.destroy()
         self.spare.clear()
-
-    destroy = _forget  # collective

@@ -31,7 +31,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.model.frame import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.simulate import Simulation
 
@@ -99,7 +99,7 @@ def real() -> Iterator[None]:
 on_a_gpu = pytest.mark.parametrize("on_gpu", [pretended, pytest.param(real, marks=pytest.mark.cuda)])
 
 
-def play(path: Path, measured: Measured = Measured()) -> list[Frame]:
+def play(path: Path, measured: Probes = Probes()) -> list[Frame]:
     scene = load_scene(path)
     with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), measured) as simulation:
         return list(simulation.frames())
@@ -143,9 +143,9 @@ def test_multigrid_may_share_its_matrix_with_our_products(tmp_path: Path, on_gpu
 @on_a_gpu
 def test_true_errors_are_measured_there(tmp_path: Path, on_gpu):
     path = block_scene(tmp_path, **{**FALL, **HELD, "solver": {"preset": "newton", "error": 1e-2}})
-    here = play(path, Measured(true_error=4))
+    here = play(path, Probes(true_error=4))
     with on_gpu():
-        there = play(path, Measured(true_error=4))
+        there = play(path, Probes(true_error=4))
     errors = [[frame.true_error for frame in frames if frame.index % 4 == 0 < frame.index] for frames in (there, here)]
     assert min(errors[1]) > 0 and max(errors[1]) < 1e-2
     np.testing.assert_allclose(*errors, rtol=1e-3)

@@ -13,6 +13,7 @@ from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.paths import Path as Motion
 from msmpetsc.scene.schema import Keyframe
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 
@@ -315,7 +316,7 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
     def one_step(name: str, error: float):
         stepper = Stepper(MPI.COMM_SELF, lattice, PRESS_T, find_preset(name), error, touches=True)
         try:
-            return stepper.step(q, 2 * q - before, load, contact)
+            return stepper.step(StepProblem(q, 2 * q - before, load, contact))
         finally:
             stepper.destroy()
 

@@ -22,6 +22,7 @@ from msmpetsc.model.inversion import (
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.material import edge_stiffness
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 
@@ -210,7 +211,7 @@ def after_many_steps(lattice: Lattice, start: np.ndarray, steps: int = 150) -> n
     q = before = start
     try:
         for _ in range(steps):
-            q, before = stepper.step(q, 2 * q - before, np.zeros_like(q)).position, q
+            q, before = stepper.step(StepProblem(q, 2 * q - before, np.zeros_like(q))).position, q
     finally:
         stepper.destroy()
     return q
@@ -245,7 +246,7 @@ def squeezed_step(preset: str, height: float, error: float) -> tuple[np.ndarray,
     q = (lattice.nodes - lattice.nodes.mean(axis=0)) * [1, 1, height] + shake
     stepper = Stepper(COMM, lattice, T, find_preset(preset), error)
     try:
-        result = stepper.step(q, q, np.zeros_like(q))
+        result = stepper.step(StepProblem(q, q, np.zeros_like(q)))
     finally:
         stepper.destroy()
     return result.position, result.error, lattice, q

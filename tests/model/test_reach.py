@@ -19,7 +19,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body
 from msmpetsc.model.reach import Reach
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.integrators.implicit import ImplicitEuler
 
 TIME = {"step": 0.01, "duration": 0.1}
 LEFT, LEFT_HALF = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}, {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]}  # 15, 45 of 75 nodes
@@ -221,17 +221,17 @@ def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):
         tmp_path, time={"step": 0.01, "duration": 0.04}, gravity={"acceleration": [0, 0, -G]}, pin=[{"region": LEFT}]
     )
     path = tmp_path / "x.h5"
-    step = Simulation._step
+    advance = ImplicitEuler.advance
 
-    def failing(simulation, index):
-        if index == 3:
-            raise StepFailed("planted", frame=3)
-        return step(simulation, index)
+    def failing(integrator, state, time):
+        if time > 0.025:
+            raise StepFailed("planted")
+        return advance(integrator, state, time)
 
-    monkeypatch.setattr(Simulation, "_step", failing)
+    monkeypatch.setattr(ImplicitEuler, "advance", failing)
     assert main(["run", str(scene), "-o", str(path)]) == 3
     *_, took, left, error = capsys.readouterr().err.splitlines()
-    assert "took " in took and f"left 3 frames in {path} (" in left and error == "msmpetsc: error: planted"
+    assert "took " in took and f"left 3 frames in {path} (" in left and error == "msmpetsc: error: frame 3 (t = 0.03 s) planted"
 
 
 COMPILES = """

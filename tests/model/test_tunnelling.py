@@ -23,7 +23,7 @@ from msmpetsc.model.paths import Path as Motion
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.energy_balance import Ledger
-from msmpetsc.solve.integrators.implicit import MOST_SOLVES
+from msmpetsc.solve.integrators.contact_faces import MOST_SOLVES
 from msmpetsc.solve.simulate import Simulation
 
 INTEGRATORS = ["implicit-euler", "bdf2", "verlet"]

@@ -25,6 +25,7 @@ from msmpetsc.model.build import build_model
 from msmpetsc.output.restart import Earlier
 from msmpetsc.output.writer import finished
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import Simulation
 
@@ -415,14 +416,14 @@ def test_what_cannot_be_resumed_is_told(given, capsys, monkeypatch, tmp_path):
 def test_a_run_that_failed_goes_on_from_there(whole: Path, tmp_path, monkeypatch):
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
-        step = Simulation._step
+        advance = ImplicitEuler.advance
 
-        def failing(simulation, index):
-            if index == 20:
+        def failing(integrator, state, time):
+            if np.isclose(time, 20 * integrator.time_step):
                 raise StepFailed("did not converge")
-            return step(simulation, index)
+            return advance(integrator, state, time)
 
-        patch.setattr(Simulation, "_step", failing)
+        patch.setattr(ImplicitEuler, "advance", failing)
         assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--true-error", "3"]) == 3
     assert main(["run", "--resume", str(path)]) == 0
     assert_same(path, whole)

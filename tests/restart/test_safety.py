@@ -11,6 +11,7 @@ from block_scene import CELL, block_scene, play
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.frame import Frame
 from msmpetsc.solve import recovery
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 
 STEP, STEPS = 1 / 60, 6
@@ -38,7 +39,7 @@ class Failing:
 
         def failing(stepper: Stepper, *given, **named):
             self.count += 1
-            self.prefixes.append(stepper.prefix)
+            self.prefixes.append(stepper.options.prefix)
             if self.count in self.calls:
                 raise StepFailed("did not converge: as the test has it; try nothing", "line search")
             return step(stepper, *given, **named)
@@ -75,11 +76,11 @@ class Overshooting:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, share: float):
         step = Stepper.step
 
-        def overshooting(stepper: Stepper, q: np.ndarray, y: np.ndarray, *given, **named):
-            result = step(stepper, q, y, *given, **named)
-            if stepper.prefix or not np.isclose(stepper.t2, STEP**2):
+        def overshooting(stepper: Stepper, problem: StepProblem, *given, **named):
+            result = step(stepper, problem, *given, **named)
+            if stepper.options.prefix or not np.isclose(stepper.functional.t2, STEP**2):
                 return result
-            return replace(result, position=result.position + share * (result.position - y))
+            return replace(result, position=result.position + share * (result.position - problem.y))
 
         monkeypatch.setattr(Stepper, "step", overshooting)
 
@@ -205,7 +206,7 @@ def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: py
 
 
 def test_off_makes_no_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recovery.Rescue, "_new", lambda *_: pytest.fail("a spare solver was made"))
+    monkeypatch.setattr(recovery.Recovery, "_new", lambda *_: pytest.fail("a spare solver was made"))
     for way in ("stop", "substep", "fallback"):
         play(beam(tmp_path), f"safety.on_failure={way}")
 

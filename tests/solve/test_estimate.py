@@ -14,8 +14,9 @@ from test_step import COMM, T, beam, swing, weight
 
 from msmpetsc.model.build import build_model
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Measured
-from msmpetsc.solve.nonlinear.reference import Problem, Reference
+from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.reference import Reference
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 from msmpetsc.solve.simulate import Simulation
@@ -50,12 +51,12 @@ def test_the_estimate_is_within_three_of_the_true_error(tmp_path: Path, name: st
     )
     model = build_model(MPI.COMM_SELF, scene)
     ratios, estimated = [], []
-    with Simulation(MPI.COMM_SELF, scene, model, Measured(true_error=1)) as simulation:
+    with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
         stepper = simulation.integrator.stepper
         for frame in simulation.frames():
             if frame.index and frame.true_error > 1e-9:
                 ratios.append(frame.step_error / frame.true_error)
-                estimated.append(stepper.corrected)
+                estimated.append(stepper.control.now.corrected)
     ratios, estimated = np.array(ratios), np.array(estimated)
     assert estimated.sum() >= 5 and (ratios[estimated] < 3).all() and (ratios > 1 / 3).all()
 
@@ -71,11 +72,11 @@ def test_g_falls_at_every_iteration_of_plain_and_line_searched_methods(preset: s
     stepper, values = Stepper(COMM, lattice, T, find_preset(preset), error=1e-6), []
     y = 2 * q - before
 
-    def observe(stepper: Stepper) -> None:
-        values.append(stepper.functional.change(stepper.snes.getSolution(), y)[0])
+    def observe(positions: np.ndarray) -> None:
+        values.append(stepper.functional.change(positions, y)[0])
 
     stepper.observer = observe
-    stepper.step(q, 2 * q - before, weight(lattice))
+    stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
     stepper.destroy()
     falls = np.diff(values)
     assert len(values) > 2 and (falls <= 1e-12 * abs(values[-1])).all() and values[-1] < 0
@@ -92,7 +93,7 @@ def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     y = 2 * 1.3 - 1.25
     exact = (m * y + T**2 * k * r) / (m + T**2 * k)
     found = [np.array([[0.0, 0, 0], [0, 0, exact + e * (y - exact)]]) for e in (1.0, 0.5, -0.01)]
-    errors = reference.errors(Problem(q, 2 * q - before, np.zeros((2, 3)), None, None), found)
+    errors = reference.errors(StepProblem(q, 2 * q - before, np.zeros((2, 3))), found)
     reference.destroy()
     np.testing.assert_allclose(errors, [[1, 1], [0.5, 0.25], [0.01, 1e-4]], rtol=1e-6)
 
@@ -157,7 +158,7 @@ def test_two_solvers_do_not_take_each_others_options():
         first = Stepper(COMM, lattice, T, find_preset("lbfgs"))
         second = Stepper(COMM, lattice, T, find_preset("newton"), prefix="reference_")
         assert first.snes.getType() == "qn" and second.snes.getType() == "newtonls"
-        assert first.tightest == 1e-9 and second.tightest == float(PRESETS["newton"].options["ksp_rtol"])
+        assert first.control.tightest == 1e-9 and second.control.tightest == float(PRESETS["newton"].options["ksp_rtol"])
         second.destroy()
         first.destroy()
     finally:
@@ -171,8 +172,8 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
     def tolerances(error: float) -> list[float]:
         lattice, seen = beam(), []
         stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=error)
-        stepper.observer = lambda stepper: seen.append(stepper.ksp.getTolerances()[0])
-        stepper.step(lattice.nodes, lattice.nodes + [0, 0, 1e-3], weight(lattice))
+        stepper.observer = lambda _: seen.append(stepper.ksp.getTolerances()[0])
+        stepper.step(StepProblem(lattice.nodes, lattice.nodes + [0, 0, 1e-3], weight(lattice)))
         stepper.destroy()
         return seen[1:]
 

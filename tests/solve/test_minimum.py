@@ -20,8 +20,9 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.model.frame import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.simulate import Simulation
 
@@ -62,7 +63,7 @@ def write_case(folder: Path, name: str, **solver) -> Path:
 def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
     scene, frames = load_scene(path, overrides), []
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), Measured(true_error=1)) as simulation:
+    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), Probes(true_error=1)) as simulation:
         try:
             frames.extend(simulation.frames())
         except StepFailed:
@@ -126,10 +127,10 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(tmp_path: Path, share: f
     """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that knows nothing."""
     simulation, q = squashed(tmp_path, share)
     stepper = simulation.integrator.stepper
-    functional, curvature = stepper.functional, stepper.curvature
-    functional.begin(q, q, np.zeros((len(q), 3)), None, None)
-    stepper.hessian.linearise(q, None)
-    found, direction = curvature.lowest(curvature.compression(q), False, None)
+    functional, curvature = stepper.functional, stepper.minimum.curvature
+    functional.begin(StepProblem(q, q, np.zeros((len(q), 3))))
+    stepper.jacobian.hessian.linearise(q, None)
+    found, direction = curvature.lowest(q, curvature.compression(q), False, None)
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
     lowest = np.linalg.eigvalsh(dense / root / root[:, None])[0]
     assert found == pytest.approx(direction @ dense @ direction / (direction**2 @ functional.mass))
@@ -141,13 +142,13 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(tmp_path: Path, share: f
 
 
 def dense_hessian(stepper: Stepper) -> np.ndarray:
-    x, y = stepper.operator.createVecs()
+    x, y = stepper.jacobian.operator.createVecs()
     columns = []
     for row in range(x.getSize()):
         x.set(0.0)
         x[row] = 1.0
         x.assemble()
-        stepper.hessian.mult(None, x, y)
+        stepper.jacobian.hessian.mult(None, x, y)
         columns.append(y.array.copy())
     return np.array(columns)
 

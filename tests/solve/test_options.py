@@ -14,9 +14,10 @@ from msmpetsc.cli import compare, fetch, inspect, plan, render, study
 from msmpetsc.cli.main import main
 from msmpetsc.cli.run import add_parser
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.options import _is_in_library, refuse_bad_values, refuse_early
-from msmpetsc.solve.petsc.errors import refusal
+from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.initialise import _check_files
 from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
 
@@ -194,7 +195,7 @@ def test_a_solver_that_is_to_fail_where_it_does_not_converge_fails_the_step():
     """As of an inner solver: -mg_coarse_ksp_error_if_not_converged."""
     from petsc4py import PETSc
 
-    with pytest.raises(StepFailed, match="did not converge"), refusal("PETSc cannot"):
+    with pytest.raises(StepFailed, match="did not converge"), petsc_errors("PETSc cannot"):
         raise PETSc.Error(91)
 
 
@@ -216,8 +217,8 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
     lattice = beam()
     for error, budget in ((1e-1, None), (1e-3, None), (1e-6, None), (1e-12, 2)):
         stepper = Stepper(COMM, lattice, T, find_preset(preset), error, budget)
-        stepper.step(lattice.nodes, lattice.nodes, weight(lattice))
-        reason, corrected = stepper.snes.reason, stepper.corrected
+        stepper.step(StepProblem(lattice.nodes, lattice.nodes, weight(lattice)))
+        reason, corrected = stepper.snes.reason, stepper.control.now.corrected
         stepper.destroy()
         rule = reasons.CONVERGED_SNORM_RELATIVE if corrected else reasons.CONVERGED_FNORM_RELATIVE
         assert reason == (reasons.CONVERGED_ITS if budget else rule)
@@ -229,7 +230,7 @@ def test_newton_starts_its_solves_where_the_user_says(petsc_options):  # noqa: F
     petsc_options(ksp_initial_guess_nonzero="1")
     lattice = beam()
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-6)
-    stepper.step(lattice.nodes, lattice.nodes, weight(lattice))
+    stepper.step(StepProblem(lattice.nodes, lattice.nodes, weight(lattice)))
     assert stepper.ksp.getInitialGuessNonzero()
     stepper.destroy()
 
@@ -274,9 +275,9 @@ def test_matrices_are_written_whole(petsc_options, tmp_path: Path, preset: str):
     lattice = beam()
     stepper = Stepper(COMM, lattice, T, find_preset(preset), 1e-3)
     rows = np.arange(stepper.unknowns.size, dtype=np.int32)
-    A = stepper.matrix.getValues(rows, rows)
+    A = stepper.jacobian.matrix.getValues(rows, rows)
     q = lattice.nodes + 1e-3 * np.random.default_rng(0).normal(size=lattice.nodes.shape) * ~lattice.pinned[:, None]
-    stepper.step(q, q, weight(lattice))
+    stepper.step(StepProblem(q, q, weight(lattice)))
     stepper.destroy()
     three = np.kron(np.eye(3), A)
     np.testing.assert_array_equal(read_matrix(tmp_path / "mat_view"), A)
@@ -299,11 +300,11 @@ def test_the_written_hessian_is_the_one_that_is_applied(tmp_path: Path):
     lattice = replace(beam(), stiffening=2.0)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-3)
     q = lattice.nodes * [1, 1, 0.3]
-    stepper.hessian.linearise(q, None)
-    matrix = explicit(stepper.operator, stepper.unknowns)
-    x, y = stepper.operator.createVecs()
+    stepper.jacobian.hessian.linearise(q, None)
+    matrix = explicit(stepper.jacobian.operator, stepper.unknowns)
+    x, y = stepper.jacobian.operator.createVecs()
     x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
-    stepper.operator.mult(x, y)
+    stepper.jacobian.operator.mult(x, y)
     found = y.duplicate()
     matrix.mult(x, found)
     np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())

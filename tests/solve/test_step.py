@@ -11,8 +11,9 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.errors import refusal
+from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 T = 1 / 60
@@ -38,7 +39,7 @@ def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -
     q, before, results = lattice.nodes.copy(), lattice.nodes.copy(), []
     try:
         for _ in range(steps):
-            result = stepper.step(q, 2 * q - before, weight(lattice))
+            result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
             q, before = result.position, q
             results.append(result)
     finally:
@@ -78,7 +79,7 @@ def test_a_lattice_at_rest_stays_at_rest():
     stepper = Stepper(COMM, lattice, T, find_preset("newton"))
     q = lattice.nodes.copy()
     for _ in range(3):
-        q = stepper.step(q, q, np.zeros((lattice.owned, 3))).position
+        q = stepper.step(StepProblem(q, q, np.zeros((lattice.owned, 3)))).position
     stepper.destroy()
     np.testing.assert_allclose(q, lattice.nodes, atol=1e-14)
 
@@ -119,7 +120,7 @@ def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
     q = q_before = np.array([[0.0, 0, 0], [0, 0, x]])
     for _ in range(10):
         x, before = (m * (2 * x - before) + T**2 * k * r) / (m + T**2 * k), x
-        q, q_before = stepper.step(q, 2 * q - q_before, np.zeros((2, 3))).position, q
+        q, q_before = stepper.step(StepProblem(q, 2 * q - q_before, np.zeros((2, 3)))).position, q
         np.testing.assert_allclose(q[1], [0, 0, x], atol=1e-8)
     stepper.destroy()
 
@@ -136,7 +137,7 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
     def one_step(name: str, error: float):
         stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
         try:
-            return stepper.step(q, 2 * q - before, weight(lattice)), stepper.corrected
+            return stepper.step(StepProblem(q, 2 * q - before, weight(lattice))), stepper.control.now.corrected
         finally:
             stepper.destroy()
 
@@ -236,7 +237,7 @@ def test_a_fault_of_ours_within_petsc_is_no_bad_option():
     def fault(*_):
         raise ZeroDivisionError
 
-    with pytest.raises(ZeroDivisionError), refusal("PETSc refuses"):
+    with pytest.raises(ZeroDivisionError), petsc_errors("PETSc refuses"):
         snes = PETSc.SNES().create(COMM)
         x = PETSc.Vec().createMPI(2, comm=COMM)
         snes.setFunction(fault, x.duplicate())
@@ -258,7 +259,7 @@ def test_pinned_nodes_do_not_move_and_are_no_unknowns(reference: list):
     for result in reference:
         np.testing.assert_array_equal(result.position[lattice.pinned], lattice.nodes[lattice.pinned])
     stepper = Stepper(COMM, lattice, T, find_preset("newton"))
-    assert stepper.matrix.getSize()[0] == lattice.owned - 9
+    assert stepper.jacobian.matrix.getSize()[0] == lattice.owned - 9
     stepper.destroy()
 
 
@@ -267,7 +268,7 @@ def test_A_is_M_plus_t2_L():
     lattice = build_lattice(cages_of(block(2, 2, 1), 0.1), 1000.0, young_modulus=2e5)
     stepper = Stepper(COMM, lattice, T, find_preset("anderson"))
     rows = np.arange(lattice.owned, dtype=np.int32)
-    A = stepper.matrix.getValues(rows, rows)
+    A = stepper.jacobian.matrix.getValues(rows, rows)
     stepper.destroy()
     dense = np.diag(lattice.mass)
     for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
@@ -283,9 +284,9 @@ def test_a_plain_iteration_is_the_papers_global_step():
     lattice = replace(lattice, rest_length=0.95 * lattice.rest_length)
     stepper = Stepper(COMM, lattice, T, find_preset("fast-msm"), max_iterations=1)
     rows = np.arange(lattice.owned, dtype=np.int32)
-    A = stepper.matrix.getValues(rows, rows)
+    A = stepper.jacobian.matrix.getValues(rows, rows)
     y = lattice.nodes
-    x = stepper.step(y, y, weight(lattice)).position
+    x = stepper.step(StepProblem(y, y, weight(lattice))).position
     stepper.destroy()
     along = y[lattice.springs[:, 0]] - y[lattice.springs[:, 1]]
     d = lattice.rest_length[:, None] * along / np.linalg.norm(along, axis=1)[:, None]
@@ -304,7 +305,7 @@ def test_a_strut_that_buckles_under_its_load():
     load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
     q = np.array([[0.0, 0, 0], [1e-3, 0, length]])
     stepper = Stepper(COMM, lattice, T, replace(find_preset("newton"), extrapolate=False), error=1e-9)
-    x = stepper.step(q, q, load).position[1]
+    x = stepper.step(StepProblem(q, q, load)).position[1]
     stepper.destroy()
     stretch = np.linalg.norm(x) - r
     F = m * (x - q[1]) + T**2 * (k * stretch * x / np.linalg.norm(x) - load[1])
@@ -316,7 +317,7 @@ def test_a_body_pressed_to_half_still_gives_a_descent():
     lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), 1000.0, young_modulus=2e6)
     pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(size=lattice.nodes.shape)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-6)
-    x = stepper.step(pressed, pressed, weight(lattice)).position
+    x = stepper.step(StepProblem(pressed, pressed, weight(lattice))).position
     stepper.destroy()
     g = np.zeros_like(x)
     Elasticity(MPI.COMM_SELF, lattice).add_gradient(x, g)

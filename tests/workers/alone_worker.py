@@ -21,9 +21,9 @@ def fail_at(where: str, what: str, fails: bool) -> None:
 
     petsc4py.init(["msmpetsc"])
     from msmpetsc.model import build
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.integrators.implicit import ImplicitEuler
 
-    owner, name = {"model": (build, "build_lattice"), "step": (Simulation, "_step")}[where]
+    owner, name = {"model": (build, "build_lattice"), "step": (ImplicitEuler, "advance")}[where]
     function, calls = getattr(owner, name), []
 
     def failing(*given, **named):

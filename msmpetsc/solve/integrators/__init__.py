@@ -1,0 +1,33 @@
+"""Integrators of the equations of motion, by the name that a scene gives them (time.integrator)."""
+
+from mpi4py import MPI
+
+from msmpetsc.model.build import Model
+from msmpetsc.model.environment import Environment
+from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
+from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.verlet import Verlet
+
+INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+
+
+def make_integrator(
+    comm: MPI.Comm,
+    model: Model,
+    environment: Environment,
+    time: Time,
+    solver: Solver,
+    *,
+    probes: Probes = Probes(),
+    prefix: str = "",
+) -> Integrator:
+    """Integrator of a model as a scene's tables ``time`` and ``solver`` have it (collective).
+
+    probes : what is to be measured of its steps
+    prefix : of its PETSc options
+
+    Raises InputError for PETSc options that do not go together, and for probes that it has nothing for.
+    """
+    return INTEGRATORS[time.integrator](comm, model, environment, time, solver, probes, prefix)

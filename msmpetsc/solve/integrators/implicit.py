@@ -9,54 +9,52 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.environment import Environment
-from msmpetsc.scene import schema as scene
-from msmpetsc.solve.instrumentation import Measured, Trace
+from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.solve.instrumentation import Probes, Trace
+from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.nonlinear.reference import PREFIX, Problem, Reference
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
 
-MOST_SOLVES = 10  # of a step, for nodes that pass through a box
-
 
 class ImplicitEuler:
-    """The steps of one model; another solver takes over where an anchor lets go.
+    """Implicit Euler's method (an Integrator); another solver takes over where an anchor lets go.
 
         v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1)
 
     so that y = q_n + t v_n = 2 q_n - q_(n-1) and tau = t (Eq. 10-12).
-
-    prefix : of its PETSc options
     """
 
     SHARE = 1.0  # tau / t
-    looks_back = False  # whether it has a use for State.history
+    looks_back = False
 
     def __init__(
         self,
         comm: MPI.Comm,
         model: Model,
         environment: Environment,
-        time: scene.Time,
-        solver: scene.Solver,
-        measured: Measured = Measured(),
+        time: Time,
+        solver: Solver,
+        probes: Probes = Probes(),
         prefix: str = "",
     ):
-        self.comm, self.model, self.around, self.prefix = comm, model, environment, prefix
+        self.comm, self.model, self.environment, self.prefix = comm, model, environment, prefix
         self.time_step, self.tau = time.step, self.SHARE * time.step
-        self.solver, self.measured = solver, measured
-        self.held = environment.anchors_at(self.time_step)
+        self.solver, self.probes = solver, probes
+        self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
-        self.reference, self.trace = None, None
+        self.problem: StepProblem | None = None  # of the step taken last
+        self.reference: Reference | None = None
+        self.trace: Trace | None = None
 
     @property
     def unknowns(self) -> int:
-        """Free nodes of this rank."""
         return self.stepper.unknowns.size
 
     def set_up(self) -> None:
@@ -64,70 +62,49 @@ class ImplicitEuler:
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed."""
         self._let_go(time)
-        result, sides = self._solve(state.q, 2 * state.q - state.q_previous, time, self.time_step, state.sides)
-        after, before, work = self.around.reflect(
-            result.position, result.previous, time, self.time_step, self.stepper.lattice.pinned, sides
+        q, time_step = state.q, self.time_step
+        result, sides = self._solve(q, 2 * q - state.q_previous, time, time_step, state.sides)
+        after, before, work = self.environment.reflect(
+            result.position, result.previous, time, time_step, self.stepper.lattice.pinned, sides
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
     def _solve(
         self, q: np.ndarray, y: np.ndarray, time: float, time_step: float, before: np.ndarray | None
     ) -> tuple[StepResult, np.ndarray]:
-        """The x that belongs to y, as it will be at ``time``, and the sides that it was found with.
-
-        Which face pushes a node out of a box is settled before the step is solved, by the way to y. Where the way to x
-        tells otherwise the step is solved again; from then on a node that has a face keeps it, so that this ends.
-        """
-        around, iterations, ksp_its = self.around, 0, 0
-        way = {"time": time, "time_step": time_step, "before": before, "held": self.stepper.lattice.pinned}
-        sides = around.met(q, y, **way)
-        for solves in range(MOST_SOLVES):
-            contact = around.contact(q, time, time_step, sides)
-            self.problem = Problem(q, y, around.load(time), contact, around.prescribed(q, time))
-            result = self.stepper.step(**vars(self.problem))
-            iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
-            met = around.met(q, result.position, **way)
-            settled = np.where(sides > 0, sides, met) if solves else met
-            if not self._passes(result.position, time, sides, settled):
-                if around.penalties:  # what reflects goes by the way to x alone
-                    met[around.pressing] = np.where(settled > 0, settled, sides)[around.pressing]
-                return replace(result, iterations=iterations, ksp_its=ksp_its), met
-            sides = settled
-        raise StepFailed(
-            f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came in by; "
-            'try a smaller time.step, or safety.on_failure = "substep"',
-            "contact",
+        """The x that belongs to y, as it will be at ``time``, and the contact faces that it has."""
+        fixed = self.stepper.lattice.pinned
+        faces = ContactFaces(
+            self.comm, self.environment, q, y, time=time, time_step=time_step, before=before, fixed=fixed
         )
-
-    def _passes(self, x: np.ndarray, time: float, sides: np.ndarray, met: np.ndarray) -> bool:
-        """Whether any node on its way to x has met what did not push it (collective)."""
-        if not (self.around.has_sides and self.around.penalties):
-            return False
-        return self.comm.allreduce(not self.around.pushes_alike(x, time, sides, met), MPI.LOR)
+        iterations = ksp_its = 0
+        while not faces.is_settled:
+            self.problem = faces.problem()
+            result = self.stepper.step(self.problem)
+            iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
+            faces.compare(result.position)
+        return replace(result, iterations=iterations, ksp_its=ksp_its), faces.sides
 
     def follow(self) -> None:
-        """Trace the step that comes next."""
         self.trace = Trace()
         self.trace.follow(self.stepper)
 
     def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
-        """Position and energy error of the step taken last, and its trace if that was asked for (collective)."""
         if self.reference is None:
             lattice = self.stepper.lattice
             self.reference = Reference(self.comm, lattice, self.tau, touches=bool(self.model.penalties))
         trace, self.trace, self.stepper.observer = self.trace, None, None
         positions = [*(trace.positions if trace else []), result.position]
         errors = self.reference.errors(self.problem, positions)
-        return errors[-1], trace.told(index, errors[:-1]) if trace else None
+        return errors[-1], trace.as_lists(index, errors[:-1]) if trace else None
 
     def _new_stepper(self, time: float) -> Stepper:
-        """The solver while the same nodes are held as at ``time``: these are no unknowns."""
+        """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""
         solver = self.solver
         return Stepper(
             self.comm,
-            self.model.lattice.pin(self.around.fixed_at(time)),
+            self.model.lattice.pin(self.environment.fixed_at(time)),
             self.tau,
             find_preset(solver.preset),
             solver.error,
@@ -137,38 +114,33 @@ class ImplicitEuler:
         )
 
     def _let_go(self, time: float) -> None:
-        """Another solver where an anchor's time has come (collective)."""
-        held = self.around.anchors_at(time)
-        if len(held) < len(self.held):
-            self.held = held
+        """Make another solver where an anchor's time has come (collective)."""
+        anchors = self.environment.anchors_at(time)
+        if len(anchors) < len(self.anchors):
+            self.anchors = anchors
             self.destroy()
             self.stepper, self.reference = self._new_stepper(time), None
             self.stepper.set_up()
 
-    def save(self, saved: Checkpoint, _: State) -> None:
-        self.stepper.save(saved)
+    def save(self, checkpoint: Checkpoint, _: State) -> None:
+        self.stepper.save(checkpoint)
 
-    def restore(self, saved: Checkpoint, _: State, time: float) -> None:
-        """Go on after a step that ended at ``time`` (collective)."""
+    def restore(self, checkpoint: Checkpoint, _: State, time: float) -> None:
         self._let_go(time)
-        self.stepper.restore(saved)
+        self.stepper.restore(checkpoint)
 
     def forget(self) -> None:
-        """Let the steps so far leave no trace in the next (collective)."""
         self.stepper.restore(Checkpoint())
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
-        """Raise InputError for PETSc options of the user that nothing has used (collective).
-
-        awaited : prefixes of solvers that may still be made
-        """
-        reference = self.reference.stepper.defaults if self.reference else set()
-        if self.measured != Measured() and not at_end:
+        names = self.stepper.options.names
+        if self.reference:
+            names = names | self.reference.stepper.options.names
+        if self.probes != Probes() and not at_end:
             awaited = (*awaited, PREFIX)
-        refuse_unused(self.comm, self.stepper.defaults | reference, at_end, awaited)
+        refuse_unused(self.comm, names, at_end, awaited)
 
     def destroy(self) -> None:
-        """Collective."""
         if self.reference:
             self.reference.destroy()
         self.stepper.destroy()
@@ -202,7 +174,7 @@ class Bdf2(ImplicitEuler):
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
-        before, work = self.around.turn(
+        before, work = self.environment.turn(
             result.position, previous, a, time, self.time_step, self.stepper.lattice.pinned, sides
         )
         result = replace(result, previous=previous, ksp_its=result.ksp_its + began, work=work)

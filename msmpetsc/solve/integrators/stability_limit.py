@@ -19,13 +19,14 @@ class HighestMode:
     def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
         self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
         self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
+        self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
-    def hold(self, held: np.ndarray) -> None:
-        """Know the nodes ``held`` (owned,) bool, and begin with something of every mode, whatever the number of ranks."""
-        self.held = held
+    def hold(self, fixed: np.ndarray) -> None:
+        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of ranks."""
+        self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
-        self.mode.values[: self.lattice.owned][held] = 0
+        self.mode.values[: self.lattice.owned][fixed] = 0
         self._normalise()
         self.squared = 0.0
 
@@ -41,7 +42,7 @@ class HighestMode:
             product[:] = 0
             hessian.add_product(x, product)
             np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
-            x[:owned][self.held] = 0
+            x[:owned][self.fixed] = 0
             self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
             if not abs(self.squared - before) > SETTLED * self.squared:
                 break

@@ -1,4 +1,4 @@
-"""What a step starts from."""
+"""State of a run: what a step starts from."""
 
 from dataclasses import dataclass, replace
 
@@ -34,22 +34,26 @@ class State:
         """The same for steps of another length, which have no history yet."""
         return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
 
-    def save(self, saved: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
-        """looks_back, has_sides : whether the integrator has a use for the history, and contact for the sides"""
-        saved.rows |= {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
+    def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
+        """Store the state.
+
+        looks_back, has_sides : whether the integrator has a use for the history, and contact for the sides
+        """
+        rows = {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
         if looks_back:
-            saved.numbers["history"] = self.history is not None
             history = self.history or (np.zeros((owned, 3)),) * 2
-            saved.rows |= {name: rows[:owned] for name, rows in zip(HISTORY, history, strict=True)}
+            rows |= {name: part[:owned] for name, part in zip(HISTORY, history, strict=True)}
+            checkpoint.keep(numbers={"history": self.history is not None})
         if has_sides:
-            saved.rows[SIDES] = 1.0 * self.sides[:, :owned].T
+            rows[SIDES] = 1.0 * self.sides[:, :owned].T
+        checkpoint.keep(rows)
 
     @staticmethod
-    def restored(comm: MPI.Comm, lattice: Lattice, saved: Checkpoint) -> "State":
-        """Collective."""
-        names = ("q", "q_previous", *HISTORY) if saved.count("history", 1) else ("q", "q_previous")
-        q, q_previous, *history = (with_ghosts(comm, lattice, saved.row(name)) for name in names)
-        sides = _sides(comm, lattice, saved.rows[SIDES]) if SIDES in saved.rows else None
+    def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
+        """The state that a checkpoint holds (collective)."""
+        names = ("q", "q_previous", *HISTORY) if checkpoint.count("history", 1) else ("q", "q_previous")
+        q, q_previous, *history = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
+        sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None
         return State(q, q_previous, tuple(history) or None, sides)
 
 

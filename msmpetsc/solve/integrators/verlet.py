@@ -19,8 +19,8 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
-from msmpetsc.scene import schema as scene
-from msmpetsc.solve.instrumentation import Measured
+from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.stability_limit import HighestMode
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
@@ -34,7 +34,7 @@ TORN = 100.0  # of the energy that presses every spring to a point: no body live
 
 
 class Verlet:
-    """The substeps of one model. ``time.substep`` may only shorten them."""
+    """Velocity Verlet's method (an Integrator). ``time.substep`` may only shorten its substeps."""
 
     looks_back = False
 
@@ -43,13 +43,14 @@ class Verlet:
         comm: MPI.Comm,
         model: Model,
         environment: Environment,
-        time: scene.Time,
-        _: scene.Solver,
-        measured: Measured = Measured(),
+        time: Time,
+        _: Solver,
+        probes: Probes = Probes(),
+        prefix: str = "",
     ):
-        if measured != Measured():
+        if probes != Probes():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
-        self.comm, self.lattice, self.around = comm, model.lattice, environment
+        self.comm, self.lattice, self.environment, self.prefix = comm, model.lattice, environment, prefix
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
@@ -60,8 +61,10 @@ class Verlet:
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.sides = environment.no_sides[:, :owned]
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
-        self.known = None  # the positions that ``gradient`` and the highest frequency are of
-        self.anchors = None  # how many hold
+        self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
+        self.anchors: int | None = None  # how many hold
+        self.fixed = environment.fixed_at(self.time_step)[:owned]
+        self.free = np.flatnonzero(~self.fixed)
         springs = slice(self.lattice.springs_owned)
         crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
         self.most = TORN * comm.allreduce(crushed)  # [J]
@@ -69,7 +72,7 @@ class Verlet:
     @property
     def unknowns(self) -> int:
         """Free nodes of this rank: pinned ones and led ones aside."""
-        return int((~self.around.fixed_at(self.time_step)[: self.lattice.owned]).sum())
+        return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
 
     def set_up(self) -> None:
         """There is no matrix to make ready."""
@@ -78,33 +81,37 @@ class Verlet:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
 
-    def save(self, saved: Checkpoint, state: State) -> None:
-        """grad E is found again from q, if it is known of that."""
-        saved.rows["mode"] = self.highest.mode.values[: self.lattice.owned]
-        if self.anchors is not None:  # it has taken a step
-            saved.numbers |= {"squared": self.highest.squared, "known": state.q is self.known}
-        else:
-            saved.numbers |= {"squared": -1.0, "known": False}
-        saved.numbers["substep"] = self.substep
+    def follow(self) -> None:
+        """Do nothing: an explicit step has no iterates."""
 
-    def restore(self, saved: Checkpoint, state: State, time: float) -> None:
-        """Go on after a step that ended at ``time`` (collective)."""
-        squared = saved.number("squared", -1.0, -1.0, np.finfo(float).max)
+    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
+        """Unknown (NaN): an explicit step solves nothing."""
+        return np.full(2, np.nan), None
+
+    def save(self, checkpoint: Checkpoint, state: State) -> None:
+        """Store the highest mode; grad E is computed again from q, if it is known of that."""
+        has_begun = self.anchors is not None  # it has taken a step
+        squared, known = (self.highest.squared, state.q is self.known) if has_begun else (-1.0, False)
+        mode = self.highest.mode.values[: self.lattice.owned]
+        checkpoint.keep({"mode": mode}, {"squared": squared, "known": known, "substep": self.substep})
+
+    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
+        squared = checkpoint.number("squared", -1.0, -1.0, np.finfo(float).max)
         if squared < 0:
             return
         self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = like(self.v, saved.row("mode"))
+        self.highest.mode.values[: self.lattice.owned] = like(self.v, checkpoint.row("mode"))
         self.highest.mode.update()
-        self.highest.squared, self.substep = squared, saved.number("substep", self.substep, np.finfo(float).tiny)
-        if saved.count("known", 1):
+        self.highest.squared = squared
+        self.substep = checkpoint.number("substep", self.substep, np.finfo(float).tiny)
+        if checkpoint.count("known", 1):
             self.known = state.q
             self.position.values[:] = state.q
-            sides = self.around.no_sides if state.sides is None else state.sides
+            sides = self.environment.no_sides if state.sides is None else state.sides
             self.sides = sides[:, : self.lattice.owned]
             self._pull(time)
 
     def forget(self) -> None:
-        """Let the steps so far leave no trace in the next."""
         self.known = self.anchors = None
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -147,7 +154,7 @@ class Verlet:
     def _meet(self, state: State, time: float) -> None:
         """The sides of a state."""
         before = None if state.sides is None else state.sides[:, : self.lattice.owned]
-        self.sides = self.around.met(self.q, self.q, time, 0.0, before, self.held)
+        self.sides = self.environment.met(self.q, self.q, time, 0.0, before, self.fixed)
 
     def _take(self, count: int, start: float, time: float) -> None:
         """All substeps of a step."""
@@ -157,14 +164,14 @@ class Verlet:
         for begin, end in zip(times, times[1:], strict=False):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
-            self.work += self.around.appearing(self.q, begin, end, self.sides)
+            self.work += self.environment.appearing(self.q, begin, end, self.sides)
             self._pull(end)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
     def _squared_acceleration(self, time: float) -> float:
         """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
-        force = (self.around.load(time) - self.gradient[: self.lattice.owned])[self.free]
+        force = (self.environment.load(time) - self.gradient[: self.lattice.owned])[self.free]
         return float(self.per_mass[self.free] @ (force**2).sum(axis=1))
 
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
@@ -178,16 +185,18 @@ class Verlet:
         """grad E at q, with what obstacles push."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
-        contact = self.around.push(time, self.sides)
+        contact = self.environment.push(time, self.sides)
         if contact:
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
-        load = self.around.load(time)
+        load = self.environment.load(time)
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
-        self.work += duration * self.around.power(self.q, time, begin, end, self.sides)
-        self.around.apply_friction(self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides)
+        self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
+        self.environment.apply_friction(
+            self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides
+        )
 
     def _drift(self, begin: float, end: float) -> None:
         """q to the end of a substep: led nodes along their path, nodes that strike something back."""
@@ -195,13 +204,13 @@ class Verlet:
         drift(len(self.free), self.free, self.v, end - begin, self.q)
         if self.anchors:
             self._lead(begin, end)
-        if self.around.reflections or self.around.has_sides:
+        if self.environment.reflections or self.environment.has_sides:
             self._strike(begin, end)
         self.position.update()
 
     def _lead(self, begin: float, end: float) -> None:
-        prescribed = self.around.prescribed(self.position.values, end)[: self.lattice.owned]
-        where = np.flatnonzero(self.held & ~self.lattice.pinned[: self.lattice.owned])
+        prescribed = self.environment.prescribed(self.position.values, end)[: self.lattice.owned]
+        where = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
         self.v[where] = (prescribed[where] - self.q[where]) / (end - begin)
         self.q[where] = prescribed[where]
 
@@ -210,8 +219,8 @@ class Verlet:
         there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
-        self.sides = self.around.met(self.before, self.q, end, end - begin, self.sides, self.held)
-        after, before, work = self.around.reflect(self.q, self.before, end, end - begin, self.held, self.sides)
+        self.sides = self.environment.met(self.before, self.q, end, end - begin, self.sides, self.fixed)
+        after, before, work = self.environment.reflect(self.q, self.before, end, end - begin, self.fixed, self.sides)
         self.work += work
         if after is not self.q:
             struck = np.flatnonzero((after != self.q).any(axis=1))
@@ -220,19 +229,21 @@ class Verlet:
 
     def _hold(self, time: float) -> None:
         """Know the free nodes anew where an anchor's time has come."""
-        anchors = len(self.around.anchors_at(time))
+        anchors = len(self.environment.anchors_at(time))
         if anchors != self.anchors:
             self.anchors = anchors
-            self.held = self.around.fixed_at(time)[: self.lattice.owned]
-            self.free = np.flatnonzero(~self.held)
-            self.highest.hold(self.held)
+            self.fixed = self.environment.fixed_at(time)[: self.lattice.owned]
+            self.free = np.flatnonzero(~self.fixed)
+            self.highest.hold(self.fixed)
 
     def _pushed(self, start: float, time: float) -> float:
         """The most omega^2 [1/s^2] that obstacles may add to the springs' until ``time`` (Weyl) (collective)."""
-        fall = self.around.load(start) * self.per_mass[:, None] * self.time_step
+        fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        pushed = self.around.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
+        pushed = (
+            self.environment.stiffest_push(self.q, speed, start, time, self.sides)[self.free] * self.per_mass[self.free]
+        )
         return self.comm.allreduce(greatest(pushed), MPI.MAX)
 
     def _count(self, squared: float) -> int:

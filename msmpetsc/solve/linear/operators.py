@@ -1,7 +1,6 @@
-"""What PETSc's solvers see: operators and a preconditioner on vectors of three coordinates.
+"""Operators on vectors of three coordinates, as PETSc's solvers see them: Python contexts of MATPYTHON.
 
-Each is a Python context over the scalar matrix A, which acts on the m x 3 block that a vector of
-unknowns is: one product or one solve for three right-hand sides.
+The scalar matrix A acts on the m x 3 block that a vector of unknowns is: one product for three right-hand sides.
 """
 
 import numpy as np
@@ -12,9 +11,7 @@ from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.explicit import asks_for_entries, explicit
-from msmpetsc.solve.petsc.memory import HOST, Memory
-
-DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
+from msmpetsc.solve.petsc.memory import Memory
 
 
 class Block:
@@ -114,64 +111,7 @@ class TrueHessian(Viewable):
             self.contact.add(x, y)
 
 
-class Preconditioned:
-    """What stands for A where PETSc wants a matrix to precondition with, 3m x 3m: a MATPYTHON that A is seen through."""
-
-    def __init__(self, matrix: PETSc.Mat):
-        self.matrix = matrix
-
-    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        self.matrix.view(viewer)
-
-
-class Preconditioner:
-    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
-
-    It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
-    preconditioned with.
-
-    matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
-    """
-
-    def __init__(self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str):
-        self.matrix, self.memory, self.columns, self.blocks = matrix, memory, columns, []
-        self.pc = PETSc.PC().create(matrix.comm)
-        self.pc.setOptionsPrefix(prefix)
-        self.pc.setOperators(matrix)
-
-    def setFromOptions(self, _: PETSc.PC) -> None:
-        self.pc.setFromOptions()
-
-    def setUp(self, _: PETSc.PC) -> None:
-        self.pc.setUp()
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self.columns == 1:
-            self.pc.apply(x, y)
-            return
-        given, found = self.blocks = self.blocks or self._create_blocks()
-        values = given.values
-        values[:] = like(values, self.memory.read(x))
-        self.pc.matApply(given.mat, found.mat)
-        y = self.memory.write(y)
-        y[:] = like(y, found.values)
-
-    def _create_blocks(self) -> list[Block]:
-        """Where the inner one works: a direct solver does on the CPU."""
-        memory = HOST if self.pc.getType() in DIRECT else self.memory
-        return [Block(self.matrix, memory), Block(self.matrix, memory)]
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.pc.view(viewer)
-
-    def destroy(self, _: PETSc.PC) -> None:
-        for part in (*self.blocks, self.pc):
-            part.destroy()
-
-
-def python_matrix(
-    unknowns: Unknowns, context: ThreeColumns | TrueHessian | Preconditioned, comm: PETSc.Comm
-) -> PETSc.Mat:
+def python_matrix(unknowns: Unknowns, context: object, comm: PETSc.Comm) -> PETSc.Mat:
     """A MATPYTHON on vectors of unknowns."""
     size = (3 * unknowns.size, 3 * unknowns.total)
     matrix = PETSc.Mat().createPython((size, size), context, comm=comm)

@@ -50,22 +50,6 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     return matrix
 
 
-class ViewOfA:
-    """Keeps -mat_view to A, which is assembled by now: PETSc would show all matrices, its own and those of solvers, and
-    write each into the same file. Given back by ``destroy``."""
-
-    def __init__(self, prefix: str):
-        self.option, given = f"{prefix}mat_view", PETSc.Options().getAll()
-        self.is_given, self.value = self.option in given, given.get(self.option)
-        if self.is_given:
-            PETSc.Options().delValue(self.option)
-
-    def destroy(self) -> None:
-        if self.is_given:
-            PETSc.Options().setValue(self.option, self.value)
-            PETSc.Options().getString(self.option)  # it has been of use
-
-
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
     given, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
     if ("cusparse" in given) != on_gpu:

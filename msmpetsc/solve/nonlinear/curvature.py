@@ -17,7 +17,8 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import greatest, like, to_host
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.initial_state import uniform
-from msmpetsc.solve.linear.operators import Preconditioner, TrueHessian
+from msmpetsc.solve.linear.operators import TrueHessian
+from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 BLOCK = 4  # directions of a long search
@@ -79,20 +80,22 @@ class LowestCurvature:
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         shares = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
-        found = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
-        most, sums, resist = zip(*found, strict=True)
+        gathered = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
+        most, sums, resist = zip(*gathered, strict=True)
         return Compression(max(most), sum(sums), any(resist))
 
-    def lowest(self, compression: Compression, alarmed: bool, hint: PETSc.Vec | None) -> tuple[float, np.ndarray]:
-        """The lowest eigenvalue of M^(-1) H that was found, and a direction (n,) of about that curvature, about where H
-        was linearised last.
+    def lowest(
+        self, q: np.ndarray, compression: Compression, alarmed: bool, hint: PETSc.Vec | None
+    ) -> tuple[float, np.ndarray]:
+        """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
 
+        q       : positions (l, 3) [m] that H was linearised at last
         alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
         if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
-            values, modes = self._search_at_length(hint)
+            values, modes = self._search_at_length(q, hint)
         else:
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
         if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
@@ -109,13 +112,13 @@ class LowestCurvature:
         direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(self, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
+    def _search_at_length(self, q: np.ndarray, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
         """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
         for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
         start = self._random(BLOCK)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
-        self.rigid = self._rigid_motions()
+        self.rigid = self._rigid_motions(q)
         _, modes = self._iterate(self._without_rigid(start), MOST, LEAST)
         known = [] if self.mode is None else [self.mode[None]]
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
@@ -165,11 +168,11 @@ class LowestCurvature:
         lengths = np.maximum(self._lengths(moved[0]), TINY)
         return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
 
-    def _rigid_motions(self) -> np.ndarray | None:
-        """Translations and rotations of a free body at functional.q, (6, n) orthonormal in M; None if nodes are held."""
+    def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
+        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
-        columns = self.functional.q[self.unknowns.free].T
+        columns = q[self.unknowns.free].T
         motions = np.zeros((6, *columns.shape), like=columns)
         for c in range(3):
             motions[c, c] = 1.0
@@ -198,12 +201,12 @@ class LowestCurvature:
     def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
         if self.vectors is None:
             self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
-        given, made = self.vectors
+        source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):
-            self.memory.write(given)[:] = direction
-            act(None, given, made)
-            result[:] = self.memory.read(made)
+            self.memory.write(source)[:] = direction
+            act(None, source, product)
+            result[:] = self.memory.read(product)
         return results
 
     def _unit(self, directions: np.ndarray) -> np.ndarray:
@@ -217,23 +220,21 @@ class LowestCurvature:
         """Over all ranks."""
         return self.comm.allreduce(values)
 
-    def save(self, saved: Checkpoint) -> None:
-        """What the next step's search depends on."""
-        lattice = self.functional.lattice
-        rows = saved.rows["lowest_mode"] = np.zeros((lattice.owned, 3), like=lattice.nodes)
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next step's search depends on."""
+        lattice, searched = self.functional.lattice, self.searched
+        rows = np.zeros((lattice.owned, 3), like=lattice.nodes)
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
-        saved.numbers |= {"searched_greatest": self.searched.greatest, "searched_total": self.searched.total}
-        saved.numbers["knows_mode"] = self.mode is not None
+        numbers = {"searched_greatest": searched.greatest, "searched_total": searched.total}
+        checkpoint.keep({"lowest_mode": rows}, {**numbers, "knows_mode": self.mode is not None})
 
-    def restore(self, saved: Checkpoint) -> None:
-        """Go on from there; from nothing saved as if no step had been taken."""
-        self.searched = Compression(
-            saved.number("searched_greatest", 0, 0), saved.number("searched_total", 0, 0), False
-        )
-        self.mode = None
-        if saved.count("knows_mode", 1):
-            rows = like(self.functional.mass, saved.row("lowest_mode"))
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken."""
+        most, total = (checkpoint.number(name, 0, 0) for name in ("searched_greatest", "searched_total"))
+        self.searched, self.mode = Compression(most, total, False), None
+        if checkpoint.count("knows_mode", 1):
+            rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def destroy(self) -> None:

@@ -2,7 +2,7 @@
 
 The error x - x* solves H e = F(x) but for terms of second order, H the true Hessian. |F|_(M^-1) bounds |e|_M, but
 was seen up to 6000 times too large on stiff bodies; some CG iterations on H, preconditioned as the step is, tell
-more. In the norm of H they have found |e_k|_H^2 = e_k^T F, and miss no more than |r_k|_(P^-1) / sqrt(lambda), P the
+more. In the norm of H their part is |e_k|_H^2 = e_k^T F, and miss no more than |r_k|_(P^-1) / sqrt(lambda), P the
 preconditioner and lambda the least eigenvalue of P^(-1) H, of which CG's own Ritz values tell: the solve ends when
 the second is a part of the first and |e_k|_M hardly grows, or when that is over the error that would do. It does not
 end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the others for that long.
@@ -11,10 +11,11 @@ end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiff
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.solve.linear.operators import Preconditioner, TrueHessian, python_matrix
-from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
+from msmpetsc.solve.linear.preconditioner import Preconditioner
+from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
-LOOK_EVERY = 4  # iterations
+CHECK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
 LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
@@ -22,12 +23,17 @@ MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; ``correction`` is the e it found, ``residual`` what F - H e is left."""
+    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is left."""
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str):
         self.functional, self.hessian = functional, hessian
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
         self.correction, self.residual = self.operator.createVecs()
+        self.length = np.inf  # the last estimate [m sqrt(kg)]
+        self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
+        self.bound = self.enough = np.inf
+        self.lowest = 1.0
+        self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
         self.ksp.setType(PETSc.KSP.Type.CG)
@@ -37,25 +43,24 @@ class ErrorEstimate:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
         self.ksp.setOperators(self.operator, self.operator)
-        self.ksp.setConvergenceTest(self._told_enough)
+        self.ksp.setConvergenceTest(self._converged)
 
-    def __call__(self, f: PETSc.Vec, bound: float, enough: float, lowest: float = 1.0) -> float:
-        """|x - x*|_M at functional.q, where F is f (collective); what comes out over ``enough`` may be too low.
+    def __call__(self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0) -> float:
+        """Estimate |x - x*|_M at an iterate (collective); a result over ``enough`` may be too low.
 
         bound  : on it, |F|_(M^-1) where H is no less than M
         lowest : eigenvalue of M^(-1) H, as far as is known
 
-        Infinite where the Hessian is not positive definite: there no linear correction tells the way.
+        Infinite where the Hessian is not positive definite: there no linear correction shows the way.
         """
-        self.enough, self.f, self.bound = enough, f, bound
-        self.lengths = {}  # |e_k|_M by iteration
-        self.lowest = min(lowest, 1.0)
-        self.linearise()
-        self.ksp.solve(f, self.correction)
-        self.length = self._length_found() if self.ksp.reason > 0 else np.inf
+        self.right_side, self.bound, self.enough = iterate.f, bound, enough
+        self.lowest, self.lengths = min(lowest, 1.0), {}
+        self.linearise(iterate.q)
+        self.ksp.solve(iterate.f, self.correction)
+        self.length = self._length() if self.ksp.reason > 0 else np.inf
         return self.length
 
-    def _length_found(self) -> float:
+    def _length(self) -> float:
         """|e_k|_M, grown once more as it has since k was half of it; or, where CG was cut short, all that it may be."""
         length, its = self.functional.norm(self.correction), self.ksp.its
         left, half = self._left(), self.lengths.get(its // 2, 0.0)
@@ -63,37 +68,39 @@ class ErrorEstimate:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
 
-    def linearise(self) -> None:
-        """Take the Hessian at functional.q."""
-        self.hessian.linearise(self.functional.q, self.functional.contact)
+    def linearise(self, q: np.ndarray) -> None:
+        """Take the Hessian at positions q (l, 3) [m]."""
+        self.hessian.linearise(q, self.functional.problem.contact)
         self.operator.assemble()
 
-    def _told_enough(self, ksp: PETSc.KSP, its: int, residual: float) -> int | None:
+    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> int | None:
+        """Whether the solve has shown what an estimate needs (a convergence test of KSP)."""
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
-        if residual > 0 and (its == 0 or its % (LOOK_EVERY // 2)):
+        if residual > 0 and (its == 0 or its % (CHECK_EVERY // 2)):
             return reasons.ITERATING
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
         if residual == 0 or its >= MOST or length > self.enough:
             return reasons.CONVERGED_ITS
-        if its % LOOK_EVERY or 4 * its**2 * length < self.bound or length > GROWTH * self.lengths[its // 2]:
+        if its % CHECK_EVERY or 4 * its**2 * length < self.bound or length > GROWTH * self.lengths[its // 2]:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
-        """In the norm of H, as far as CG can tell."""
+        """Whether e is near in the norm of H, as far as CG can show."""
         least = ksp.computeExtremeSingularValues()[1]
-        found = ksp.getSolution().dot(self.f)
-        if not (min(least, found) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * found)):
+        energy = ksp.getSolution().dot(self.right_side)
+        if not (min(least, energy) > 0 and residual < CLOSE * np.sqrt(self.lowest * least * energy)):
             return False
         return self._left() < LEFT * self.lengths[ksp.its]
 
     def _left(self) -> float:
-        """No less than what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""
+        """Bound on what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""
         self.residual = self.ksp.buildResidual(self.residual)
         return self.functional.dual_norm(self.residual) / self.lowest
 
     def destroy(self) -> None:
+        """Collective."""
         for owned in (self.ksp, self.correction, self.residual, self.operator):
             owned.destroy()

@@ -1,4 +1,4 @@
-"""What is known of a step that could not be solved, in one line: the reason, the residual, where it is worst, what to try."""
+"""Messages of steps that could not be solved, one line each: the reason, the residual, where it is worst, what to try."""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.locate import inside_out, place_of_greatest
+from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
 if TYPE_CHECKING:
     from msmpetsc.solve.nonlinear.step import Stepper
@@ -21,33 +22,35 @@ REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items(
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
-def not_converged(stepper: "Stepper", iterations: int) -> StepFailed:
-    """SNES gave up; ``stepper.work`` is F where it did (collective)."""
-    snes, ksp = stepper.snes, stepper.ksp
+def not_converged(stepper: "Stepper", iterate: Iterate, iterations: int) -> StepFailed:
+    """SNES gave up at ``iterate`` (collective)."""
+    snes, ksp, now = stepper.snes, stepper.ksp, stepper.control.now
     reason, kind = REASON.get(snes.reason, str(snes.reason)), KINDS.get(snes.reason, "iterations")
-    other = "" if stepper.preset.true_hessian else "another preset (newton), "
-    advice = f'a smaller time.step, {other}a looser solver.error, or safety.on_failure = "substep"'
+    preset = "" if stepper.preset.true_hessian else "another preset (newton), "
+    advice = f'a smaller time.step, {preset}a looser solver.error, or safety.on_failure = "substep"'
     if kind == "linear solve":
         reason += f" (KSP {KSP_REASON.get(ksp.reason, str(ksp.reason))} after {ksp.its} its)"
         advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
     return StepFailed(
-        f"did not converge: {reason} after {iterations} iterations, residual |F| = {stepper.residual:.2e}, "
-        f"relative error {stepper.last_error:.2e}{_where_worst(stepper)}; try {advice}",
+        f"did not converge: {reason} after {iterations} iterations, residual |F| = {now.residual:.2e}, "
+        f"relative error {now.error:.2e}{_worst(stepper.functional, iterate)}; try {advice}",
         kind,
     )
 
 
-def no_minimum(stepper: "Stepper", error: float) -> StepFailed:
-    """All that it came to was none, or farther from one than it seemed; ``stepper.work`` is F at the last (collective)."""
-    seen = "a saddle or a fold" if np.isinf(error) else "a point farther from its solution than it seemed"
+def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
+    """All that the step came to was no minimum, or farther from one than it seemed; ``iterate`` is the last (collective)."""
+    now = stepper.control.now
+    seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
     return StepFailed(
-        f"did not come to a minimum: it came to {seen} {stepper.doubts} times, residual |F| = {stepper.residual:.2e}"
-        f"{_where_worst(stepper)}; try a smaller time.step, or another preset (newton)",
+        f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}"
+        f"{_worst(stepper.functional, iterate)}; try a smaller time.step, or another preset (newton)",
         "no minimum",
     )
 
 
-def _where_worst(stepper: "Stepper") -> str:
-    """Where ``stepper.work``, which is F, pulls farthest, and what is inside out (collective)."""
-    worst = place_of_greatest(stepper.comm, stepper.lattice, *stepper.functional.pull(stepper.work))
-    return f", worst at {worst}{inside_out(stepper.comm, stepper.lattice, stepper.functional.q)}"
+def _worst(functional: StepFunctional, iterate: Iterate) -> str:
+    """Where F pulls farthest, and what is inside out (collective)."""
+    comm, lattice = functional.comm, functional.lattice
+    worst = place_of_greatest(comm, lattice, *functional.pull(iterate.f))
+    return f", worst at {worst}{inside_out(comm, lattice, iterate.q)}"

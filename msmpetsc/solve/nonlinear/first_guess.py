@@ -7,7 +7,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
-SAVED = ("correction", "correction_before")
+STORED = ("correction", "correction_before")
 
 
 class FirstGuess:
@@ -22,19 +22,20 @@ class FirstGuess:
         self.holds = unknowns.total < lattice.table.total  # some nodes are no unknowns
         self.corrections = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
-    def best(self, q: np.ndarray) -> np.ndarray:
-        """The start (l, 3) [m] of the step that the functional has begun, from q = q_n (collective).
+    def best(self) -> np.ndarray:
+        """The start (l, 3) [m] of the step that the functional has begun (collective).
 
         Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
         y and the elastic corrections of the last steps extrapolated, near in smooth motion; and q_n, which after an
         impact is not folded over as y may be, moved by what the free flight moves on average where nothing is held,
         so that a step that stops early keeps the momentum.
         """
-        y, lattice = self.functional.y, self.functional.lattice
+        problem, lattice = self.functional.problem, self.functional.lattice
+        q, y = problem.q, problem.y
         if not self.extrapolate:
             return y
         flight = y.copy()
-        flight[: lattice.owned] += self.functional.t2 * self.functional.load / lattice.mass[:, None]
+        flight[: lattice.owned] += self.functional.t2 * problem.load / lattice.mass[:, None]
         guesses = [y, flight, q + self._drift(flight - q)]
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
@@ -43,27 +44,27 @@ class FirstGuess:
 
     def learn(self, x: np.ndarray) -> None:
         """The step has come to x (l, 3) [m]."""
-        self.corrections = [x - self.functional.y, *self.corrections[:1]]
+        self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
-    def save(self, saved: Checkpoint) -> None:
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store the corrections."""
         if not self.extrapolate:
             return
         lattice = self.functional.lattice
         missing = [np.zeros((lattice.owned, 3), like=lattice.nodes)] * (2 - len(self.corrections))
-        saved.numbers["corrections"] = len(self.corrections)
-        for name, rows in zip(SAVED, [*self.corrections, *missing], strict=True):
-            saved.rows[name] = rows[: lattice.owned]
+        rows = [rows[: lattice.owned] for rows in (*self.corrections, *missing)]
+        checkpoint.keep(dict(zip(STORED, rows, strict=True)), {"corrections": len(self.corrections)})
 
-    def restore(self, saved: Checkpoint) -> None:
-        """Collective."""
-        names = SAVED[: saved.count("corrections", len(SAVED))]
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
+        names = STORED[: checkpoint.count("corrections", len(STORED))]
         comm, lattice = self.functional.comm, self.functional.lattice
-        self.corrections = [with_ghosts(comm, lattice, saved.row(name)) for name in names]
+        self.corrections = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
 
     def _held(self, guess: np.ndarray) -> np.ndarray:
         """The guess, but with the held nodes where they will be."""
         lattice = self.functional.lattice
-        return np.where(lattice.pinned[:, None], self.functional.q, guess) if self.holds else guess
+        return np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess) if self.holds else guess
 
     def _drift(self, moved: np.ndarray) -> np.ndarray | float:
         """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""

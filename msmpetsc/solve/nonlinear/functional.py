@@ -4,6 +4,8 @@ g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), for implicit Euler y = 
 F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -14,61 +16,96 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 
 
-class StepFunctional:
-    """g of the step that ``begin`` was last told of, at vectors of unknowns. All methods are collective.
+@dataclass(frozen=True)
+class StepProblem:
+    """Data of one implicit step.
 
-    q : (l, 3) [m] positions last looked at, ghosts included
-    y : (l, 3) [m]
+    q          : q_n (l, 3) [m], ghosts included
+    y          : where the nodes would be without forces (l, 3) [m]
+    load       : f_ext (owned, 3) [N]
+    contact    : penalties that press on the nodes in this step
+    prescribed : q_n with the anchored nodes where they will be (l, 3) [m]; None if they stay
+    """
+
+    q: np.ndarray
+    y: np.ndarray
+    load: np.ndarray
+    contact: Contact | None = None
+    prescribed: np.ndarray | None = None
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """Positions (l, 3) [m] whose rows of fixed nodes hold at the end of the step."""
+        return self.q if self.prescribed is None else self.prescribed
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Point that a solver came to: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
+
+    q: np.ndarray
+    f: PETSc.Vec
+
+
+class StepFunctional:
+    """g of the problem given to ``begin``. All methods are collective.
+
+    Positions are (l, 3) [m], ghosts included; PETSc's vectors are of unknowns (solve.linear.unknowns).
     """
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
         self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
         self.lattice, self.memory = unknowns.lattice, unknowns.memory
-        self.q, self.gradient = np.empty_like(self.lattice.nodes), np.empty_like(self.lattice.nodes)
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
         self.per_mass = 1 / self.mass
+        nodes = self.lattice.nodes
+        self.problem = StepProblem(nodes, nodes, np.zeros((self.lattice.owned, 3), like=nodes))
+        self.extent = 0.0  # greatest coordinate of the problem's q [m]
+        self._gradient = np.empty_like(nodes)
 
-    def begin(
-        self, q: np.ndarray, y: np.ndarray, load: np.ndarray, contact: Contact | None, prescribed: np.ndarray | None
-    ) -> None:
-        """A new step, as Stepper.step takes it."""
-        self.y, self.load, self.contact = y, load, contact
-        self.q[:] = q if prescribed is None else prescribed  # held nodes stay there
-        self.reach = self.comm.allreduce(greatest(np.abs(q)), MPI.MAX)  # [m]
+    def begin(self, problem: StepProblem) -> None:
+        """Take the data of a new step."""
+        self.problem = problem
+        self.extent = self.comm.allreduce(greatest(np.abs(problem.q)), MPI.MAX)
 
-    def gradient_at(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """f = F(x) [kg m]."""
-        self.unknowns.to_nodes(x, self.q)
-        self.gradient[:] = 0
-        self.elasticity.add_gradient(self.q, self.gradient)
-        owned = self.lattice.owned
-        self.gradient[:owned] -= self.load
-        if self.contact:
-            self.contact.add_gradient(self.q, self.gradient)
-        moved = self.q[:owned] - self.y[:owned]
-        self.unknowns.scaled_sum(moved, self.t2, self.gradient, f)
+    def positions(self, x: PETSc.Vec) -> np.ndarray:
+        """Positions (l, 3) [m] of unknowns x, the fixed nodes where the problem has them."""
+        q = self.problem.fixed.copy()
+        self.unknowns.to_nodes(x, q)
+        return q
+
+    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec) -> Iterate:
+        """Positions of x, and F there, written into f [kg m]."""
+        q, gradient, owned = self.positions(x), self._gradient, self.lattice.owned
+        gradient[:] = 0
+        self.elasticity.add_gradient(q, gradient)
+        gradient[:owned] -= self.problem.load
+        if self.problem.contact:
+            self.problem.contact.add_gradient(q, gradient)
+        self.unknowns.scaled_sum(q[:owned] - self.problem.y[:owned], self.t2, gradient, f)
+        return Iterate(q, f)
 
     def value(self, q: np.ndarray) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart."""
-        owned = slice(self.lattice.owned)
-        moved = q[owned] - self.y[owned]
-        acting = self.elasticity.energy(q) - float(np.vdot(moved, self.load))
-        if self.contact:
-            acting += self.contact.change(q, self.y)
+        problem, owned = self.problem, slice(self.lattice.owned)
+        moved = q[owned] - problem.y[owned]
+        acting = self.elasticity.energy(q) - float(np.vdot(moved, problem.load))
+        if problem.contact:
+            acting += problem.contact.change(q, problem.y)
         inertia = 0.5 * self._inner(moved, moved)
         return self.comm.allreduce(inertia + self.t2 * acting)
 
-    def change(self, x: PETSc.Vec, base: np.ndarray) -> tuple[float, float]:
-        """g(x) - g(base) [kg m^2] and |x - base|^2 [m^2], base (l, 3); a difference that keeps its digits."""
-        self.unknowns.to_nodes(x, self.q)
-        owned = slice(self.lattice.owned)
-        moved = self.q[owned] - base[owned]
-        twice = self.q[owned] + base[owned] - 2 * self.y[owned]
+    def change(self, q: np.ndarray, base: np.ndarray) -> tuple[float, float]:
+        """g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3); a difference that keeps its digits."""
+        problem, owned = self.problem, slice(self.lattice.owned)
+        moved = q[owned] - base[owned]
+        twice = q[owned] + base[owned] - 2 * problem.y[owned]
         inertia = 0.5 * self._inner(moved, twice)
-        elastic = self.elasticity.change(self.q, base) - float(np.vdot(moved, self.load))
-        if self.contact:
-            elastic += self.contact.change(self.q, base)
-        return tuple(self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])))
+        elastic = self.elasticity.change(q, base) - float(np.vdot(moved, problem.load))
+        if problem.contact:
+            elastic += problem.contact.change(q, base)
+        change, squared = self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))]))
+        return change, squared
 
     def _inner(self, a: np.ndarray, b: np.ndarray) -> float:
         """a^T M b of this rank's (owned, 3)."""
@@ -87,10 +124,10 @@ class StepFunctional:
         columns = (self.memory.read(f) * self.per_mass).reshape(3, -1)
         return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
-    def away(self, correction: PETSc.Vec | None = None) -> float:
+    def distance(self, q: np.ndarray, correction: PETSc.Vec | None = None) -> float:
         """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""
         free = self.unknowns.free
-        columns = (self.q[free] - self.y[free]).T.ravel()
+        columns = (q[free] - self.problem.y[free]).T.ravel()
         if correction is not None:
             columns -= self.memory.read(correction)
         return np.sqrt(self.comm.allreduce(float(columns**2 @ self.mass)))

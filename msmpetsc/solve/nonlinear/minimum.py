@@ -13,21 +13,23 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import greatest
 from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
 DOUBTFUL = 30.0  # times what both say may then be the error: it was seen 10 times as large in a valley
-SLOPE = (
-    0.25  # over what the curvature makes of it on the first move: a less one, as of a symmetric body, may be rounding
-)
+SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
 @dataclass(frozen=True)
-class Finding:
-    """error: relative, of x, infinite where no estimate can be had; direction (n,): of negative curvature, None if none
-    was found; curvature: of it, an eigenvalue of M^(-1) H."""
+class Examination:
+    """Verdict on a point x.
+
+    error     : relative, of x; infinite where no estimate can be had
+    direction : (n,) of negative curvature; None where there is none
+    curvature : of it, an eigenvalue of M^(-1) H
+    """
 
     error: float
     direction: np.ndarray | None = None
@@ -42,8 +44,10 @@ class Minimum:
         self.unknowns, self.memory = functional.unknowns, functional.memory
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
 
-    def examine(self, x: PETSc.Vec, corrected: bool, compression: Compression, alarmed: bool, enough: float) -> Finding:
-        """What there is at x, or rather at x less its estimated error.
+    def examine(
+        self, x: PETSc.Vec, corrected: bool, compression: Compression, alarmed: bool, enough: float
+    ) -> Examination:
+        """Examine x, or rather the point that is x less its estimated error.
 
         corrected : whether estimate.correction is of x
         alarmed   : whether something has shown a negative curvature
@@ -55,63 +59,65 @@ class Minimum:
         if corrected:
             estimate.correction.copy(self.first)
             self.nearer.axpy(-1.0, self.first)
-        functional.gradient_at(self.nearer, self.f)  # functional.q is there from now on
-        estimate.linearise()
+        nearer = functional.evaluate(self.nearer, self.f)
+        estimate.linearise(nearer.q)
         bent = self._bent()
-        value, direction = self.curvature.lowest(compression, alarmed, estimate.correction if alarmed else None)
+        hint = estimate.correction if alarmed else None
+        value, direction = self.curvature.lowest(nearer.q, compression, alarmed, hint)
         if value < 0:
-            return Finding(np.inf, direction, value)
+            return Examination(np.inf, direction, value)
         value = min(value, 1.0)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Finding(estimate.length / functional.away())
-        return Finding(self._second_estimate(functional.dual_norm(self.f) / value, enough, value))
+            return Examination(estimate.length / functional.distance(nearer.q))
+        return Examination(self._second_estimate(nearer, functional.dual_norm(self.f) / value, enough, value))
 
     def _bent(self) -> float:
         """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
         self.estimate.residual.aypx(-1.0, self.f)
         return self.functional.dual_norm(self.estimate.residual)
 
-    def _second_estimate(self, bound: float, enough: float, lowest: float) -> float:
-        """The error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of little but
+    def _second_estimate(self, nearer: Iterate, bound: float, enough: float, lowest: float) -> float:
+        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of little but
         rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
         functional, correction = self.functional, self.estimate.correction
-        first = functional.norm(self.first)
-        second = self.estimate(self.f, bound, enough, lowest)
+        first, distance = functional.norm(self.first), functional.distance(nearer.q)
+        second = self.estimate(nearer, bound, enough, lowest)
         if not np.isfinite(second):
-            return (first + bound) / functional.away() if lowest > CONVEX else np.inf
+            return (first + bound) / distance if lowest > CONVEX else np.inf
         if first > 0 and second > SMALL * first:
-            return DOUBTFUL * max(first, second) / functional.away()
+            return DOUBTFUL * max(first, second) / distance
         self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
-        return functional.norm(self.first) / functional.away(correction)
+        return functional.norm(self.first) / functional.distance(nearer.q, correction)
 
-    def go_on(self, x: PETSc.Vec, finding: Finding) -> bool:
+    def go_on(self, x: PETSc.Vec, examination: Examination) -> bool:
         """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
         way that g falls, as far as doubling the move lets it fall; whether it has moved."""
         functional = self.functional
-        self.unknowns.to_nodes(x, functional.q)
-        base = functional.q.copy()
-        falls = functional.change(self.nearer, base)[0] < 0
+        falls = functional.change(functional.positions(self.nearer), functional.positions(x))[0] < 0
         if falls:
             self.nearer.copy(x)
-        direction = finding.direction
-        if direction is None:
+        if examination.direction is None:
             return falls
-        functional.gradient_at(x, self.f)
-        base[:] = functional.q
+        return self._descend(x, examination.direction, examination.curvature) or falls
+
+    def _descend(self, x: PETSc.Vec, direction: np.ndarray, curvature: float) -> bool:
+        """Move x along a direction (n,) of negative curvature; whether g falls that way."""
+        functional = self.functional
+        base = functional.evaluate(x, self.f).q
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
         longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        if slope > SLOPE * abs(finding.curvature) * move:  # else both ways lead down, and ranks must not differ
+        if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move
         best = lowest = 0.0
         for _ in range(MOVES):
             self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
-            change, _ = functional.change(self.f, base)
+            change, _ = functional.change(functional.positions(self.f), base)
             if not change < lowest:
                 break
             best, lowest, move = move, change, 2 * move
         self.memory.write(x)[:] += best * direction
-        return falls or best != 0.0
+        return best != 0.0
 
     def destroy(self) -> None:
         for owned in (self.nearer, self.f, self.first):

@@ -1,7 +1,5 @@
 """Steps solved to rounding beside a run: what their true errors are measured against."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -9,25 +7,14 @@ from petsc4py import PETSc
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
 
 PRESET, ERROR = "newton-multigrid", 1e-10
 PREFIX = "reference_"  # of its PETSc options
 STAGE = "reference"  # of PETSc's log, so that its time is told apart
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A step, as Stepper.step takes it."""
-
-    q: np.ndarray
-    y: np.ndarray
-    load: np.ndarray
-    contact: Contact | None
-    prescribed: np.ndarray | None
 
 
 class Reference:
@@ -40,7 +27,7 @@ class Reference:
         self.stepper.set_up()
         self.stage.pop()
 
-    def errors(self, problem: Problem, positions: list[np.ndarray]) -> np.ndarray:
+    def errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
         """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
@@ -48,11 +35,11 @@ class Reference:
         self.stage.push()
         try:
             self.stepper.restore(Checkpoint())  # what is measured does not depend on what was measured before
-            exact = self.stepper.step(**vars(problem), start=positions[-1]).position
-            away = self._distances(problem.y, exact)
-            found = np.array([self._distances(x, exact) for x in positions])
-            errors = np.divide(found, away, out=np.zeros_like(found), where=away > 0)
-            errors[:, 0] = [self.stepper.rounding.added_to(error, away[0]) for error in errors[:, 0]]
+            exact = self.stepper.step(problem, positions[-1]).position
+            start = self._distances(problem.y, exact)
+            distances = np.array([self._distances(x, exact) for x in positions])
+            errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
+            errors[:, 0] = [self.stepper.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
             return errors
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
@@ -66,7 +53,8 @@ class Reference:
         stepper.unknowns.from_nodes(x - exact, stepper.x)
         distance = stepper.functional.norm(stepper.x)
         stepper.unknowns.from_nodes(x, stepper.x)
-        return np.array([distance, stepper.functional.change(stepper.x, exact)[0]])
+        q = stepper.functional.positions(stepper.x)
+        return np.array([distance, stepper.functional.change(q, exact)[0]])
 
     def destroy(self) -> None:
         """Collective."""

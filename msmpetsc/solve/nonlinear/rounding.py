@@ -31,7 +31,7 @@ class Rounding:
     def is_all_of(self, f: PETSc.Vec) -> bool:
         """Whether F is nothing but rounding, row by row, for soft parts have less of it than stiff ones."""
         functional = self.functional
-        rows = np.abs(functional.memory.read(f)) / (self.rows * max(functional.reach, np.finfo(float).tiny))
+        rows = np.abs(functional.memory.read(f)) / (self.rows * max(functional.extent, np.finfo(float).tiny))
         squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
         return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= OF_ONE_ROW)
 
@@ -41,8 +41,8 @@ class Rounding:
 
         Raises StepFailed where rounding moves the body about as far as its forces do.
         """
-        reach = self.functional.reach
-        moved, size = self.moved * reach, self.size * reach
+        extent = self.functional.extent
+        moved, size = self.moved * extent, self.size * extent
         if moved > max(NEGLIGIBLE * size, HOPELESS * away):
             raise StepFailed(
                 f"cannot be solved in double precision: rounding in the stiffest springs moves the body by "

@@ -1,4 +1,4 @@
-"""What PETSc says of options that it cannot use, as the one line of an InputError."""
+"""Errors of PETSc about options that it cannot use, as the one line of an InputError."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,8 +11,8 @@ NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked
 
 
 @contextmanager
-def refusal(what: str, abandon: Callable[[], None] = lambda: None, others: type = PETSc.Error) -> Iterator[None]:
-    """PETSc's errors in the block, or in the function decorated, become InputError ``what``: its last words.
+def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None, others: type = PETSc.Error) -> Iterator[None]:
+    """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
     ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
     option made that an error, becomes StepFailed.

@@ -1,0 +1,78 @@
+"""Contact faces of an implicit step: by which face each node is pushed out of an obstacle."""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.errors import StepFailed
+from msmpetsc.model.environment import Environment
+from msmpetsc.solve.nonlinear.functional import StepProblem
+
+MOST_SOLVES = 10  # of a step, for nodes that pass through a box
+
+
+class ContactFaces:
+    """Search for the faces of one step, from q to its end. All methods are collective.
+
+    They are settled before the step is solved, by the way to y. Where the way to x shows others, the step is solved
+    again; from then on a node that has a face keeps it, so that this ends.
+
+    q, y       : (l, 3) [m], as a StepProblem has them
+    time       : of the step's end [s]
+    before     : (o, l) faces when it began (model.environment); None: the nearest
+    fixed      : (l,) bool, nodes that are no unknowns
+    sides      : (o, l) faces of the problem to solve; once settled, those of the step
+    is_settled : the problem solved last was the right one
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        environment: Environment,
+        q: np.ndarray,
+        y: np.ndarray,
+        *,
+        time: float,
+        time_step: float,
+        before: np.ndarray | None,
+        fixed: np.ndarray,
+    ):
+        self.comm, self.environment, self.q, self.y = comm, environment, q, y
+        self.time, self.time_step, self.before, self.fixed = time, time_step, before, fixed
+        self.solves, self.is_settled = 0, False
+        self.sides = self._crossed(y)
+
+    def _crossed(self, end: np.ndarray) -> np.ndarray:
+        """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
+        return self.environment.met(self.q, end, self.time, self.time_step, self.before, self.fixed)
+
+    def problem(self) -> StepProblem:
+        """The step with the faces as they are known now."""
+        environment, time = self.environment, self.time
+        contact = environment.contact(self.q, time, self.time_step, self.sides)
+        return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
+
+    def compare(self, x: np.ndarray) -> None:
+        """Know the faces anew from the solution x (l, 3) [m]. Raises StepFailed where they do not settle."""
+        crossed, pressing = self._crossed(x), self.environment.pressing
+        sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
+        self.solves += 1
+        self.is_settled = not self._differs(x, sides)
+        if not self.is_settled:
+            self.sides = sides
+            if self.solves == MOST_SOLVES:
+                raise StepFailed(
+                    f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came in "
+                    'by; try a smaller time.step, or safety.on_failure = "substep"',
+                    "contact",
+                )
+            return
+        if self.environment.penalties:  # what reflects goes by the way to x alone
+            crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
+        self.sides = crossed
+
+    def _differs(self, x: np.ndarray, sides: np.ndarray) -> bool:
+        """Whether penalties press on any node at x otherwise with ``sides``."""
+        if not (self.environment.has_sides and self.environment.penalties):
+            return False
+        alike = self.environment.pushes_alike(x, self.time, self.sides, sides)
+        return self.comm.allreduce(not alike, MPI.LOR)

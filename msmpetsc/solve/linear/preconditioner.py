@@ -1,0 +1,121 @@
+"""Preconditioner of a step's linear solves: any PETSc preconditioner of A, with what bounds contact on its diagonal."""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import like
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.solve.linear.operators import Block
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.memory import HOST, Memory
+
+DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
+
+
+class Preconditioned:
+    """Context of the MATPYTHON (3m x 3m) that stands for A where PETSc wants a matrix to precondition with."""
+
+    def __init__(self, matrix: PETSc.Mat):
+        self.matrix = matrix
+
+    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        self.matrix.view(viewer)
+
+
+class Preconditioner:
+    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
+
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
+    preconditioned with.
+
+    matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
+    """
+
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str):
+        self.matrix, self.memory, self.columns = matrix, memory, columns
+        self.blocks: list[Block] = []
+        self.pc = PETSc.PC().create(matrix.comm)
+        self.pc.setOptionsPrefix(prefix)
+        self.pc.setOperators(matrix)
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        self.pc.setFromOptions()
+
+    def setUp(self, _: PETSc.PC) -> None:
+        self.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        if self.columns == 1:
+            self.pc.apply(x, y)
+            return
+        right, solution = self.blocks = self.blocks or self._create_blocks()
+        values = right.values
+        values[:] = like(values, self.memory.read(x))
+        self.pc.matApply(right.mat, solution.mat)
+        columns = self.memory.write(y)
+        columns[:] = like(columns, solution.values)
+
+    def _create_blocks(self) -> list[Block]:
+        """Blocks where the inner preconditioner works: a direct solver does on the CPU."""
+        memory = HOST if self.pc.getType() in DIRECT else self.memory
+        return [Block(self.matrix, memory), Block(self.matrix, memory)]
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.pc.view(viewer)
+
+    def destroy(self, _: PETSc.PC) -> None:
+        for part in (*self.blocks, self.pc):
+            part.destroy()
+
+
+class ContactDiagonal:
+    """Diagonal of the matrix that is preconditioned: that of A, and what bounds the blocks of contact.
+
+    A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
+
+    own   : (k,) diagonal of A or A (x) I_3, of this rank [kg]
+    added : (k,) t^2 times what is added to it, over t^2 [N/m]
+    """
+
+    def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, time_step: float):
+        self.matrix, self.unknowns, self.t2 = matrix, unknowns, time_step**2
+        self.vector = matrix.createVecLeft()
+        matrix.getDiagonal(self.vector)
+        self.own = unknowns.memory.read(self.vector).copy()
+        self.added = np.zeros_like(self.own)
+
+    def follow(self, comm: MPI.Comm, contact: Contact | None, q: np.ndarray) -> bool:
+        """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
+        owned = self.unknowns.lattice.owned
+        bound = self._columns(contact.bound(q) if contact else np.zeros(owned, like=q))
+        changed = comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
+        if changed:
+            self._add(bound)
+        return changed
+
+    def _columns(self, bound: np.ndarray) -> np.ndarray:
+        """(k,) of a bound of each owned node [N/m]."""
+        free = bound[self.unknowns.free]
+        return np.tile(free, len(self.own) // max(len(free), 1))
+
+    def _add(self, bound: np.ndarray) -> None:
+        self.added = bound
+        self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
+        self.matrix.setDiagonal(self.vector)
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store the bound: where it does not change, the preconditioner of the last step is kept."""
+        bound = np.zeros(self.unknowns.lattice.owned, like=self.added)
+        bound[self.unknowns.free] = self.added[: self.unknowns.size]
+        checkpoint.keep(rows={"contact_bound": bound})
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
+        bound = checkpoint.rows.get("contact_bound", np.zeros(self.unknowns.lattice.owned))
+        self._add(self._columns(like(self.added, bound)))
+
+    def destroy(self) -> None:
+        """Collective."""
+        self.vector.destroy()

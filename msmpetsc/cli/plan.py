@@ -64,7 +64,8 @@ def try_all(args: argparse.Namespace, target: float) -> list:
     signal.signal(signal.SIGTERM, stop)
     processes = Processes()
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
-        planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, tell)
+        bench = Bench(Path(folder), processes)
+        planner = Planner(args.scene, bench, presets=PRESETS, frames=args.frames, ranks=args.ranks, report=tell)
         print(HEAD, flush=True)
         try:
             trials = planner.for_step(target) if args.error is None else planner.for_trajectory(target)

@@ -1,7 +1,6 @@
 """What a run cost, as `--measure` writes it: where the time went, memory, and on what machine."""
 
 import json
-import os
 import platform
 import resource
 import shlex
@@ -14,6 +13,7 @@ from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.machine import machine
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 
@@ -80,15 +80,6 @@ def peak_memory() -> int:
     lines = status.read_text().splitlines() if status.exists() else []
     found = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
     return 1024 * (found[0] if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-
-
-def machine() -> dict:
-    """Processor, cores, memory [bytes], system."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    cpu = names[0] if names else platform.processor() or platform.machine()
-    return {"cpu": cpu, "cores": os.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
 
 
 def versions() -> dict:

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         tell_cases(args, folder)
         return 0
     try:
-        rows = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart, part)
+        rows = run_study(args.study, folder, PRESETS, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
     except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename or folder}: {error.strerror}") from None
     tell_of(rows)

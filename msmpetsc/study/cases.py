@@ -20,7 +20,7 @@ from msmpetsc.study.schema import Axis, Length, Map, Method, ReferenceRun, Study
 
 
 class Key(NamedTuple):
-    """Where the value of a case's key goes.
+    """The destinations of the value of a case's key.
 
     override : table and key of the scene
     argument : of ``msmpetsc run``
@@ -98,7 +98,7 @@ class Case:
 
     @property
     def id(self) -> str:
-        """The same for the same run, whatever it is called, however long it may take."""
+        """Digest of what defines the run, whatever it is called, however long it may take."""
         what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
         what |= {"place": asdict(self.point)} if self.point else {}  # as tables of before have it
@@ -111,7 +111,7 @@ class Case:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """What the table says of the case before it runs."""
+        """Columns of the table that are known before the case runs."""
         row = {name: getattr(self, name) for name, key in KEYS.items() if key.column}
         if self.point:
             row |= {"map": self.point.map, "x": str(self.point.x), "y": str(self.point.y)}
@@ -218,7 +218,7 @@ def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str]
     for sweep in study.sweep:
         for scene in study.scene:
             wanted = (not sweep.scenes or scene.name in sweep.scenes) and (full or not (sweep.full or scene.full))
-            for case in sweep_cases(study, scene, sweep, folder, presets) if wanted else ():
+            for case in sweep_cases(study, scene, sweep, folder=folder, presets=presets) if wanted else ():
                 by_id.setdefault(case.id, case)
     for map in study.map:
         for case in map_cases(study, map, folder, presets) if full or not map.full else ():
@@ -235,7 +235,7 @@ def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]
 
 
 def sweep_cases(
-    study: Study, scene: StudyScene, sweep: Sweep, folder: Path, presets: Collection[str] | None
+    study: Study, scene: StudyScene, sweep: Sweep, *, folder: Path, presets: Collection[str] | None
 ) -> Iterator[Case]:
     """Yield the cases of a sweep over a scene: its lists multiplied with each other."""
     file = folder / scene.file
@@ -303,10 +303,10 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
         return None
     frame = scene.frame or as_given.time.step
     duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
-    return reference_case(base, scene.reference, frame, duration, as_given)
+    return reference_case(base, scene.reference, as_given, frame=frame, duration=duration)
 
 
-def reference_case(base: Case, reference: ReferenceRun, frame: float, duration: float, scene: Scene) -> Case:
+def reference_case(base: Case, reference: ReferenceRun, scene: Scene, *, frame: float, duration: float) -> Case:
     """Return a run of the same lattice with tiny steps; frame, duration [s]."""
     case = replace(
         base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
@@ -327,7 +327,7 @@ def reference_case(base: Case, reference: ReferenceRun, frame: float, duration: 
 
 @dataclass(frozen=True)
 class MapScene:
-    """What all methods are tried on: a scene with its changes. y may be the name of a case, x is then the method's.
+    """A scene with its changes, which all methods are tried on. y may be the name of a case, x is then the method's.
 
     length : of a run; the scene's own duration where it says nothing
     """

@@ -45,7 +45,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of a method.
+    """The result of a method that was tried.
 
     cost  : computing seconds a simulated second
     error : as asked for; both None with a reason where there is none
@@ -80,7 +80,7 @@ def nearest_miss(trials: Iterable[Trial]) -> Trial | None:
     return min(known)[2] if known else None
 
 
-def plan_trajectory(attempt: Try, step: float, target: float, verlet: bool, methods: Collection) -> list[Trial]:
+def plan_trajectory(attempt: Try, step: float, target: float, *, verlet: bool, methods: Collection) -> list[Trial]:
     """Try verlet, which needs one trial; then newton with steps as short as they must be; then methods like it."""
     done: list[Trial] = []
     if verlet:
@@ -159,6 +159,7 @@ class Planner:
         self,
         scene: Path,
         bench: Bench,
+        *,
         presets: Collection[str],
         frames: int,
         ranks: int,
@@ -177,7 +178,9 @@ class Planner:
         self.figure = "trajectory_error"
         probe = self._probe()
         self.reference = self._finest(probe)
-        return plan_trajectory(self._attempt(target), self.step, target, probe is not None, self._methods())
+        return plan_trajectory(
+            self._attempt(target), self.step, target, verlet=probe is not None, methods=self._methods()
+        )
 
     def for_step(self, target: float) -> list[Trial]:
         """Return the trials for an error of the step."""

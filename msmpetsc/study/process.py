@@ -28,7 +28,7 @@ OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_defa
 
 @dataclass(frozen=True)
 class Ended:
-    """How a process ended.
+    """The end of a process.
 
     status  : exit status, None where time ran out
     reason  : the last line of trouble, "" if status is 0
@@ -78,7 +78,7 @@ class Processes:
 
     @property
     def stopped(self) -> bool:
-        """Whether no process is started any more."""
+        """True once no process is started any more."""
         return self._stopped
 
     def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen | Forked | None:

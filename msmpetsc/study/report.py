@@ -196,10 +196,10 @@ def winner(name: str, best: list[Row]) -> str:
     """Return the label of the cheapest and what it costs; then those within its noise."""
     if not best:
         return "none"
-    row, *others = best
+    row, *near = best
     step = f", {formatting.stepping(row)}" if name == TRAJECTORY.name else ""
-    near = f"; or {', '.join(other['label'] for other in others)}" if others else ""
-    return f"{row['label']}: {cost_of(row, MEASURES[name])}{step}{near}"
+    rivals = f"; or {', '.join(rival['label'] for rival in near)}" if near else ""
+    return f"{row['label']}: {cost_of(row, MEASURES[name])}{step}{rivals}"
 
 
 def failures(table: "DataFrame") -> HtmlTable:
@@ -211,8 +211,8 @@ def failures(table: "DataFrame") -> HtmlTable:
 
 def whole_table(table: "DataFrame") -> dict[str, Any]:
     """Return the whole table, and what all its cases share, which stands above it."""
-    others = [str(name) for name in table if name not in COLUMNS]
-    order = [name for name in (*TEXT, *NUMBERS, *others) if name not in (*FIRST, LAST)]
+    unknown = [str(name) for name in table if name not in COLUMNS]
+    order = [name for name in (*TEXT, *NUMBERS, *unknown) if name not in (*FIRST, LAST)]
     filled = [name for name in order if (table[name].notna() & (table[name] != "")).any()]
     agreed = [name for name in filled if len(table) > 1 and table[name].nunique(dropna=False) == 1]
     differing = sorted(

@@ -137,7 +137,7 @@ def _remove_files(path: Path, log: bool) -> None:
 
 @dataclass
 class StudyResults:
-    """What is known so far, in its folder: rows and traces by case, in the order of ``order``."""
+    """Rows and traces of a study so far, by case, in its folder and in the order of ``order``."""
 
     folder: Path
     order: Sequence[str]
@@ -183,6 +183,7 @@ def run_study(
     path: Path,
     folder: Path,
     presets: Collection[str] | None,
+    *,
     full: bool = False,
     jobs: int | None = None,
     restart: bool = False,
@@ -207,7 +208,8 @@ def run_study(
     (own / "study.toml").write_bytes(path.read_bytes())
     results.write()
     todo = [every[case] for case in wanted if not _is_done(every[case], results.rows)]
-    _carry_out(Bench(own, Processes(), path.stem), todo, results, jobs or study.jobs, len(wanted) - len(todo))
+    bench = Bench(own, Processes(), path.stem)
+    _carry_out(bench, todo, results, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
     return [results.rows[case] for case in wanted]
 
 
@@ -229,7 +231,7 @@ def _cases(
     return every, [case.id for case in study_cases(study, path.parent, full, presets)]
 
 
-def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, jobs: int, done: int) -> None:
+def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
     """Run cases and keep their results; ``done`` were before."""
     work = {case.id: case.work for case in todo}
     progress = StudyProgress(list(work.values()), done)

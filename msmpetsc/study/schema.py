@@ -90,7 +90,7 @@ class Length(Table):
 
     @field_validator("duration")
     @classmethod
-    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
+    def _single_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
         if duration is not None and info.data.get("steps") is not None:
             raise rule("must not stand beside steps", "steps")
         return duration
@@ -246,7 +246,7 @@ class Study(Table):
 
     @field_validator("sweep")
     @classmethod
-    def _scenes_are_there(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
+    def _scenes_known(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
         _known([name for sweep in sweeps for name in sweep.scenes], "scene", info)
         return sweeps
 
@@ -269,7 +269,7 @@ class Study(Table):
 
     @field_validator("order")
     @classmethod
-    def _orders_are_there(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
+    def _orders_known(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
         _known([order.scene for order in orders], "scene", info)
         return orders
 

@@ -145,8 +145,8 @@ def typed(texts: "DataFrame | Iterable[Mapping[str, str]]") -> "DataFrame":
 
     texts = DataFrame(texts if isinstance(texts, DataFrame) else list(texts))
     stripped = texts.fillna("").map(str.strip)
-    others = [name for name in stripped if name not in COLUMNS]
-    table = stripped.reindex(columns=[*COLUMNS, *others], fill_value="").astype(object).fillna("")
+    unknown = [name for name in stripped if name not in COLUMNS]
+    table = stripped.reindex(columns=[*COLUMNS, *unknown], fill_value="").astype(object).fillna("")
     return table.assign(**{name: table[name].map(_number).astype(float) for name in NUMBERS})
 
 

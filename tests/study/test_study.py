@@ -23,7 +23,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.writer import ResultFile
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study import runner
+from msmpetsc.study import runner, table
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.distances import common_times, trajectory_error
 from msmpetsc.study.metrics import of_frames, together
@@ -522,7 +522,9 @@ def test_a_plan_takes_the_cheapest_that_meets_the_error():
             return 100.0, 1e-5
         return 0.1 * factor[method.preset] / method.time_step, 5 * method.time_step + 0.01 * method.step_error
 
-    trials = plan_trajectory(attempt_with(model), 0.02, 0.03, True, [("newton-multigrid", ""), ("anderson", "")])
+    trials = plan_trajectory(
+        attempt_with(model), 0.02, 0.03, verlet=True, methods=[("newton-multigrid", ""), ("anderson", "")]
+    )
     best = cheapest(trials, 0.03)
     assert best.method.preset == "anderson" and best.method.time_step == 0.005  # 0.1 at 0.02 s, 0.025 at 0.005 s
     assert best.cost == min(trial.cost for trial in trials if trial.error <= 0.03)
@@ -535,25 +537,27 @@ def test_a_plan_does_not_try_what_cannot_become_cheapest():
         attempt_with(lambda m: (1.0, 1e-5) if m.integrator == "verlet" else (50.0, 0.2)),
         0.02,
         1e-3,
-        True,
-        [("anderson", "")],
+        verlet=True,
+        methods=[("anderson", "")],
     )
     assert len(trials) == 2 and cheapest(trials, 1e-3).method.integrator == "verlet"
 
 
 def test_a_plan_that_cannot_meet_the_error_ends():
-    trials = plan_trajectory(attempt_with(lambda m: (1.0, 0.5)), 0.02, 1e-3, False, [("anderson", "")])
+    trials = plan_trajectory(attempt_with(lambda m: (1.0, 0.5)), 0.02, 1e-3, verlet=False, methods=[("anderson", "")])
     assert cheapest(trials, 1e-3) is None and len(trials) <= 6
-    failed = plan_trajectory(lambda m, _: Trial(m, None, None, "failed"), 0.02, 1e-3, True, [])
+    failed = plan_trajectory(lambda m, _: Trial(m, None, None, "failed"), 0.02, 1e-3, verlet=True, methods=[])
     assert cheapest(failed, 1e-3) is None and len(failed) == 2
 
 
 def test_a_plan_solves_the_steps_better_where_that_is_what_is_wrong():
     """The error is the steps' own: no shorter step helps, a tenth of the step error does."""
-    trials = plan_trajectory(attempt_with(lambda m: (1 / m.time_step, 3 * m.step_error)), 0.02, 0.05, False, [])
+    trials = plan_trajectory(
+        attempt_with(lambda m: (1 / m.time_step, 3 * m.step_error)), 0.02, 0.05, verlet=False, methods=[]
+    )
     assert cheapest(trials, 0.05).method.step_error == pytest.approx(0.005)
     stubborn = plan_trajectory(
-        attempt_with(lambda m: (1.0, 0.5 if m.time_step > 0.003 else 0.01)), 0.02, 0.05, False, []
+        attempt_with(lambda m: (1.0, 0.5 if m.time_step > 0.003 else 0.01)), 0.02, 0.05, verlet=False, methods=[]
     )
     assert cheapest(stubborn, 0.05).method.time_step < 0.003  # a better solution did not help: on to shorter steps
 
@@ -668,3 +672,22 @@ def test_a_plan_refuses_with_status_2_and_one_line(tmp_path: Path, capsys, own_l
     assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("msmpetsc: error: ") and words in line
+
+
+# What a study needs
+
+
+def test_only_a_table_and_its_charts_load_what_they_need():
+    """A plan, a forecast and the start of a study do without pandas, matplotlib and jinja2."""
+    modules = "msmpetsc.study.runner, msmpetsc.study.plan, msmpetsc.study.forecast, msmpetsc.cli.main"
+    loaded = "sorted({'pandas', 'matplotlib', 'jinja2'} & set(sys.modules))"
+    words = [sys.executable, "-c", f"import sys, {modules}; print({loaded})"]
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[]\n", done.stderr
+
+
+def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path, stand_in, monkeypatch):
+    monkeypatch.setattr(table, "find_spec", lambda name: None if name == "pandas" else name)
+    with pytest.raises(InputError, match=r"^a study needs pandas: install msmpetsc\[study\]$"):
+        carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
+    assert not (tmp_path / "out").exists()

@@ -82,7 +82,7 @@ class Quantity(NamedTuple):
 
     @property
     def numbers(self) -> Numbers:
-        """What a point tells of itself."""
+        """Numbers that a point tells of itself."""
         return {"valid cells": (formatting.count, "cells"), self.title: (self.word, self.shown)} | COSTS
 
 
@@ -185,10 +185,12 @@ def figure6_chart(name: str, key: tuple[str, float], rows: "DataFrame", styles: 
     figure, (axes,) = new_figure(1, list(handles))
     chart = Chart(name, FIGURE6, chart_title("Frames a second over cells", *key), FIGURE6_CAPTION, figure)
     title_axes(axes, "", X_LABEL, "frames a second")
-    log_axes(axes, rows["cells"], reach(rows, "fps").to_numpy().ravel(), COUNT, COUNT)
+    log_axes(axes, rows["cells"], reach(rows, "fps").to_numpy().ravel(), (COUNT, COUNT))
     for curve, group in by_curve.items():
         columns = "cells", "fps"
-        chart.curve(axes, group, columns, style_of[curve], SPEED, label="curve", line=lines[curve], whiskers=True)
+        chart.curve(
+            axes, group, columns, style_of[curve], numbers=SPEED, label="curve", line=lines[curve], whiskers=True
+        )
     legend_below(figure, handles)
     overtaking = overtaking_lines(rows)
     if overtaking:
@@ -284,11 +286,11 @@ def growth_chart(name: str, key: tuple[str, float], rows: "DataFrame", styles: S
         shown = measured(rows, quantity.column)
         is_time = quantity.column == "time_frame"
         heights = reach(shown, quantity.shown).to_numpy().ravel() if is_time else shown[quantity.shown]
-        log_axes(axes, shown["cells"], heights, COUNT, quantity.tick)
+        log_axes(axes, shown["cells"], heights, (COUNT, quantity.tick))
         for curve, group in by_curve.items():
             chart.curve(
                 axes, measured(group, quantity.column), ("cells", quantity.shown), styles[label_of(group)],
-                quantity.numbers, label="curve", line=lines[curve], whiskers=is_time,
+                numbers=quantity.numbers, label="curve", line=lines[curve], whiskers=is_time,
             )  # fmt: skip
     legend_below(figure, handles)
     return chart

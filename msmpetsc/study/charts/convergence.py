@@ -81,23 +81,17 @@ def convergence_chart(scene: str, frames: set, curves: dict[str, "DataFrame"], s
     figure, axes = new_figure(2, list(handles))
     step = f", step {frames.pop()}" if len(frames) == 1 else ""
     chart = Chart(f"convergence_{scene}", KIND, f"{KIND}: {scene}{step}", CAPTION, figure)
-    title_axes(
-        axes[0], "over the iterations", "iteration", "true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|"
-    )
-    title_axes(
-        axes[1],
-        "over the computing time",
-        "computing time within the step",
-        "true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|",
-    )
-    draw_panel(chart, axes[0], "iteration", COUNT, curves, styles)
-    draw_panel(chart, axes[1], "seconds", SECONDS, curves, styles)
+    y_label = "true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|"
+    title_axes(axes[0], "over the iterations", "iteration", y_label)
+    title_axes(axes[1], "over the computing time", "computing time within the step", y_label)
+    draw_panel(chart, axes[0], curves, styles, column="iteration", tick=COUNT)
+    draw_panel(chart, axes[1], curves, styles, column="seconds", tick=SECONDS)
     legend_below(figure, handles)
     return chart
 
 
 def draw_panel(
-    chart: Chart, axes: Axes, column: str, tick: Formatter, curves: dict[str, "DataFrame"], styles: Styles
+    chart: Chart, axes: Axes, curves: dict[str, "DataFrame"], styles: Styles, *, column: str, tick: Formatter
 ) -> None:
     """Draw the error over a column."""
     shown = {label: rows.dropna(subset=[column]) for label, rows in curves.items()}
@@ -111,7 +105,7 @@ def draw_panel(
         style = styles[label]
         size = style.size if len(rows) <= MANY else style.size / 2
         columns = column, "position_error"
-        chart.curve(axes, rows, columns, style, NUMBERS, linewidth=1.4, markersize=size)
+        chart.curve(axes, rows, columns, style, numbers=NUMBERS, linewidth=1.4, markersize=size)
 
 
 def axis_from_zero(axes: Axes, values: list[float], formatter: Formatter) -> None:

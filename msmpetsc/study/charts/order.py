@@ -81,7 +81,7 @@ def order_chart(scene: str, rows: "DataFrame", styles: Styles, frequency: float 
     chart = Chart(f"order_{scene}", KIND, f"{KIND}: {scene}", CAPTION, figure)
     draw_error(chart, axes[0], measured(rows, "trajectory_error"), styles)
     if with_energy:
-        draw_energy(chart, axes[1], measured(rows, "energy_left"), styles, frequency)
+        draw_energy(chart, axes[1], measured(rows, "energy_left"), styles=styles, frequency=frequency)
     legend_below(figure, handles)
     chart.findings["Order in the time step"] = [
         f"{label}: the error goes as the step to the power {slope:.2f}." for label, slope in slopes.items() if slope
@@ -96,18 +96,18 @@ def _legend(label: str, slope: float | None) -> str:
 def draw_error(chart: Chart, axes: Axes, rows: "DataFrame", styles: Styles) -> None:
     """Draw the error of the motion over the step."""
     title_axes(axes, "error of the motion", "time step", "trajectory error")
-    log_axes(axes, rows["step"], rows["trajectory_error"], SECONDS, ERROR)
-    draw_methods(chart, axes, rows, "trajectory_error", styles)
+    log_axes(axes, rows["step"], rows["trajectory_error"], (SECONDS, ERROR))
+    draw_methods(chart, axes, rows, column="trajectory_error", styles=styles)
 
 
-def draw_energy(chart: Chart, axes: Axes, rows: "DataFrame", styles: Styles, frequency: float | None) -> None:
+def draw_energy(chart: Chart, axes: Axes, rows: "DataFrame", *, styles: Styles, frequency: float | None) -> None:
     """Draw the energy that is left over the step."""
     title_axes(axes, "energy left at the end", "time step", "energy left / energy at the start")
     axes.set_xscale("log")
     axes.set_xlim(around(rows["step"]))
     log_ticks(axes.xaxis, around(rows["step"]), SECONDS)
     axes.set_ylim(0, 1.15 * min(2, max(1, rows["energy_left"].max())))
-    draw_methods(chart, axes, rows, "energy_left", styles)
+    draw_methods(chart, axes, rows, column="energy_left", styles=styles)
     euler = rows[rows["integrator"] == "implicit-euler"]
     if frequency and len(euler):
         axes.plot(*closed_form(euler, frequency), "--", color=FAINT, zorder=2)
@@ -124,7 +124,7 @@ def closed_form(rows: "DataFrame", frequency: float) -> tuple[np.ndarray, np.nda
     return t, (1 + (2 * math.pi * frequency * t) ** 2) ** (-end / t)
 
 
-def draw_methods(chart: Chart, axes: Axes, rows: "DataFrame", column: str, styles: Styles) -> None:
+def draw_methods(chart: Chart, axes: Axes, rows: "DataFrame", *, column: str, styles: Styles) -> None:
     """Draw a curve for each method."""
     for label, group in grouped(rows, "label").items():
-        chart.curve(axes, group.sort_values("step", kind="stable"), ("step", column), styles[label], NUMBERS)
+        chart.curve(axes, group.sort_values("step", kind="stable"), ("step", column), styles[label], numbers=NUMBERS)

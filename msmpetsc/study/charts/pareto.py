@@ -74,7 +74,7 @@ class ErrorMeasure:
 
     @property
     def numbers(self) -> Numbers:
-        """What a point tells of itself; its rows have the spread of their cost."""
+        """Numbers that a point tells of itself; its rows have the spread of their cost."""
         return {
             self.name: (formatting.error, self.error),
             self.y_label: (formatting.seconds, self.cost),
@@ -184,7 +184,7 @@ def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Ch
     figure, all_axes = new_figure(len(panels), list(handles))
     chart = Chart(name, KIND, title, CAPTION, figure)
     for axes, (measure, shown) in zip(all_axes, panels, strict=True):
-        draw_panel(chart, axes, measure, shown, styles)
+        draw_panel(chart, axes, shown, measure=measure, styles=styles)
         chart.cheapest[measure.name] = best = [winners(shown, measure, level) for level in LEVELS]
         lines = [cheapest_line(measure, level, rows) for level, rows in zip(LEVELS, best, strict=True)]
         chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
@@ -198,27 +198,27 @@ def common_time_step(rows: "DataFrame") -> "DataFrame":
     return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
-def draw_panel(chart: Chart, axes: Axes, measure: ErrorMeasure, rows: "DataFrame", styles: Styles) -> None:
+def draw_panel(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, styles: Styles) -> None:
     """Draw a panel: the front first, the methods over it."""
     step = formatting.seconds(rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     title_axes(axes, f"over the {measure.name}{at_step}", measure.x_label, measure.y_label)
     ends = reach(rows, measure.cost)
-    log_axes(axes, rows[measure.error], ends.to_numpy().ravel(), ERROR, SECONDS)
+    log_axes(axes, rows[measure.error], ends.to_numpy().ravel(), (ERROR, SECONDS))
     draw_front(axes, front_rows(rows, measure), measure)
     for label, group in grouped(rows.join(spread(rows, measure.cost)), "label").items():
-        draw_method(chart, axes, measure, group, styles[label])
+        draw_method(chart, axes, group, measure=measure, style=styles[label])
 
 
-def draw_method(chart: Chart, axes: Axes, measure: ErrorMeasure, rows: "DataFrame", style: CurveStyle) -> None:
+def draw_method(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, style: CurveStyle) -> None:
     """Draw a line through a method's own best points, and its other ones small and hollow."""
     best = front_rows(rows, measure)
     axes.plot(best[measure.error], best[measure.cost], color=style.color, linewidth=1.6, zorder=3)
     chart.whiskers(axes, rows, measure.columns, style)
-    chart.mark(axes, best, measure.columns, style, measure.numbers)
+    chart.mark(axes, best, measure.columns, style, numbers=measure.numbers)
     beaten = rows.drop(best.index)
     hollow: dict[str, Any] = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.color}
-    chart.mark(axes, beaten, measure.columns, style, measure.numbers, **hollow)
+    chart.mark(axes, beaten, measure.columns, style, numbers=measure.numbers, **hollow)
 
 
 def draw_front(axes: Axes, rows: "DataFrame", measure: ErrorMeasure) -> None:
@@ -245,15 +245,15 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
     start = f"{formatting.error(level)} or less:"
     if not best:
         return f"{start} nothing measured reaches it."
-    row, *others = best
+    row, *near = best
     reached = formatting.error(row[measure.error])
     step = f", {formatting.stepping(row)}" if measure is TRAJECTORY else ""
     asked = f"asked for {formatting.error(row['error'])}, " if row["error"] else ""
     sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
-    if not others:
+    if not near:
         return f"{sentence}."
-    near = ", ".join(f"{other['label']} {cost_of(other, measure)}" for other in others)
-    return f"{sentence}; within its noise: {near}."
+    rivals = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in near)
+    return f"{sentence}; within its noise: {rivals}."
 
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:

@@ -122,7 +122,7 @@ def stability_chart(name: str, rows: "DataFrame", settings: dict) -> Chart:
     chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, figure)
     for index, (axes, (label, group)) in enumerate(zip(all_axes, panels.items(), strict=True)):
         axes.set_title(label, loc="left", fontsize=10)
-        draw_cells(chart, axes, group, x, y, of_cases=of_cases)
+        draw_cells(chart, axes, group, x=x, y=y, of_cases=of_cases)
         if not of_cases:
             draw_limit(axes, group, x, y)
         decorate(axes, x, y, of_cases=of_cases, left=index % COLUMNS == 0, low=index + COLUMNS >= len(panels))
@@ -148,7 +148,7 @@ def panels_of(count: int, cells: tuple[int, int], of_cases: bool) -> tuple[Figur
     return figure, axes[:count]
 
 
-def draw_cells(chart: Chart, axes: Axes, rows: "DataFrame", x: Scale, y: Scale, *, of_cases: bool) -> None:
+def draw_cells(chart: Chart, axes: Axes, rows: "DataFrame", *, x: Scale, y: Scale, of_cases: bool) -> None:
     """Draw the cells of a panel, their symbols, and what tells their numbers."""
     known = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["x", "y"], keep="last")
     cells = known.assign(value=known["outcome"].map(OUTCOMES.index)).pivot(index="y", columns="x", values="value")
@@ -167,7 +167,7 @@ def draw_cells(chart: Chart, axes: Axes, rows: "DataFrame", x: Scale, y: Scale, 
     y_name = y.name if y.name != "y" else "case"
     numbers: Numbers = {} if of_cases else {x.name: (x.text, "x")}
     numbers |= {y_name: (y.text, "y")} | NUMBERS
-    chart.mark(axes, known, ("i", "j"), CurveStyle(INK, "s"), numbers, markersize=CELL * 72 * 0.9, alpha=0)
+    chart.mark(axes, known, ("i", "j"), CurveStyle(INK, "s"), numbers=numbers, markersize=CELL * 72 * 0.9, alpha=0)
 
 
 def symbol(row: Row) -> str:

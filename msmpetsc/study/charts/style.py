@@ -156,8 +156,8 @@ class Chart:
         rows: "DataFrame",
         columns: tuple[str, str],
         style: CurveStyle,
-        numbers: Numbers,
         *,
+        numbers: Numbers,
         label: str = "label",
         line: str = "-",
         whiskers: bool = False,
@@ -173,7 +173,7 @@ class Chart:
         axes.plot(*(rows[name] for name in columns), line, color=style.color, linewidth=linewidth)
         if whiskers:
             self.whiskers(axes, rows, columns, style)
-        self.mark(axes, rows, columns, style, numbers, label=label, **marker)
+        self.mark(axes, rows, columns, style, numbers=numbers, label=label, **marker)
 
     def mark(
         self,
@@ -181,8 +181,8 @@ class Chart:
         rows: "DataFrame",
         columns: tuple[str, str],
         style: CurveStyle,
-        numbers: Numbers,
         *,
+        numbers: Numbers,
         label: str = "label",
         **marker: Any,
     ) -> None:
@@ -266,14 +266,14 @@ COUNT = FuncFormatter(lambda value, _position: short(value))
 BYTES = EngFormatter("B")
 
 
-def log_axes(axes: Axes, x: ArrayLike, y: ArrayLike, x_format: Formatter, y_format: Formatter) -> None:
+def log_axes(axes: Axes, x: ArrayLike, y: ArrayLike, formats: tuple[Formatter, Formatter]) -> None:
     """Make axes logarithmic around all values, each at least a decade long: three ticks at least have numbers."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(around(x))
     axes.set_ylim(around(y))
-    log_ticks(axes.xaxis, around(x), x_format, dense=2.5 if len(axes.figure.axes) < 3 else 1.6)
-    log_ticks(axes.yaxis, around(y), y_format)
+    log_ticks(axes.xaxis, around(x), formats[0], dense=2.5 if len(axes.figure.axes) < 3 else 1.6)
+    log_ticks(axes.yaxis, around(y), formats[1])
 
 
 def around(values: ArrayLike, margin: float = 0.08) -> tuple[float, float]:

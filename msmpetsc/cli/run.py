@@ -180,7 +180,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     """Print what a run would have in PETSc's options database, which takes no mesh (collective)."""
     earlier = resume.look(comm, args) if args.scene or args.resume else None
     initialise(comm, args.petsc_options)
-    from msmpetsc.solve.options import refuse_bad_values, refuse_early, tell_none_left
+    from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
     from msmpetsc.solve.petsc.device import choose
     from msmpetsc.solve.presets import find_preset, shown_options
     from msmpetsc.solve.simulate import solvers_of
@@ -196,7 +196,7 @@ def show_options(comm: MPI.Comm, args: argparse.Namespace) -> int:
     on_root(comm, lambda: refuse_bad_values(solvers))
     if comm.rank == 0:
         print("\n".join(shown_options(solvers)))
-    tell_none_left()
+    silence_options_left()
     return 0
 
 

@@ -1,7 +1,7 @@
 """All that the next step depends on beside the scene: saved and restored, a run goes on as if it had never stopped.
 
-Each part of a run that remembers something has ``save`` and ``restore``, and names what it stores. What PETSc's solvers remember is not
-among it: they begin each step anew (solve.nonlinear.step).
+Each part of a run that remembers something has ``save`` and ``restore``, and names what it stores. What PETSc's
+solvers remember is not among it: they begin each step anew (solve.nonlinear.step).
 """
 
 import math
@@ -29,10 +29,10 @@ class Checkpoint:
 
     def keep(self, rows: dict[str, np.ndarray] | None = None, numbers: dict[str, float] | None = None) -> None:
         """Store a part's rows and numbers; no two parts may store one name."""
-        for kept, given in ((self.rows, rows or {}), (self.numbers, numbers or {})):
-            if twice := kept.keys() & given.keys():
-                raise ValueError(f"two parts of a checkpoint store {', '.join(sorted(twice))}")
-            kept.update(given)
+        if twice := (self.rows.keys() & (rows or {}).keys()) | (self.numbers.keys() & (numbers or {}).keys()):
+            raise ValueError(f"two parts of a checkpoint store {', '.join(sorted(twice))}")
+        self.rows |= rows or {}
+        self.numbers |= numbers or {}
 
     def row(self, name: str) -> np.ndarray:
         """Raises InputError where there is none."""

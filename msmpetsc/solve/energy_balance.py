@@ -7,8 +7,8 @@ A step that is solved exactly, of a convex energy, ends with no more than it beg
 T of the free nodes; C the push of obstacles, both times as they stand at the end; q'_n is q_n with the nodes that
 anchors lead where they will be; W no less than the work of obstacles that drag, and that of those that strike, the
 impulse times their velocity. What the left side has more, and what later steps have not lost again, came from nowhere.
-What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows it.
-Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
+What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows
+it. Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
 
 Verlet counts in W what moving obstacles push, so that C(q'_n) is that of where they stand at the start. The energy of
 its steps and of BDF2's swings about what it should be: what they lose, up to a share, they may gain again.
@@ -16,6 +16,7 @@ In a linear body Verlet's, of substeps dt, swings just as dt^2/8 |M^(-1) (f_ext 
 Wanner, Geometric Numerical Integration, IX): only what was gained with and without that is worth a word.
 """
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +100,7 @@ class EnergyBalance:
         self.credit = CREDIT if swings else 0.0
         self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
         self.ledger, self.gained = Ledger(), 0.0
-        self.energies: Energies | None = None
+        self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3))
         self.known: tuple[np.ndarray, float] | None = (
             None  # positions that the last step ended at, their elastic energy [J]
         )
@@ -110,7 +111,7 @@ class EnergyBalance:
         """Know the energies of the state that a run begins with (collective)."""
         self.energies = self._energies(state.q, state.velocity(time_step), 0.0, state.sides)
 
-    def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray) -> Energies:
+    def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> Energies:
         """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
@@ -147,7 +148,8 @@ class EnergyBalance:
             raise StepFailed(
                 f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
                 f"{self._worst(v)}{inside_out(self.comm, self.lattice, result.position)}; "
-                'try a smaller solver.error (or more iterations), a smaller time.step, or safety.on_failure = "fallback"',
+                "try a smaller solver.error (or more iterations), a smaller time.step, or "
+                'safety.on_failure = "fallback"',
                 "energy",
             )
         self.energies, self.known, self.ledger = solved, (after.q, ended.elastic), ledger
@@ -171,7 +173,7 @@ class EnergyBalance:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint."""
-        most = np.finfo(float).max
+        most = sys.float_info.max
         self.ledger = Ledger(**{name: checkpoint.number(name, 0.0, -most, most) for name in vars(Ledger())})
         self.gained = checkpoint.numbers.get("energy_gained", 0.0)
 
@@ -183,8 +185,8 @@ class EnergyBalance:
         return self.comm.allreduce(own, MPI.LOR)
 
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> np.ndarray:
-        """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of obstacles
-        that drag, and that which the step counted itself; and its swing (collective)."""
+        """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of
+        obstacles that drag, and that which the step counted itself; and its swing (collective)."""
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
         prescribed = environment.prescribed(before.q, time)
@@ -193,7 +195,7 @@ class EnergyBalance:
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.push(when, sides)
         sides = environment.no_sides if sides is None else sides
-        known = self.known is not None and q is self.known[0]
+        known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
@@ -203,7 +205,7 @@ class EnergyBalance:
             result.work,
             result.swing,
         )
-        sums[0] += (self.known[1] if known else sums[1]) + sums[2]
+        sums[0] += (known[1] if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: float) -> np.ndarray:

@@ -46,15 +46,16 @@ class Monitors:
                     else "with no minimum near"
                 )
                 log.warning(
-                    "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their place, "
-                    "or a smaller time.step mend that",
+                    "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their "
+                    "place, or a smaller time.step mend that",
                     index, time, off,
                 )  # fmt: skip
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
     def overlaps(self, index: int, environment: Environment, q: np.ndarray, time: float, time_step: float) -> None:
-        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it (collective)."""
+        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it
+        (collective)."""
         new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
             overlapping = overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
@@ -69,8 +70,8 @@ class Monitors:
         if not ledger.share <= MUCH:
             if not self.gaining:
                 log.warning(
-                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; a smaller time.step "
-                    "or a smaller solver.error mends that",
+                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; a smaller "
+                    "time.step or a smaller solver.error mends that",
                     index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in,
                 )  # fmt: skip
             self.gaining += 1

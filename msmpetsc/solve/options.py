@@ -89,8 +89,8 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
                     objects[-1].setOptionsPrefix(prefix)
                     objects[-1].setFromOptions()
         finally:
-            for one in objects:
-                one.destroy()
+            for owned in objects:
+                owned.destroy()
             forget_defaults(names)
 
 
@@ -143,19 +143,20 @@ def _is_in_library(name: str) -> bool:
 
 @cache
 def _names_in_library() -> frozenset[str]:
-    """Of the options that stand in PETSc's library and in petsc4py's; a few are words of messages, which does no harm."""
+    """Names of the options that stand in PETSc's library and in petsc4py's; a few are words of messages, which does no
+    harm."""
     files = {library_file(), PETSc.__file__}
-    found = {name for file in files for name in LITERAL.findall(Path(file).read_bytes())}
-    return frozenset(re.sub("%l+d", "%d", name.decode()) for name in found)
+    names = {name for file in files for name in LITERAL.findall(Path(file).read_bytes())}
+    return frozenset(re.sub("%l+d", "%d", name.decode()) for name in names)
 
 
-def _check_what_is_read_at_the_end(given: dict[str, str]) -> None:
+def _check_what_is_read_at_the_end(database: dict[str, str]) -> None:
     """Raise InputError for values that would make PETSc fail when it ends, after all is computed (collective)."""
     checks = {name: PETSc.Options().getBool for name in SWITCHES_READ_AT_THE_END}
     checks |= {name: open_viewer for name in VIEWERS_READ_AT_THE_END}
-    for name in sorted(checks.keys() & {name for name, value in given.items() if value}):
+    for name in sorted(checks.keys() & {name for name, value in database.items() if value}):
         try:
-            with petsc_errors(f"-{name} {given[name]}"):
+            with petsc_errors(f"-{name} {database[name]}"):
                 checks[name](name)
         except InputError:
             PETSc.Options().delValue(name)  # for PETSc ends now, too
@@ -173,7 +174,7 @@ def _left() -> list[str]:
     return left
 
 
-def tell_none_left() -> None:
+def silence_options_left() -> None:
     """Keep PETSc from telling at its end which options were not used, where none was meant to be: newer ones do so by
     themselves."""
     if "options_left" not in PETSc.Options().getAll():

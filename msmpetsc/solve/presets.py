@@ -185,10 +185,10 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
     """
     options = preset.options | {"snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))}
     database = PETSc.Options()
-    given = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
-    ours = options.keys() - given
+    users = {name.removeprefix(prefix) for name in database.getAll() if name.startswith(prefix) and not in_use[name]}
+    ours = options.keys() - users
     for chosen, bound in BOUND_TO_TYPE.items():
-        if chosen in given:
+        if chosen in users:
             ours -= bound
     if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
         ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
@@ -200,7 +200,7 @@ def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
 
 
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
-    """What PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
+    """Options that PETSc's database holds for solvers, the user's own options among it, as lines of an options file.
 
     solvers : prefix of their options -> preset and budget of iterations
 

@@ -1,4 +1,4 @@
-"""What is done about a step that fails, so that a hard moment costs time instead of the run."""
+"""Recovery from a step that fails, so that a hard moment costs time instead of the run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,7 +22,8 @@ MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # the string: prefix
 
 @dataclass
 class StepCost:
-    """Cost of one step: shorter steps taken in its place, whether the robust method solved it, and what all that took."""
+    """Cost of one step: shorter steps taken in its place, whether the robust method solved it, and what all that
+    took."""
 
     substeps: int = 0
     fallbacks: int = 0
@@ -63,7 +64,8 @@ class Recovery:
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State, StepCost]:
-        """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises StepFailed."""
+        """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises
+        StepFailed."""
         if failure and self.on_failure == "stop":
             raise failure
         if not self.recovered:
@@ -141,7 +143,7 @@ class Recovery:
         name = "verlet" if self.time.integrator == "verlet" and not is_fallback else "implicit-euler"
         time = self.time.model_copy(update={"step": short, "integrator": name})
         if is_fallback:
-            return self.make(time, Solver(preset=ROBUST, error=self.solver.error), PREFIX)
+            return self.make(time, Solver(preset=ROBUST, error=self.solver.error, max_iterations=None), PREFIX)
         return self.make(time, self.solver, "")
 
     def destroy(self) -> None:

@@ -295,7 +295,7 @@ def test_the_written_hessian_is_the_one_that_is_applied(tmp_path: Path):
     """Under a stiffening law, with cells that resist, against products with it."""
     from petsc4py import PETSc
 
-    from msmpetsc.solve.petsc.explicit import explicit
+    from msmpetsc.solve.linear.explicit import explicit
 
     lattice = replace(beam(), stiffening=2.0)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-3)

@@ -10,7 +10,8 @@ from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.verlet import Verlet
 
-INTEGRATORS = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
+INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
 
 
 def make_integrator(

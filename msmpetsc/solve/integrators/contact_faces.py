@@ -61,8 +61,8 @@ class ContactFaces:
             self.sides = sides
             if self.solves == MOST_SOLVES:
                 raise StepFailed(
-                    f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came in "
-                    'by; try a smaller time.step, or safety.on_failure = "substep"',
+                    f"has nodes that pass through an obstacle, solved {MOST_SOLVES} times with the face that each came "
+                    'in by; try a smaller time.step, or safety.on_failure = "substep"',
                     "contact",
                 )
             return

@@ -95,6 +95,7 @@ class ImplicitEuler:
             lattice = self.stepper.lattice
             self.reference = Reference(self.comm, lattice, self.tau, touches=bool(self.model.penalties))
         trace, self.trace, self.stepper.observer = self.trace, None, None
+        assert self.problem is not None, "no step was taken"
         positions = [*(trace.positions if trace else []), result.position]
         errors = self.reference.errors(self.problem, positions)
         return errors[-1], trace.as_lists(index, errors[:-1]) if trace else None
@@ -159,9 +160,10 @@ class Bdf2(ImplicitEuler):
     looks_back = True
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
-        """As of implicit Euler, but a node that bounces off stays where it is, and its history becomes what leads there
-        with its new velocity and the acceleration that it has: set back against its springs, as the paper has it, or
-        without that acceleration, which its neighbours feel the other end of, a ball gained a fifth of its energy.
+        """Take a step as implicit Euler does, but a node that bounces off stays where it is, and its history becomes
+        what leads there with its new velocity and the acceleration that it has: set back against its springs, as the
+        paper has it, or without that acceleration, which its neighbours feel the other end of, a ball gained a fifth
+        of its energy.
         """
         self._let_go(time)
         q, v, began = state.q, state.velocity(self.time_step), 0
@@ -187,8 +189,8 @@ class Bdf2(ImplicitEuler):
     def _history(
         self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None
     ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
-        """What would have led to q and v with the acceleration of an implicit Euler step of tau from there, which is
-        the true one but for a part of first order; and the KSP iterations that this takes."""
+        """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
+        which is the true one but for a part of first order; and the KSP iterations that this takes."""
         t, tau = self.time_step, self.tau
         result, _ = self._solve(q, q + tau * v, time - t + tau, tau, sides)
         a = ((result.position - q) / tau - v) / tau

@@ -22,7 +22,8 @@ class HighestMode:
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
     def hold(self, fixed: np.ndarray) -> None:
-        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of ranks."""
+        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
+        ranks."""
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))

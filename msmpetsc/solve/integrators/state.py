@@ -31,7 +31,7 @@ class State:
         return (self.q - self.q_previous) / time_step
 
     def over(self, time_step: float, shorter: float) -> "State":
-        """The same for steps of another length, which have no history yet."""
+        """The same state for steps of another length, which have no history yet."""
         return replace(self, q_previous=self.q - shorter / time_step * (self.q - self.q_previous), history=None)
 
     def save(self, checkpoint: Checkpoint, owned: int, looks_back: bool, has_sides: bool) -> None:
@@ -44,7 +44,7 @@ class State:
             history = self.history or (np.zeros((owned, 3)),) * 2
             rows |= {name: part[:owned] for name, part in zip(HISTORY, history, strict=True)}
             checkpoint.keep(numbers={"history": self.history is not None})
-        if has_sides:
+        if has_sides and self.sides is not None:
             rows[SIDES] = 1.0 * self.sides[:, :owned].T
         checkpoint.keep(rows)
 
@@ -52,9 +52,10 @@ class State:
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
         """The state that a checkpoint holds (collective)."""
         names = ("q", "q_previous", *HISTORY) if checkpoint.count("history", 1) else ("q", "q_previous")
-        q, q_previous, *history = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
+        q, q_previous, *last = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
+        history = (last[0], last[1]) if last else None
         sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None
-        return State(q, q_previous, tuple(history) or None, sides)
+        return State(q, q_previous, history, sides)
 
 
 def _sides(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:

@@ -8,6 +8,9 @@ The two half kicks at one time are one, but for a step's first and last: so v is
 frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
 """
 
+import sys
+from itertools import pairwise
+
 import numpy as np
 from mpi4py import MPI
 
@@ -96,14 +99,14 @@ class Verlet:
         checkpoint.keep({"mode": mode}, {"squared": squared, "known": known, "substep": self.substep})
 
     def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        squared = checkpoint.number("squared", -1.0, -1.0, np.finfo(float).max)
+        squared = checkpoint.number("squared", -1.0, -1.0, sys.float_info.max)
         if squared < 0:
             return
         self._hold(time)
         self.highest.mode.values[: self.lattice.owned] = like(self.v, checkpoint.row("mode"))
         self.highest.mode.update()
         self.highest.squared = squared
-        self.substep = checkpoint.number("substep", self.substep, np.finfo(float).tiny)
+        self.substep = checkpoint.number("substep", self.substep, sys.float_info.min)
         if checkpoint.count("known", 1):
             self.known = state.q
             self.position.values[:] = state.q
@@ -161,7 +164,7 @@ class Verlet:
         self.known = None
         times = np.linspace(start, time, 1 + count).tolist()
         duration = 0.5 * (times[1] - start)
-        for begin, end in zip(times, times[1:], strict=False):
+        for begin, end in pairwise(times):
             self._kick(begin, duration, begin, end)
             self._drift(begin, end)
             self.work += self.environment.appearing(self.q, begin, end, self.sides)
@@ -199,7 +202,7 @@ class Verlet:
         )
 
     def _drift(self, begin: float, end: float) -> None:
-        """q to the end of a substep: led nodes along their path, nodes that strike something back."""
+        """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
         drift(len(self.free), self.free, self.v, end - begin, self.q)
         if self.anchors:
@@ -209,14 +212,15 @@ class Verlet:
         self.position.update()
 
     def _lead(self, begin: float, end: float) -> None:
-        prescribed = self.environment.prescribed(self.position.values, end)[: self.lattice.owned]
-        where = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-        self.v[where] = (prescribed[where] - self.q[where]) / (end - begin)
-        self.q[where] = prescribed[where]
+        prescribed = self.environment.prescribed(self.position.values, end)
+        anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
+        if prescribed is not None:
+            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
+            self.q[anchored] = prescribed[anchored]
 
     def _strike(self, begin: float, end: float) -> None:
-        """By which faces nodes come into contact. One that bounces off is set back, and its velocity is what then led it
-        there."""
+        """Know the faces that nodes come into contact by. One that bounces off is set back, and its velocity is what
+        then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.met(self.before, self.q, end, end - begin, self.sides, self.fixed)

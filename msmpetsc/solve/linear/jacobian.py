@@ -43,10 +43,10 @@ class Jacobian:
         self.matrix = assemble(comm, unknowns, time_step, prefix=options.prefix)
         owned.callback(self.matrix.destroy)
         options.hide("mat_view")  # which is of A: PETSc would show all matrices, and write each into the same file
-        blocks = [ContactBlocks(unknowns, time_step) if touches else None for _ in range(2)]
-        self.hessian = TrueHessian(unknowns, elasticity, time_step, blocks[0])
-        self.linear = self.hessian if true_hessian else ThreeColumns(self.matrix, unknowns, blocks[1])
-        self.operator = python_matrix(unknowns, self.linear, comm)
+        self.hessian = TrueHessian(unknowns, elasticity, time_step, _blocks(touches, unknowns, time_step))
+        self.blocks = None if true_hessian else _blocks(touches, unknowns, time_step)  # that go with A
+        context = self.hessian if true_hessian else ThreeColumns(self.matrix, unknowns, self.blocks)
+        self.operator = python_matrix(unknowns, context, comm)
         owned.callback(self.operator.destroy)
         columns, preconditioned = 3 if kronecker else 1, self.matrix
         if kronecker:
@@ -69,10 +69,14 @@ class Jacobian:
         """
         if self.true_hessian and not known:
             self.hessian.linearise(q, contact, projected)
-        elif self.touches and not self.true_hessian:
-            self.linear.contact.linearise(contact, q, False)
+        elif self.blocks:
+            self.blocks.linearise(contact, q, False)
         changed = self.touches and self.diagonal.follow(self.comm, contact, q)
         if self.true_hessian or changed:
             self.operator.assemble()
         if changed:
             self.pmat.assemble()
+
+
+def _blocks(touches: bool, unknowns: Unknowns, time_step: float) -> ContactBlocks | None:
+    return ContactBlocks(unknowns, time_step) if touches else None

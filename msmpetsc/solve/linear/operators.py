@@ -9,8 +9,8 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.petsc.explicit import asks_for_entries, explicit
 from msmpetsc.solve.petsc.memory import Memory
 
 
@@ -32,7 +32,8 @@ class ContactBlocks:
     """t^2 (Hessian of contact): a 3 x 3 block for each node in contact, added to either operator below."""
 
     def __init__(self, unknowns: Unknowns, time_step: float):
-        self.t2, self.unknowns, self.parts = time_step**2, unknowns, []
+        self.t2, self.unknowns = time_step**2, unknowns
+        self.parts: list[tuple[np.ndarray, np.ndarray]] = []  # rows of unknowns, their blocks (k, 3, 3)
         row = np.full(unknowns.lattice.owned, -1)
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)

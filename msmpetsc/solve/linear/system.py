@@ -33,10 +33,10 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
     nodes = np.concatenate([free, ends[kept, 1]])
     values = np.concatenate([diagonal, -np.tile(weight, 2)[kept]])
-    places = unknowns.numbers[:, None] if columns == 1 else unknowns.places
+    indices = unknowns.numbers[:, None] if columns == 1 else unknowns.indices
     sizes = (columns * unknowns.size, columns * unknowns.total)
     rows = (rows + unknowns.size * np.arange(columns)[:, None]).ravel()
-    csr = coo_array((np.tile(values, columns), (rows, places[nodes].T.ravel())), shape=sizes).tocsr()
+    csr = coo_array((np.tile(values, columns), (rows, indices[nodes].T.ravel())), shape=sizes).tocsr()
 
     matrix = PETSc.Mat().create(comm=comm)
     matrix.setOptionsPrefix(prefix)
@@ -62,7 +62,7 @@ def assembly_bytes(
 
 
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
-    given, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
-    if ("cusparse" in given) != on_gpu:
+    mat_type, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
+    if ("cusparse" in mat_type) != on_gpu:
         prefix = matrix.getOptionsPrefix() or ""
-        raise InputError(f"-{prefix}mat_type {given}: the run computes on the {'GPU' if on_gpu else 'CPU'}")
+        raise InputError(f"-{prefix}mat_type {mat_type}: the run computes on the {'GPU' if on_gpu else 'CPU'}")

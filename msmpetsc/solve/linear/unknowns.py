@@ -24,9 +24,9 @@ class Unknowns:
 
     free    : (m,) local numbers of the free owned nodes, where the lattice's arrays are
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
-    places  : (l, 3) where its x, y and z stand in a vector of unknowns, of no meaning where pinned
+    indices : (l, 3) of its x, y and z in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
-    memory  : what PETSc's vectors are in
+    memory  : where PETSc's vectors have their numbers
 
     Raises InputError for more of them than PETSc can number.
     """
@@ -35,7 +35,7 @@ class Unknowns:
         self.lattice, self.memory = lattice, memory_of(lattice.nodes)
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
         self.size = len(self.free)
-        first = comm.exscan(self.size) or 0
+        first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
         self.total = comm.allreduce(self.size)
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
@@ -43,14 +43,14 @@ class Unknowns:
         to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
         asked = to_owner.send(lattice.ghosts) - lattice.table.first
         self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
-        place = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        self.places = np.concatenate([place, to_owner.answer(place[asked])])
+        index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
+        self.indices = np.concatenate([index, to_owner.answer(index[asked])])
         self._scatter_ghosts(comm)
 
     def _scatter_ghosts(self, comm: MPI.Comm) -> None:
         owned = self.lattice.owned
         free_ghosts = owned + np.flatnonzero(self.numbers[owned:] >= 0)
-        sources = self.places[free_ghosts].ravel().astype(PETSc.IntType)
+        sources = self.indices[free_ghosts].ravel().astype(PETSc.IntType)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
         self.ghost_values = PETSc.Vec().create(PETSc.COMM_SELF)
@@ -63,6 +63,7 @@ class Unknowns:
         vector.destroy()
 
     def create_vector(self, comm: MPI.Comm) -> PETSc.Vec:
+        """A new vector of unknowns (collective)."""
         vector = PETSc.Vec().create(comm)
         vector.setSizes((3 * self.size, 3 * self.total))
         vector.setType(self.memory.vec_type)
@@ -73,6 +74,7 @@ class Unknowns:
         return self.memory.read(vector).reshape(3, self.size)
 
     def columns_to_write(self, vector: PETSc.Vec) -> np.ndarray:
+        """A vector of unknowns as (3, m), to be written to at once."""
         return self.memory.write(vector).reshape(3, self.size)
 
     def to_nodes(self, vector: PETSc.Vec, nodes: np.ndarray) -> None:
@@ -92,6 +94,7 @@ class Unknowns:
         _scaled_sum(self.size, self.lattice.mass, a, t2, b, self.free, self.columns_to_write(vector))
 
     def destroy(self) -> None:
+        """Collective."""
         self.scatter.destroy()
         self.ghost_values.destroy()
 

@@ -17,26 +17,28 @@ LOWER = 0.9
 class Chebyshev:
     """Context of the SNES: PETSc makes it by name, and takes x_k - y for x_(k+1)."""
 
-    last = None  # x_k - x_(k-1)
+    def __init__(self) -> None:
+        self.last: PETSc.Vec | None = None  # x_k - x_(k-1)
+        self.count, self.length, self.least, self.limit = 0, 0.0, float("inf"), 1.0
+        self.rho = self.w = 0.0
 
     def step(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = w z - (w - 1) (x_k - x_(k-1))."""
-        if self.last is None:
-            self.last = x.duplicate()
+        last = self.last = self.last or x.duplicate()
         if snes.its == 0:
             self._begin(1.0)
+            last.set(0.0)
         operator, preconditioned = snes.getJacobian()[:2]
         snes.computeJacobian(x, operator, preconditioned)
         snes.ksp.setOperators(operator, preconditioned)
         snes.ksp.solve(f, y)
         w = self._weight(y.norm())
-        y.axpby(1 - w, w, self.last)
-        y.copy(self.last)
-        self.last.scale(-1.0)
+        y.axpby(1 - w, w, last)
+        y.copy(last)
+        last.scale(-1.0)
 
     def _begin(self, limit: float) -> None:
         self.count, self.length, self.least, self.limit = 0, 0.0, float("inf"), limit
-        self.last.set(0.0)
 
     def _weight(self, length: float) -> float:
         """w of the next iteration, given |z|."""

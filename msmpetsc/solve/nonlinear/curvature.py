@@ -1,11 +1,11 @@
 """Whether a step has come to a minimum of g: the lowest curvature of its true Hessian H = M + t^2 (Hessian of E).
 
-F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H is
-positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is looked
-for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev 2001, Toward
-the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the third. At length when
-the body is compressed anew or more than it was, or something showed a negative curvature; at all other steps the mode
-found last is followed in a few iterations.
+F = 0 on a saddle, too, and a symmetric start stays on it. Where no spring is compressed enough, and no cell resists, H
+is positive definite for certain, which one pass over the springs tells. Elsewhere the lowest eigenvalue of M^(-1) H is
+looked for by locally optimal conjugate gradients on a block of directions, preconditioned as the step is (Knyazev
+2001, Toward the optimal preconditioned eigensolver, Algorithm 5.1); a single direction was seen to settle on the
+third. At length when the body is compressed anew or more than it was, or something showed a negative curvature; at all
+other steps the mode found last is followed in a few iterations.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of 
 
 @dataclass(frozen=True)
 class Compression:
-    """Of all ranks: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
 
     greatest: float
     total: float
@@ -53,8 +53,9 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if not self.resists else 0.0
 
-    def exceeds(self, other: "Compression") -> bool:
-        return self.greatest > MORE * other.greatest or self.total > MORE * other.total
+    def exceeds(self, searched: "Compression") -> bool:
+        """Whether modes may have come since another compression was searched."""
+        return self.greatest > MORE * searched.greatest or self.total > MORE * searched.total
 
 
 NONE = Compression(0.0, 0.0, False)
@@ -76,11 +77,11 @@ class LowestCurvature:
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
     def compression(self, q: np.ndarray) -> Compression:
-        """At positions q (l, 3) [m]."""
+        """Compression at positions q (l, 3) [m]."""
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        shares = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
-        gathered = self.comm.allgather((greatest(shares), float(shares.sum()), elasticity.resists(q)))
+        ratios = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
+        gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
         return Compression(max(most), sum(sums), any(resist))
 
@@ -107,14 +108,15 @@ class LowestCurvature:
         return values[0], self.mode
 
     def _way_down(self, modes: np.ndarray) -> np.ndarray:
-        """What a random direction has of all of them (k, n): where a body may buckle to many sides, no matter which of
-        them rounding has made the first, so that it goes the same way on any ranks."""
+        """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
+        which of them rounding has made the first, so that it goes the same way on any ranks."""
         direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, q: np.ndarray, hint: PETSc.Vec | None) -> tuple[np.ndarray, np.ndarray]:
-        """From something of each mode, for near a mode that is known a lower one comes up late, and without rigid motions,
-        for their curvature mostly is about 1, which would hide a lower one as long; then from the best of all of them."""
+        """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
+        rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
+        of all of them."""
         start = self._random(BLOCK)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
@@ -141,7 +143,8 @@ class LowestCurvature:
             residuals = self._without_rigid(self._preconditioned(x[1] - like(mass, values)[:, None] * mass * x[0]))
             w = self._unit(residuals)
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
-            values, (x, last) = self._ritz(tuple(map(np.concatenate, zip(*blocks, strict=True))), size)
+            span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+            values, (x, last) = self._ritz((span, products), size)
             lowest.append(values[0])
             self.its += len(w)
             if lowest[-1] < 0:
@@ -152,8 +155,8 @@ class LowestCurvature:
         return values, x[0]
 
     def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
-        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and of
-        each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
+        """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
+        of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
         grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
         sizes, parts = np.linalg.eigh(grams[1])
@@ -169,7 +172,8 @@ class LowestCurvature:
         return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
 
     def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
-        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes are held."""
+        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
+        are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
         columns = q[self.unknowns.free].T
@@ -210,14 +214,14 @@ class LowestCurvature:
         return results
 
     def _unit(self, directions: np.ndarray) -> np.ndarray:
-        """Of unit length in the norm of M; those of no length stay so."""
+        """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
 
     def _lengths(self, directions: np.ndarray) -> np.ndarray:
         return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))
 
     def _sum(self, values: np.ndarray) -> np.ndarray:
-        """Over all ranks."""
+        """Sum over all ranks."""
         return self.comm.allreduce(values)
 
     def save(self, checkpoint: Checkpoint) -> None:

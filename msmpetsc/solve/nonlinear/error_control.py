@@ -1,7 +1,8 @@
 """Stopping rule of a step: the error that x is known to have, and how closely the next linear solve must be made.
 
-The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). |F(x)|_(M^-1) / |x - y|_M bounds it wherever
-E is convex between x and x*. Where the bound will do already, or no estimate can be had, the bound is the error.
+The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). |F(x)|_(M^-1) / |x - y|_M bounds it
+wherever E is convex between x and x*. Where the bound will do already, or no estimate can be had, the bound is the
+error.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for 
 
 @dataclass
 class StepError:
-    """What is known of the step in progress.
+    """Error of the step in progress.
 
     goal        : relative error to come to; 0 where a budget of iterations ends the step
     error       : of the last iterate, estimated or bounded

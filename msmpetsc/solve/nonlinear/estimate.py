@@ -1,4 +1,4 @@
-"""How far a step is from its exact solution: the Newton correction, found no better than an estimate needs.
+"""Error estimate of a step: the Newton correction, computed no better than an estimate needs.
 
 The error x - x* solves H e = F(x) but for terms of second order, H the true Hessian. |F|_(M^-1) bounds |e|_M, but
 was seen up to 6000 times too large on stiff bodies; some CG iterations on H, preconditioned as the step is, tell
@@ -23,7 +23,8 @@ MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is left."""
+    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is
+    left."""
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner, prefix: str):
         self.functional, self.hessian = functional, hessian

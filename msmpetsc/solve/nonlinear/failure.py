@@ -1,4 +1,5 @@
-"""Messages of steps that could not be solved, one line each: the reason, the residual, where it is worst, what to try."""
+"""Messages of steps that could not be solved, one line each: the reason, the residual, where it is worst, what to
+try."""
 
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,8 @@ def not_converged(stepper: "Stepper", iterate: Iterate, iterations: int) -> Step
 
 
 def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
-    """All that the step came to was no minimum, or farther from one than it seemed; ``iterate`` is the last (collective)."""
+    """All that the step came to was no minimum, or farther from one than it seemed; ``iterate`` is the last
+    (collective)."""
     now = stepper.control.now
     seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
     return StepFailed(
@@ -50,7 +52,7 @@ def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
 
 
 def _worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Where F pulls farthest, and what is inside out (collective)."""
+    """Words on where F pulls farthest, and what is inside out (collective)."""
     comm, lattice = functional.comm, functional.lattice
     worst = place_of_greatest(comm, lattice, *functional.pull(iterate.f))
     return f", worst at {worst}{inside_out(comm, lattice, iterate.q)}"

@@ -1,4 +1,4 @@
-"""Where a step starts from: the best of a few guesses that cost next to nothing."""
+"""First guess of a step: the best of a few guesses that cost next to nothing."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ class FirstGuess:
         self.functional, self.extrapolate = functional, extrapolate
         lattice, unknowns = functional.lattice, functional.unknowns
         self.holds = unknowns.total < lattice.table.total  # some nodes are no unknowns
-        self.corrections = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
+        self.corrections: list[np.ndarray] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
     def best(self) -> np.ndarray:
         """The start (l, 3) [m] of the step that the functional has begun (collective).

@@ -1,4 +1,4 @@
-"""What one implicit Euler step minimises, its gradient, and how far a gradient is from none.
+"""Functional that one implicit step minimises, its gradient, and norms of both.
 
 g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), for implicit Euler y = 2 q_n - q_(n-1) (paper Eq. 10-12);
 F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
@@ -113,11 +113,11 @@ class StepFunctional:
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""
-        return np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass)))
+        return float(np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass))))
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
-        return np.sqrt(self.comm.allreduce(float(self.memory.read(f) ** 2 @ self.per_mass)))
+        return float(np.sqrt(self.comm.allreduce(float(self.memory.read(f) ** 2 @ self.per_mass))))
 
     def pull(self, f: PETSc.Vec) -> tuple[np.ndarray, np.ndarray]:
         """The free nodes, local numbers, and |F| / m of each [m]: how far each is pulled from where it is."""
@@ -130,4 +130,4 @@ class StepFunctional:
         columns = (q[free] - self.problem.y[free]).T.ravel()
         if correction is not None:
             columns -= self.memory.read(correction)
-        return np.sqrt(self.comm.allreduce(float(columns**2 @ self.mass)))
+        return float(np.sqrt(self.comm.allreduce(float(columns**2 @ self.mass))))

@@ -1,4 +1,5 @@
-"""Where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and no more.
+"""Examination of where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and
+no more.
 
 The estimate of a step's error is the Newton correction e at x. Where a body is compressed g may have a fold or a saddle
 between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
@@ -77,8 +78,8 @@ class Minimum:
         return self.functional.dual_norm(self.estimate.residual)
 
     def _second_estimate(self, nearer: Iterate, bound: float, enough: float, lowest: float) -> float:
-        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of little but
-        rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
+        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of
+        little but rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
         functional, correction = self.functional, self.estimate.correction
         first, distance = functional.norm(self.first), functional.distance(nearer.q)
         second = self.estimate(nearer, bound, enough, lowest)
@@ -105,7 +106,7 @@ class Minimum:
         functional = self.functional
         base = functional.evaluate(x, self.f).q
         slope = functional.comm.allreduce(float(self.memory.read(self.f) @ direction))
-        longest = functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX)
+        longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
         if slope > SLOPE * abs(curvature) * move:  # else both ways lead down, and ranks must not differ
             move = -move

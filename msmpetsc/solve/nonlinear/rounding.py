@@ -1,4 +1,4 @@
-"""What the rounding of numbers leaves of a step: nothing is known better than that, and no error is smaller."""
+"""Rounding errors of a step: nothing is known better than that, and no error is smaller."""
 
 import numpy as np
 from mpi4py import MPI
@@ -9,13 +9,13 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 ROUNDINGS = 3 * np.finfo(float).eps  # of a row of F: in free fall one eps was passed now and then
-OF_ONE_ROW = 10.0  # times as much in a single row
+SINGLE_ROW = 10.0  # times as much in a single row
 NEGLIGIBLE = 1e-6  # of the body's size: rounding that moves it less is of no concern
 HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more leaves no step to speak of
 
 
 class Rounding:
-    """Of the steps of one lattice and time step. All methods are collective.
+    """Rounding in the steps of one lattice and time step. All methods are collective.
 
     diagonal : (m,) of A, of each free node of this rank [kg]
     """
@@ -33,7 +33,7 @@ class Rounding:
         functional = self.functional
         rows = np.abs(functional.memory.read(f)) / (self.rows * max(functional.extent, np.finfo(float).tiny))
         squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
-        return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= OF_ONE_ROW)
+        return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= SINGLE_ROW)
 
     def added_to(self, error: float, away: float) -> float:
         """A relative error of a step that took x ``away`` = |x - y|_M from y, or what rounding makes of it if that is
@@ -46,8 +46,8 @@ class Rounding:
         if moved > max(NEGLIGIBLE * size, HOPELESS * away):
             raise StepFailed(
                 f"cannot be solved in double precision: rounding in the stiffest springs moves the body by "
-                f"{moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; try softer materials, less different "
-                "ones, or a smaller time.step",
+                f"{moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; try softer materials, less "
+                "different ones, or a smaller time.step",
                 "rounding",
             )
         if not away > moved:

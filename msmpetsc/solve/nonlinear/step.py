@@ -1,4 +1,5 @@
-"""One implicit step as one PETSc SNES, which solves F(x) = grad g(x) = 0; a method is a set of options (solve.presets)."""
+"""One implicit step as one PETSc SNES, which solves F(x) = grad g(x) = 0; a method is a set of options
+(solve.presets)."""
 
 import ctypes
 from collections.abc import Callable, Iterator
@@ -343,8 +344,8 @@ class Stepper:
             self.ksp.setTolerances(rtol=self.control.relative_tolerance())
 
     def _abandon(self) -> None:
-        """After an error within PETSc its objects may be in the middle of something, and crash when they are destroyed: they
-        stay, even when the interpreter ends."""
+        """After an error within PETSc its objects may be in the middle of something, and crash when they are
+        destroyed: they stay, even when the interpreter ends."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 

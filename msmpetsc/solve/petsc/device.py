@@ -23,16 +23,16 @@ def choose(comm: MPI.Comm, device: str | None) -> None:
 
     Raises InputError where both are given and differ, and at once what ``sender`` would raise later.
     """
-    given = PETSc.Options().getAll().get(OPTION)
-    if device and given is not None and (given in ON_GPU) != (device == "cuda"):
-        raise InputError(f"--device {device} and -{OPTION} {given} contradict each other")
-    if device == "cuda" and given is None:
+    mat_type = PETSc.Options().getAll().get(OPTION)
+    if device and mat_type is not None and (mat_type in ON_GPU) != (device == "cuda"):
+        raise InputError(f"--device {device} and -{OPTION} {mat_type} contradict each other")
+    if device == "cuda" and mat_type is None:
         PETSc.Options().setValue(OPTION, AIJCUSPARSE)
     sender(comm)
 
 
 def sender(comm: MPI.Comm) -> Callable[[np.ndarray], np.ndarray]:
-    """What takes arrays to where runs compute (collective).
+    """Function that takes arrays to where runs compute (collective).
 
     Raises InputError on all ranks where that is a GPU and one of them has none, or PETSc has no CUDA.
     """

@@ -11,7 +11,9 @@ NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked
 
 
 @contextmanager
-def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None, others: type = PETSc.Error) -> Iterator[None]:
+def petsc_errors(
+    what: str, abandon: Callable[[], None] = lambda: None, others: type[Exception] = ImportError
+) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
     ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
@@ -22,19 +24,20 @@ def petsc_errors(what: str, abandon: Callable[[], None] = lambda: None, others: 
     """
     try:
         yield
-    except (PETSc.Error, ImportError, others) as error:
-        # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, to the end.
+    except (PETSc.Error, ImportError, others) as error:  # type: ignore[misc]  # petsc4py has no types
+        # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
-        if not isinstance(error.__cause__ or error, (PETSc.Error, ImportError, others)):
-            raise error.__cause__
+        cause = error.__cause__
+        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, others)):
+            raise cause  # noqa: B904 (the error itself, not another)
         abandon()
         if getattr(error, "ierr", 0) == NOT_CONVERGED:
             raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
-        raise InputError(f"{what}: {last_words(error.__cause__ or error)}") from None
+        raise InputError(f"{what}: {last_words(cause or error)}") from None
 
 
-def last_words(error: Exception) -> str:
-    """What a PETSc error says, without the calls it came through."""
+def last_words(error: BaseException) -> str:
+    """Message of a PETSc error, without the calls it came through."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
     return said[-1] if said else lines[0]

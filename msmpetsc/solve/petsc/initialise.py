@@ -85,14 +85,14 @@ def _is_an_option(tokens: list[str]) -> bool:
 
 
 def _message(text: str) -> str:
-    """What an error that PETSc printed is about: its last line before the one on where to find help."""
+    """Subject of an error that PETSc printed: its last line before the one on where to find help."""
     lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", text.partition("PETSC ERROR: See ")[0], re.MULTILINE)
     return printable(lines[-1].strip(), 200) if lines else ""
 
 
 @contextmanager
 def _captured_stderr() -> Iterator[list[str]]:
-    """What the C library prints in the block; the text is there after it."""
+    """Capture what the C library prints in the block; the text is filled in after it."""
     text = [""]
     sys.stderr.flush()
     kept = os.dup(2)

@@ -20,19 +20,20 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Where this rank's numbers of a dense matrix are, on the GPU if it has them there (MatDenseGetArrayAndMemType)."""
+    """Address of this rank's numbers of a dense matrix, on the GPU if it has them there
+    (MatDenseGetArrayAndMemType)."""
     library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
-    found = array.value or 0
+    pointer = array.value or 0
     library.MatDenseRestoreArrayAndMemType(handle, ctypes.byref(array))
-    return found
+    return pointer
 
 
 def library_file() -> str:
-    """Where PETSc's C library is, as the loader has it (dladdr)."""
-    info, place = _DlInfo(), ctypes.cast(petsc_library().PetscInitialize, ctypes.c_void_p)
-    found = ctypes.CDLL(None).dladdr(place, ctypes.byref(info))
-    return os.fsdecode(info.file) if found and info.file else PETSc.__file__
+    """Path of PETSc's C library, as the loader has it (dladdr)."""
+    info, address = _DlInfo(), ctypes.cast(petsc_library().PetscInitialize, ctypes.c_void_p)
+    is_known = ctypes.CDLL(None).dladdr(address, ctypes.byref(info))
+    return os.fsdecode(info.file) if is_known and info.file else PETSc.__file__
 
 
 def open_viewer(option: str) -> None:
@@ -40,9 +41,9 @@ def open_viewer(option: str) -> None:
 
     Raises PETSc.Error where there is no such viewer, or its file cannot be written.
     """
-    library, viewer, kind, given = petsc_library(), ctypes.c_void_p(), ctypes.c_int(), ctypes.c_int()
+    library, viewer, kind, is_set = petsc_library(), ctypes.c_void_p(), ctypes.c_int(), ctypes.c_int()
     world = ctypes.c_void_p.in_dll(library, "PETSC_COMM_WORLD")
-    wanted = (world, None, None, f"-{option}".encode(), *map(ctypes.byref, (viewer, kind, given)))
+    wanted = (world, None, None, f"-{option}".encode(), *map(ctypes.byref, (viewer, kind, is_set)))
     newer = hasattr(library, "PetscOptionsCreateViewer")  # its name from PETSc 3.22 on
     create = library.PetscOptionsCreateViewer if newer else library.PetscOptionsGetViewer
     error = create(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))

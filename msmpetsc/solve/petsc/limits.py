@@ -1,4 +1,4 @@
-"""What PETSc's own integers can number: 32 bits, unless it was configured --with-64-bit-indices."""
+"""Limits of PETSc's own integers: 32 bits, unless it was configured --with-64-bit-indices."""
 
 import numpy as np
 from mpi4py import MPI

@@ -68,7 +68,11 @@ class Cuda:
         return self._view(vector, "rw")
 
     def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
-        return PETSc.Vec().createCUDAWithArrays(cudahandle=array.data.ptr, size=(len(array), None), comm=comm)
+        return PETSc.Vec().createCUDAWithArrays(
+            cudahandle=array.data.ptr,  # type: ignore[attr-defined]  # CuPy's
+            size=(len(array), None),
+            comm=comm,
+        )
 
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
         return _ready(PETSc.Mat().createDenseCUDA((rows, (None, columns)), comm=comm))

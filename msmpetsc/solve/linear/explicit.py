@@ -21,13 +21,13 @@ def asks_for_entries(viewer: PETSc.Viewer) -> bool:
 def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
     """An operator on vectors of unknowns, 3m x 3m, as AIJ (collective).
 
-    It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so that
-    one product a colour and coordinate tells the entries of all its columns: 81 products.
+    It couples nodes that a spring joins. No two nodes of a colour, three cells apart, have a neighbour in common, so
+    that one product a colour and coordinate tells the entries of all its columns: 81 products.
     """
     (a, b), colours, free = _neighbours(unknowns), _colours(unknowns), to_host(unknowns.free)
     row = np.full(len(colours), -1)
     row[free] = np.arange(unknowns.size)
-    row, places, colour = row[a], unknowns.places[b], colours[b]
+    row, indices, colour = row[a], unknowns.indices[b], colours[b]
     x, y = operator.createVecs()
     rows, columns, values = [], [], []
     for wanted, c in product(range(27), range(3)):
@@ -36,10 +36,10 @@ def explicit(operator: PETSc.Mat, unknowns: Unknowns) -> PETSc.Mat:
         target = unknowns.columns_to_write(x)
         target[:] = like(target, chosen)
         operator.mult(x, y)
-        found, hit = to_host(unknowns.columns(y)), np.flatnonzero(colour == wanted)
+        entries, hit = to_host(unknowns.columns(y)), np.flatnonzero(colour == wanted)
         rows.append((row[hit] + unknowns.size * np.arange(3)[:, None]).ravel())
-        columns.append(np.tile(places[hit, c], 3))
-        values.append(found[:, row[hit]].ravel())
+        columns.append(np.tile(indices[hit, c], 3))
+        values.append(entries[:, row[hit]].ravel())
     x.destroy()
     y.destroy()
     sizes = 3 * unknowns.size, 3 * unknowns.total

@@ -53,6 +53,20 @@ def plain(value: float | str) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e15 else f"{value:.4g}"
 
 
+SETTINGS: dict[str, tuple[str, Callable[[Any], str]]] = {  # columns that a reader tells cases apart by: their words
+    "error": ("error {}", error),
+    "max_iterations": ("{} iterations", count),
+    "cells": ("{} cells", count),
+    "ranks": ("{} ranks", count),
+}
+
+
+def setting(row: dict[str, Any], name: str) -> str:
+    """Return a setting of the case of a row in words; empty where it has none."""
+    text, word = SETTINGS[name]
+    return text.format(word(row[name])) if row[name] else ""
+
+
 def stepping(row: dict[str, Any]) -> str:
     """Return how the case of a row steps; an explicit one has substeps within its time step, that between frames."""
     if row["integrator"] == "verlet":

@@ -248,13 +248,8 @@ def by_reason(rows: Iterable[Row]) -> list[str]:
 
 def name_of(row: Row) -> str:
     """Return a failed case in words."""
-    settings = [
-        formatting.stepping(row),
-        f"error {formatting.error(row['error'])}" if row["error"] else "",
-        f"{formatting.count(row['max_iterations'])} iterations" if row["max_iterations"] else "",
-        f"{formatting.count(row['cells'])} cells" if row["cells"] else "",
-        f"{formatting.count(row['ranks'])} ranks" if (row["ranks"] or 1) > 1 else "",
-    ]
+    names = [name for name in formatting.SETTINGS if name != "ranks" or (row["ranks"] or 1) > 1]
+    settings = [formatting.stepping(row), *(formatting.setting(row, name) for name in names)]
     return ", ".join(filter(None, [row["label"] or row["case"], *settings]))
 
 

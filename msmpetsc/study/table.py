@@ -97,10 +97,10 @@ ONCE_NOTE = (
 
 
 def require_extra() -> None:
-    """Raise InputError where a study's packages are missing: before hours of runs, not after them."""
-    missing = [name for name in EXTRA if find_spec(name) is None]
-    if missing:
-        raise InputError(f"a study needs {', '.join(missing)}: install msmpetsc[study]")
+    """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
+    for name in EXTRA:
+        if find_spec(name) is None:
+            raise InputError(f"{name} is not installed: pip install 'msmpetsc[study]' brings it")
 
 
 # Writing and reading

@@ -688,6 +688,6 @@ def test_only_a_table_and_its_charts_load_what_they_need():
 
 def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path, stand_in, monkeypatch):
     monkeypatch.setattr(table, "find_spec", lambda name: None if name == "pandas" else name)
-    with pytest.raises(InputError, match=r"^a study needs pandas: install msmpetsc\[study\]$"):
+    with pytest.raises(InputError, match=r"^pandas is not installed: pip install .msmpetsc\[study\]. brings it$"):
         carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
     assert not (tmp_path / "out").exists()

@@ -38,11 +38,7 @@ GROWTH_CAPTION = (
     "greatest of the repeats."
 )
 X_LABEL = "valid cells (k: thousand, M: million)"
-QUALIFIERS: dict[str, tuple[str, Any]] = {  # what was varied within a method: its words
-    "error": ("error {}", formatting.error),
-    "max_iterations": ("{} iterations", formatting.count),
-    "ranks": ("{} ranks", formatting.count),
-}
+VARIED = ("error", "max_iterations", "ranks")  # columns that may differ between curves of one method
 CHOLESKY_PRESETS = ("fast-msm", "fast-msm-kronecker")
 FACTORS = ("cholesky", "lu")
 GPU_TYPES = ("cuda", "cusparse", "hip", "kokkos")  # parts of the names of PETSc's types
@@ -105,13 +101,9 @@ def cell_sweeps(table: "DataFrame") -> dict[tuple[str, float], "DataFrame"]:
 
 def with_curves(rows: "DataFrame") -> "DataFrame":
     """Return the rows with a column ``curve``: the method, and what else was varied within it."""
-    varied = [name for name in QUALIFIERS if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
-    return rows.assign(curve=[", ".join([row["label"], *_qualifiers(row, varied)]) for row in records(rows)])
-
-
-def _qualifiers(row: Row, columns: list[str]) -> list[str]:
-    words = ((QUALIFIERS[name], row[name]) for name in columns if row[name] is not None)
-    return [text.format(word(value)) for (text, word), value in words]
+    varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
+    words = ([row["label"], *(formatting.setting(row, name) for name in varied)] for row in records(rows))
+    return rows.assign(curve=[", ".join(filter(None, text)) for text in words])
 
 
 def curves(rows: "DataFrame") -> dict[str, "DataFrame"]:

@@ -1,16 +1,14 @@
 """The report of a study: charts and page from the table alone."""
 
-import csv
 import json
 import re
-import xml.etree.ElementTree as ElementTree
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_files import Balance, row_of, spaced, svgs, tooltips, write_rows
 
 from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cells import curves, figure6_charts, growth_charts, is_cholesky
@@ -18,39 +16,18 @@ from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, winners
 from msmpetsc.study.charts.style import curve_styles
 from msmpetsc.study.report import write_report
-from msmpetsc.study.table import NUMBERS, TEXT, read_table, records, succeeded, typed
-
-VOID = {"meta", "br"}  # elements of HTML that need no end
-
-
-def case(label: str, **given) -> dict[str, str]:
-    """A row of the table as text; frames a second and seconds a simulated second follow from the time a frame."""
-    row = {"label": label, "preset": label, "scene": "block", "integrator": "implicit-euler", "status": "ok"}
-    row |= {"study": "try", "time_step": 0.01, "cells": 1000, "ranks": 1} | given
-    if row.get("time_frame"):
-        row |= {"fps": 1 / row["time_frame"], "time_second": row["time_frame"] / row["time_step"]}
-    row.setdefault("command", "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()))
-    return {name: str(value) for name, value in row.items()}
-
-
-def write_table(folder: Path, rows: list[dict[str, str]], columns: tuple[str, ...] = TEXT + NUMBERS) -> Path:
-    with (folder / "table.csv").open("w", newline="") as stream:
-        table = csv.DictWriter(stream, columns, extrasaction="ignore")
-        table.writeheader()
-        table.writerows(rows)
-    return folder
-
+from msmpetsc.study.table import read_table, records, succeeded, typed
 
 ERRORS = [
-    case("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
-    case("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
-    case("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
-    case("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
-    case("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
-    case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
+    row_of("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
+    row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
+    row_of("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
+    row_of("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
+    row_of("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
 ]
 SWEEP = [
-    case(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
+    row_of(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
     for label, preset, times, its in (
         ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
         ("cg", "anderson", (0.02, 0.09, 0.5), 40),
@@ -78,7 +55,7 @@ TRACES = [
 @pytest.fixture(scope="module")
 def study(tmp_path_factory) -> Path:
     """A folder with a report that has all four charts."""
-    folder = write_table(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
+    folder = write_rows(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
     (folder / "traces.json").write_text(json.dumps(TRACES))
     (folder / "study.toml").write_text('title = "Fast & exact"\n')
     assert write_report(folder) == folder / "report.html"
@@ -88,35 +65,6 @@ def study(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def text(study: Path) -> str:
     return spaced((study / "report.html").read_text())
-
-
-def spaced(text: str) -> str:
-    """With plain spaces between numbers and units."""
-    return text.replace("\N{NO-BREAK SPACE}", " ")
-
-
-def svgs(text: str) -> list[ElementTree.Element]:
-    return [ElementTree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", text, re.DOTALL)]
-
-
-def tooltips(text: str) -> list[str]:
-    return [title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")]
-
-
-class Balance(HTMLParser):
-    """Fails where an element ends that is not open."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.open: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, _attributes):
-        self.open += [tag] if tag not in VOID else []
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
 
 # The Pareto front
@@ -135,7 +83,7 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
-    rows = typed(case("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3)))
+    rows = typed(row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3)))
     assert list(front_rows(rows, STEP)["time_frame"]) == [3, 1]
 
 
@@ -157,7 +105,7 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
 
 
 def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
-    return case(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
+    return row_of(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
 
 
 NOISY = [  # of those that reach 1e-2 the first overlaps with two others, not with the fourth
@@ -191,7 +139,7 @@ def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_
     unknown = "Each was run once: how much its time varies is not known"
     assert all(lines[-1].startswith(unknown) for lines in chart.findings.values())
     assert f"<dt>Repeats</dt><dd>1. {unknown}" in text
-    page = spaced(write_report(write_table(tmp_path, NOISY)).read_text())
+    page = spaced(write_report(write_rows(tmp_path, NOISY)).read_text())
     assert unknown not in page and "<dt>Repeats</dt><dd>3: times are medians" in page
 
 
@@ -264,7 +212,7 @@ def test_what_failed_is_listed_and_counts_nowhere():
 
 
 def test_only_equal_time_steps_are_compared_by_the_step_error():
-    longer = case("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
+    longer = row_of("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
     rows = typed([*ERRORS, longer])
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     panels = chart.points.items()
@@ -285,7 +233,7 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
 def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
     counts = (1000, 10000, 100000)
     cg = [
-        case("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4)
+        row_of("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4)
         for n, time in zip(counts, times, strict=True)
     ]
     rows = typed([*SWEEP[:3], *cg])
@@ -309,7 +257,7 @@ def test_what_counts_as_cholesky(preset: str, options: str, expected: bool):
 
 
 def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = typed(case("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000))
+    rows = typed(row_of("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000))
     assert {name: list(rows["cells"]) for name, rows in curves(rows).items()} == {
         "cg, error 1e-2": [1000, 2000],
         "cg, error 1e-4": [1000, 2000],
@@ -372,9 +320,9 @@ def test_the_whole_table_and_every_command_are_in_it(text: str):
 
 def test_labels_are_escaped(tmp_path: Path):
     label = "a<b>&\"c'"
-    rows = [case(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
-    rows.append(case(label, status="failed", reason=label, scene=label))
-    text = write_report(write_table(tmp_path, rows)).read_text()
+    rows = [row_of(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
+    rows.append(row_of(label, status="failed", reason=label, scene=label))
+    text = write_report(write_rows(tmp_path, rows)).read_text()
     assert Balance(text).open == []
     assert "<b>" not in text and label in unescape(text)
     assert tooltips(text)[0].startswith(label)
@@ -387,18 +335,18 @@ def test_labels_are_escaped(tmp_path: Path):
         ([], 0),
         (ERRORS[:1], 1),
         (ERRORS[-1:] * 3, 0),
-        ([case("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
-        ([case("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
+        ([row_of("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
+        ([row_of("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
     ],
     ids=["no case", "one case", "all failed", "no number", "no cells"],
 )
 def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
-    text = write_report(write_table(tmp_path, rows)).read_text()
+    text = write_report(write_rows(tmp_path, rows)).read_text()
     assert Balance(text).open == [] and len(svgs(text)) == charts
 
 
 def test_a_table_without_some_columns_is_read(tmp_path: Path):
-    write_table(tmp_path, ERRORS, ("label", "status", "command"))
+    write_rows(tmp_path, ERRORS, ("label", "status", "command"))
     assert records(read_table(tmp_path))[0]["true_error"] is None
     assert "newton" in write_report(tmp_path).read_text()
 
@@ -419,7 +367,7 @@ def test_of_several_traces_of_a_method_the_furthest_is_shown():
 
 
 def test_a_trace_without_errors_is_left_out(tmp_path: Path):
-    write_table(tmp_path, [])
+    write_rows(tmp_path, [])
     traces = [{"scene": "a", "label": "b", "trace": trace} for trace in (None, {}, {"position_error": [None]})]
     (tmp_path / "traces.json").write_text(json.dumps(traces))
     assert svgs(write_report(tmp_path).read_text()) == []

@@ -1,5 +1,6 @@
 """Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are stand-ins."""
 
+# ruff: noqa: F811 (fixtures are imported)
 import csv
 import math
 import re
@@ -12,11 +13,17 @@ import pytest
 from conftest import ROOT
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
+from study_files import (
+    Balance,
+    carry_out,
+    row_of,
+    stand_in,  # noqa: F401 (fixtures)
+    study_file,
+    svgs,
+    tooltips,
+    write_rows,
+)
 from study_stand_in import blank_frame
-from test_report import Balance, svgs, tooltips
-from test_report import case as row_of
-from test_report import write_table as write_rows
-from test_study import carry_out, stand_in, study_file  # noqa: F401 (stand_in is a fixture)
 
 from msmpetsc.cli.study import tell_of
 from msmpetsc.comm import log
@@ -204,7 +211,7 @@ def method(label: str, options: str = "") -> str:
     return f'[[method]]\nlabel = "{label}"\noptions = "{options}"\n'
 
 
-def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noqa: F811
+def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):
     methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
@@ -224,7 +231,7 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
     assert "Failed cases" not in page and "4: 1 ok, 1 energy, 1 refused, 1 crashed" in page
 
 
-def test_a_table_of_before_is_continued(tmp_path: Path, stand_in):  # noqa: F811
+def test_a_table_of_before_is_continued(tmp_path: Path, stand_in):
     text = '[[scene]]\nname = "a"\nfile = "scene.toml"\n[[sweep]]\npresets = ["newton"]'
     (before,) = carry_out(tmp_path, text)
     table = tmp_path / "out" / "table.csv"

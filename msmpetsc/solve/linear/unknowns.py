@@ -16,7 +16,7 @@ from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
-BYTES_OF_NODE = {"numbers": 8, "places": 3 * 8}  # of a local node: a forecast of memory asks for them
+BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node: a forecast of memory asks for them
 
 
 class Unknowns:

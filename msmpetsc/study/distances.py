@@ -3,21 +3,20 @@
 import warnings
 from pathlib import Path
 
-import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import common_times
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.output.compare import common_times, refuse_different_lattices
+from msmpetsc.output.reader import Result
 
 
-def shape_error(file: h5py.File, frame: int) -> float | None:
-    """Return ``distance_of_shapes`` for a frame of a result file; None where a position is not finite."""
-    position = file["frames/position"][frame]
+def shape_error(run: Result, frame: int) -> float | None:
+    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite."""
+    position = run.frames.position[frame]
     if not np.isfinite(position).all():
         return None
-    return distance_of_shapes(position, file["lattice/nodes"][:], file["lattice/mass"][:])
+    return distance_of_shapes(position, run["lattice/nodes"][:], run["lattice/mass"][:])
 
 
 def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:
@@ -51,16 +50,15 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
     Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
     """
-    with open_result(result) as run, open_result(reference) as true:
+    with Result(result) as run, Result(reference) as true:
+        refuse_different_lattices(run, true)
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
-        if run["lattice/nodes"].shape != rest.shape:
-            raise InputError(f"{result} and {reference} are runs of different lattices")
-        pairs = common_times(*(file["frames/time"][: finished(file)] for file in (run, true)))
+        pairs = common_times(run.frames.time[:], true.frames.time[:])
         if len(pairs) < 2:
             raise InputError(f"{result} and {reference} have {len(pairs)} times in common, 2 are needed")
         off = moved = 0.0
         for of_run, of_reference in pairs:
-            x, x_ref = run["frames/position"][of_run], true["frames/position"][of_reference]
+            x, x_ref = run.frames.position[of_run], true.frames.position[of_reference]
             off += mass @ ((x - x_ref) ** 2).sum(axis=1)
             moved += mass @ ((x_ref - rest) ** 2).sum(axis=1)
     if moved == 0:

@@ -95,7 +95,10 @@ def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shar
 
     options, cells = shlex.join(args.petsc_options), shares.cells.sum()
     try:
-        expected = forecast(args.scene, args.set, options, scene, surface, cells, args.frames, args.measure_here)
+        expected = forecast(
+            file=args.scene, changes=args.set, options=options, scene=scene, surface=surface, cells=cells,
+            frames=args.frames, again=args.measure_here,
+        )  # fmt: skip
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
     memory = expected.memory(shares, len(surface.points) if scene.output.surface else 0, mesh)

@@ -39,14 +39,15 @@ def run(args: argparse.Namespace) -> int:
 def try_all(args: argparse.Namespace, target: float) -> list:
     """Make the trials, and print each when it is done."""
     from msmpetsc.solve.presets import PRESETS
-    from msmpetsc.study.measure import Bench
     from msmpetsc.study.plan import Planner
     from msmpetsc.study.process import Processes
+    from msmpetsc.study.runner import Bench
 
     signal.signal(signal.SIGTERM, interrupt)
     processes = Processes()
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
-        planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, print_trial)
+        bench = Bench(Path(folder), processes)
+        planner = Planner(args.scene, bench, presets=PRESETS, frames=args.frames, ranks=args.ranks, report=print_trial)
         print(HEAD, flush=True)
         try:
             trials = planner.for_step(target) if args.error is None else planner.for_trajectory(target)
@@ -80,7 +81,7 @@ def print_nearest(trials: Sequence, target: float) -> None:
 
 def print_answer(args: argparse.Namespace, best) -> None:
     """Print lines to paste and a command that says the same, or change the file."""
-    from msmpetsc.study.case import launcher
+    from msmpetsc.study.cases import launcher
     from msmpetsc.study.scene_lines import lines, overrides, put_into
 
     print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import psutil
 from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.machine import machine
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.fields import Frame
@@ -96,23 +97,6 @@ def peak_memory() -> int:
     lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
     peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
     return 1024 * peaks[0] if peaks else psutil.Process().memory_info().rss
-
-
-def machine() -> dict[str, Any]:
-    """Return processor, cores, memory [byte] and system."""
-    return {
-        "cpu": processor(),
-        "cores": psutil.cpu_count(),
-        "memory": psutil.virtual_memory().total,
-        "system": platform.platform(terse=True),
-    }
-
-
-def processor() -> str:
-    """Return the name of the processor, which psutil does not know."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if psutil.LINUX else []
-    names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def versions() -> dict[str, str]:

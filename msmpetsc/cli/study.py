@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
         print_cases(args, folder)
         return 0
     try:
-        rows = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart, part)
+        rows = run_study(args.study, folder, PRESETS, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
     except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename or folder}: {error.strerror}") from None
     log_failures(rows)
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
 def part_of(text: str | None):
     """Return "3/16" as the third of 16 parts. Raises InputError."""
-    from msmpetsc.study.runner import Part
+    from msmpetsc.study.runner import StudyPart
 
     if text is None:
         return None
@@ -49,13 +49,13 @@ def part_of(text: str | None):
     numbers = all(part.isdecimal() and len(part) < 10 for part in (index, count))
     if not (numbers and 1 <= int(index) <= int(count)):
         raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
-    return Part(int(index), int(count))
+    return StudyPart(int(index), int(count))
 
 
 def print_cases(args: argparse.Namespace, folder: Path) -> None:
     """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
     from msmpetsc.solve.presets import PRESETS
-    from msmpetsc.study.case import shown_command
+    from msmpetsc.study.cases import shown_command
     from msmpetsc.study.runner import list_study
 
     listed = list_study(args.study, folder, PRESETS, args.full)
@@ -66,15 +66,17 @@ def print_cases(args: argparse.Namespace, folder: Path) -> None:
 
 def log_failures(rows: list[dict]) -> None:
     """Log what deserves a look: cases that failed; and of each map how it went, for there failing is an answer."""
-    from msmpetsc.study.outcome import counted
-    from msmpetsc.study.rows import mapped, swept, timed
+    from msmpetsc.study.metrics import counted
+    from msmpetsc.study.table import as_table, failed, mapped, swept, timed
 
-    failed = sum(row["status"] != "ok" for row in swept(rows))
-    if failed:
-        log.warning("%d case%s without figures: see the column reason", failed, "s" * (failed > 1))
-    once = timed(row for row in swept(rows) if row["repeats"] == 1)
+    table = as_table(rows)
+    lost = len(failed(swept(table)))
+    if lost:
+        log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
+    sweeps = timed(swept(table))
+    once = (sweeps["repeats"] == 1).sum()
     if once:
-        count = f"{len(once)} cases were" if len(once) > 1 else "1 case was"
+        count = f"{once} cases were" if once > 1 else "1 case was"
         log.info("%s run once: how much their times vary is not known", count)
-    for name, group in mapped(rows).items():
-        log.info("map %s: %s", name, counted(group))
+    for name, group in mapped(table).items():
+        log.info("map %s: %s", name, counted(group["outcome"]))

@@ -1,4 +1,4 @@
-"""Runs of the program that need not start it: a process that has imported it forks one for each.
+"""Runs of the program that need not start it: a process that has imported it forks a child for each.
 
 A start takes 2 s of a core, which is most of a small case; a fork 0.4 s. What such a run costs says less of the
 program than a run of its own does, so only cases are run like this of which no time is asked.
@@ -23,29 +23,31 @@ class Forked:
     """``msmpetsc`` with these arguments, in a session of its own; used as subprocess.Popen is."""
 
     def __init__(self, arguments: Sequence[str], log: Path, environment: Mapping[str, str]):
-        """environment: all of the run's. log: what it says goes there."""
+        """Start the run; its output goes to ``log``, and it has this environment alone."""
         self.process = SERVER.Process(target=_run, args=(list(arguments), str(log), dict(environment)), daemon=True)
         self.process.start()
-        self.pid = self.process.pid
+        self.pid = int(self.process.pid or 0)
 
     def poll(self) -> int | None:
+        """Return the exit status; None while it runs."""
         return self.process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Exit status; negative for a signal. Raises subprocess.TimeoutExpired."""
+        """Return the exit status; negative for a signal. Raises subprocess.TimeoutExpired."""
         self.process.join(timeout)
         if self.process.exitcode is None:
-            raise subprocess.TimeoutExpired("msmpetsc", timeout)
+            raise subprocess.TimeoutExpired("msmpetsc", timeout or 0.0)
         return self.process.exitcode
 
     def kill(self) -> None:
+        """End the run at once."""
         self.process.kill()
 
 
 def _run(arguments: list[str], log: str, environment: Mapping[str, str]) -> None:
     os.setsid()
-    for one in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
-        signal.signal(one, signal.SIG_DFL)
+    for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
+        signal.signal(number, signal.SIG_DFL)
     out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(out, 1)
     os.dup2(out, 2)

@@ -1,38 +1,74 @@
-"""Measured numbers as a reader wants them: 34 ms, 1.2e-3, 9,897."""
+"""Measured numbers as a reader wants them: 34 ms, 1.2e-3, 9,897. What is missing, None or NaN, is an empty text."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
 
 from matplotlib.ticker import EngFormatter
 
 GAP = "\N{NO-BREAK SPACE}"  # a unit stays with its number
 
 
-def seconds(value: float | None) -> str:
-    """A time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
-    if value is None:
-        return ""
+def _or_nothing(word: Callable[[Any], str]) -> Callable[[Any], str]:
+    """Make a function return an empty text for what is missing."""
+
+    @wraps(word)
+    def worded(value: Any) -> str:
+        return "" if value is None or value != value else word(value)
+
+    return worded
+
+
+@_or_nothing
+def seconds(value: float) -> str:
+    """Return a time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
     rounded = float(f"{value:.3g}")
     return EngFormatter("s", sep=GAP)(rounded) if rounded < 1000 else f"{rounded:,.0f}{GAP}s"
 
 
-def error(value: float | None) -> str:
-    """A relative error: 0.00123 -> 1.2e-3, 0.001 -> 1e-3."""
-    if value is None:
-        return ""
+@_or_nothing
+def error(value: float) -> str:
+    """Return a relative error: 0.00123 -> 1.2e-3, 0.001 -> 1e-3."""
     mantissa, _, exponent = f"{value:.1e}".partition("e")
     return f"{mantissa.removesuffix('.0')}e{int(exponent)}"
 
 
-def count(value: float | None) -> str:
-    """A number of things: 9897 -> 9,897; means keep a digit."""
-    return "" if value is None else f"{value:,.0f}" if value == int(value) else f"{value:,.1f}"
+@_or_nothing
+def count(value: float) -> str:
+    """Return a number of things: 9897 -> 9,897; means keep a digit."""
+    return f"{value:,.0f}" if value == int(value) else f"{value:,.1f}"
 
 
-def size(value: float | None) -> str:
-    """Bytes with their prefix: 2.5e8 -> 250 MB."""
-    return "" if value is None else EngFormatter("B", sep=GAP)(float(f"{value:.3g}"))
+@_or_nothing
+def size(value: float) -> str:
+    """Return bytes with their prefix: 2.5e8 -> 250 MB."""
+    return EngFormatter("B", sep=GAP)(float(f"{value:.3g}"))
 
 
-def plain(value: float | str | None) -> str:
-    """Any entry of the table, numbers to four digits."""
-    if value is None or isinstance(value, str):
-        return value or ""
+@_or_nothing
+def plain(value: float | str) -> str:
+    """Return any entry of the table, numbers to four digits."""
+    if isinstance(value, str):
+        return value
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e15 else f"{value:.4g}"
+
+
+SETTINGS: dict[str, tuple[str, Callable[[Any], str]]] = {  # columns that a reader tells cases apart by: their words
+    "error": ("error {}", error),
+    "max_iterations": ("{} iterations", count),
+    "cells": ("{} cells", count),
+    "ranks": ("{} ranks", count),
+}
+
+
+def setting(row: dict[str, Any], name: str) -> str:
+    """Return a setting of the case of a row in words; empty where it has none."""
+    text, word = SETTINGS[name]
+    return text.format(word(row[name])) if row[name] else ""
+
+
+def stepping(row: dict[str, Any]) -> str:
+    """Return how the case of a row steps; an explicit one has substeps within its time step, that between frames."""
+    if row["integrator"] == "verlet":
+        return f"substeps of {seconds(row['substep'])}" if row["substep"] else "longest stable substeps"
+    return f"time step {seconds(row['time_step'])}" if row["time_step"] else ""

@@ -1,43 +1,83 @@
-"""What a run says of itself, in its result file and its measure file, as the figures of a table's row."""
+"""The figures of a run, from its result file and its measure file, as a row of the table; and its outcome in a word."""
 
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
 from msmpetsc.output.reader import Result
-from msmpetsc.study.shape import shape_error
+from msmpetsc.study.distances import shape_error
 from msmpetsc.study.table import Row
 
 COUNTS = ("cells", "nodes", "unknowns", "springs")
 PARTS = ("setup", "factor", "local", "ksp", "output")
+ITERATIONS = ("iterations", "ksp_its")
+
+OUTCOMES = (  # of a run of a map: from the worst to the best
+    "crashed", "timeout", "refused", "not finite", "energy", "diverged", "not recovered", "inverted", "slow", "ok",
+)  # fmt: skip
+MEANING = {
+    "crashed": "the program itself broke",
+    "timeout": "took too long",
+    "refused": "the program would not begin",
+    "not finite": "a number overflowed",
+    "energy": "the energy grew without work",
+    "diverged": "a step not solved, or explicit steps ran away",
+    "not recovered": "more than 2% off the rest shape at the end",
+    "inverted": "cells are inside out at the end",
+    "slow": "more than 30 iterations a step",
+    "ok": "none of these",
+}
+STEP_FAILED, REFUSED = 3, 2  # exit statuses
+OWN_NAME = ("not finite", "energy", "refused")  # kinds of failure that are outcomes
+RECOVERED = 0.02  # shape error
+SLOW = 30  # iterations a step
 
 
-def measured(path: Path) -> Row:
-    """Figures of the measure file that ``msmpetsc run --measure`` leaves."""
-    told = json.loads(path.read_text())
-    row = {name: told.get(name) for name in (*COUNTS, "memory", "explicit_limit")}
-    row |= {f"time_{part}": told.get("time", {}).get(part) for part in PARTS}
-    return row | {"machine": _machine(told.get("machine", {})), "versions": _versions(told.get("versions", {}))}
+# The measure file, which ``msmpetsc run --measure`` leaves
 
 
-def failure(path: Path) -> str:
-    """What kind of failure the measure file tells of; "" for none, or where there is no such file."""
+def read_costs(path: Path) -> Row:
+    """Return counts, times, memory, machine and versions of a measure file."""
+    record = json.loads(path.read_text())
+    row = {name: record.get(name) for name in (*COUNTS, "memory", "explicit_limit")}
+    row |= {f"time_{part}": record.get("time", {}).get(part) for part in PARTS}
+    return row | {"machine": _machine(record.get("machine", {})), "versions": _versions(record.get("versions", {}))}
+
+
+def read_failure(path: Path) -> str:
+    """Return the kind of failure that a measure file records; "" for none, or where there is no such file."""
     try:
-        told = json.loads(path.read_text()).get("failure")
+        failure = json.loads(path.read_text()).get("failure")
     except (OSError, ValueError):
         return ""
-    return told["kind"] if told else ""
+    return failure["kind"] if failure else ""
 
 
-def trace(path: Path) -> dict | None:
+def read_trace(path: Path) -> dict | None:
+    """Return the trace of a measure file; None where there is none."""
     return json.loads(path.read_text()).get("trace") if path.is_file() else None
 
 
+def _machine(record: dict) -> str:
+    parts = [record.get("cpu"), record.get("cores") and f"{record['cores']} cores"]
+    parts += [record.get("memory") and f"{record['memory'] / 2**30:.0f} GiB", record.get("system")]
+    return ", ".join(str(part) for part in parts if part)
+
+
+def _versions(record: dict) -> str:
+    return ", ".join(f"{name} {version}" for name, version in record.items())
+
+
+# The result file
+
+
 def of_frames(result: Path, time_step: float) -> Row:
-    """Figures of the result file: times and iterations are means a step, the first frame left out."""
+    """Return figures of the result file: times and iterations are means a step, the first frame left out."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -45,20 +85,17 @@ def of_frames(result: Path, time_step: float) -> Row:
     if count < 2:
         return {"frames": count, "steps": 0} | shape
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
-    kept = slice(2 if count > 2 else 1, None)  # what is only done once shows in the first
-    mean = {
-        name: series[name][kept].sum() / steps[kept.start - 1 :].sum()
-        for name in ("wall_time", "iterations", "ksp_its")
-    }
+    start = 2 if count > 2 else 1  # what is only done once shows in the first frame
+    mean = {name: series[name][start:].sum() / steps[start - 1 :].sum() for name in ("wall_time", *ITERATIONS)}
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
-    row |= {"iterations": float(mean["iterations"]), "ksp_its": float(mean["ksp_its"])}
+    row |= {name: float(mean[name]) for name in ITERATIONS}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
     return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
 
 
 def _soundness(series: dict[str, np.ndarray]) -> Row:
-    """What went wrong on the way, as far as the file tells; cells inverted count in the last frame alone."""
-    row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
+    """Return what went wrong on the way, as far as the file has it; inverted cells count in the last frame alone."""
+    row: Row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
     if "energy_gained" in series:
         row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
     if "inverted" in series:
@@ -67,13 +104,13 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
 
 
 def _energy_left(series: dict[str, np.ndarray]) -> float | None:
-    """Of a body on which no load acts: energy at the end over that at the start; None for others."""
+    """Return the energy at the end over that at the start; None for a body on which a load acts."""
     energy = series["kinetic"] + series["elastic"] + series["contact"]
     return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 
 def _errors(series: dict[str, np.ndarray]) -> Row:
-    """Root mean squares over the steps whose true error was measured, or over all."""
+    """Return root mean squares over the steps whose true error was measured, or over all."""
     estimated = series["step_error"][1:]
     nothing = np.full(len(estimated), np.nan)
     true = series["true_error"][1:] if "true_error" in series else nothing
@@ -91,34 +128,63 @@ def _rms(values: np.ndarray) -> float | None:
     return float(np.sqrt((values**2).mean())) if len(values) else None
 
 
-def together(runs: Sequence[Row]) -> Row:
-    """One row of the repeats' figures: medians of times, and the range of a step's; what was measured once, from the
-    run that measured it.
+# Repeats
 
-    Memory is that of the leanest: the first run may have measured errors beside its work.
+
+def together(runs: Sequence[Row]) -> Row:
+    """Return one row of the repeats' figures: medians of times, and the range of a step's.
+
+    What was measured once comes from the run that measured it. Memory is that of the leanest: the first run may have
+    measured errors beside its work.
     """
     row = dict(runs[0])
     for name in row:
-        given = [run[name] for run in runs if run.get(name) is not None]
-        if name.startswith("time_") and given:
-            row[name] = median(given)
-        elif name == "memory" and given:
-            row[name] = min(given)
+        known = [run[name] for run in runs if run.get(name) is not None]
+        if name.startswith("time_") and known:
+            row[name] = median(known)
+        elif name == "memory" and known:
+            row[name] = min(known)
     times = [run["time_frame"] for run in runs if run.get("time_frame") is not None]
     return row | ({"time_frame_min": min(times), "time_frame_max": max(times)} if len(times) > 1 else {})
 
 
 def rates(row: Row, time_step: float) -> Row:
-    """Frames a second, and computing seconds a simulated second."""
+    """Return frames a second, and computing seconds a simulated second."""
     time = row.get("time_frame")
     return {"fps": 1 / time, "time_second": time / time_step} if time else {}
 
 
-def _machine(told: dict) -> str:
-    parts = [told.get("cpu"), told.get("cores") and f"{told['cores']} cores"]
-    parts += [told.get("memory") and f"{told['memory'] / 2**30:.0f} GiB", told.get("system")]
-    return ", ".join(str(part) for part in parts if part)
+# How a run of a map went, in a word
 
 
-def _versions(told: dict) -> str:
-    return ", ".join(f"{name} {version}" for name, version in told.items())
+def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
+    """Return the worst that befell a run.
+
+    status   : exit status, None where time ran out
+    kind     : of the failure that the run records, "" for none
+    row      : its figures
+    recovers : whether it should have ended in its rest shape
+    """
+    if status is None:
+        return "timeout"
+    if status == REFUSED:
+        return "refused"
+    if status == STEP_FAILED:
+        return kind if kind in OWN_NAME else "diverged"
+    if status != 0 or not row.get("frames"):
+        return "crashed"
+    shape = row.get("shape_error")
+    if shape is None:
+        return "not finite"
+    if recovers and shape > RECOVERED:
+        return "not recovered"
+    if (row.get("inverted") or 0) > 0:
+        return "inverted"
+    solved = row.get("integrator") != "verlet"  # whose iterations are substeps
+    return "slow" if solved and (row.get("iterations") or 0) > SLOW else "ok"
+
+
+def counted(outcomes: Iterable[Any]) -> str:
+    """Return how many went how, best first: 20 ok, 3 slow."""
+    counts = Counter(outcomes)
+    return ", ".join(f"{counts[name]} {name}" for name in reversed(OUTCOMES) if counts[name])

@@ -1,4 +1,4 @@
-"""The first that a server of runs imports (study.forkserver): MPI is not to wake in it, but in each run."""
+"""The first import of the fork server (study.forkserver), by name: MPI is to begin in each run, not in the server."""
 
 import mpi4py
 

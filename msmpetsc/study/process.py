@@ -1,4 +1,4 @@
-"""One process with all it starts: waited for, ended when it takes too long, and told of in one line."""
+"""A process with all that it starts: waited for, ended when it takes too long, its trouble kept in one line."""
 
 import os
 import signal
@@ -10,11 +10,14 @@ from pathlib import Path
 from threading import Lock
 from time import perf_counter
 
+import psutil
+
 from msmpetsc.study.forkserver import COLD, Forked
 
 GRACE = 3.0  # [s] between the request to end and the end
-MARKS_OF_MPI = (  # of a launcher around us: not for our children
-    "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_", "OMPI_MCA_orte_hnp_uri",
+VARIABLES_OF_MPI = (  # of a launcher around us: not for our children
+    "PMIX_", "PMI_", "OMPI_COMM_WORLD_", "OMPI_UNIVERSE_", "OMPI_MCA_ess", "OMPI_MCA_orte_ess_",
+    "OMPI_MCA_orte_hnp_uri",
     "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_", "OMPI_MCA_pmix",
 )  # fmt: skip
 # a process alone needs neither Open MPI's daemon nor its search for a network: a third of a second at its start
@@ -25,7 +28,12 @@ OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_defa
 
 @dataclass(frozen=True)
 class Ended:
-    """status: exit status, None where time ran out. reason: the last line of trouble, "" if status is 0."""
+    """The end of a process.
+
+    status  : exit status, None where time ran out
+    reason  : the last line of trouble, "" if status is 0
+    seconds : that it took
+    """
 
     status: int | None
     reason: str
@@ -33,9 +41,9 @@ class Ended:
 
 
 class Processes:
-    """Those under way; once stopped, none is started any more."""
+    """The processes under way; once stopped, none is started any more."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._running: set[subprocess.Popen | Forked] = set()
         self._stopped = False
         self._lock = Lock()
@@ -49,11 +57,12 @@ class Processes:
         process = self._start(command, log, warm and list(command[:3]) == COLD)
         if process is None:
             return Ended(None, "stopped", 0.0)
+        status: int | None = None
         try:
             status = process.wait(timeout)
             reason = "" if status == 0 else last_error(log.read_text(errors="replace")) or f"exit status {status}"
         except subprocess.TimeoutExpired:
-            status, reason = None, too_long(timeout)
+            reason = too_long(timeout)
         finally:
             end(process)  # what it may have left running, too
             with self._lock:
@@ -61,7 +70,7 @@ class Processes:
         return Ended(status, reason, perf_counter() - begin)
 
     def stop(self) -> None:
-        """End all of them, for good."""
+        """End all processes, for good."""
         with self._lock:
             self._stopped, running = True, list(self._running)
         for process in running:
@@ -69,6 +78,7 @@ class Processes:
 
     @property
     def stopped(self) -> bool:
+        """True once no process is started any more."""
         return self._stopped
 
     def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen | Forked | None:
@@ -76,6 +86,7 @@ class Processes:
         with self._lock, open(log, "w") as out:
             if self._stopped:
                 return None
+            process: subprocess.Popen | Forked
             if warm:
                 process = Forked(command[3:], log, variables)
             else:
@@ -87,19 +98,23 @@ class Processes:
 
 
 def environment(alone: bool = False) -> dict[str, str]:
-    """As this process was started: an MPI that has since woken up in it leaves marks that confuse a child's."""
-    ours = {name: value for name, value in os.environ.items() if not name.startswith(MARKS_OF_MPI)}
+    """Return the environment that this process was started with: an MPI begun in it since would confuse a child's.
+
+    alone : of a process without mpiexec
+    """
+    ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
     # one thread a rank, or ranks and threads would fight for the cores
     return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours
 
 
 def too_long(timeout: float) -> str:
+    """Return the reason of a process that was ended after so many seconds."""
     return f"took longer than {timeout:g} s"
 
 
-def last_error(told: str) -> str:
-    """The last line that tells of an error, or else the last line."""
-    lines = [line.strip() for line in told.splitlines() if line.strip()]
+def last_error(log: str) -> str:
+    """Return the last line of a log that is an error, or else the last line."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
     errors = [line for line in lines if "msmpetsc: error:" in line]
     return (errors or lines or [""])[-1].removeprefix("msmpetsc: error: ")[:500]
 
@@ -119,10 +134,10 @@ def end(process: subprocess.Popen | Forked) -> None:
 
 
 def session(leader: int) -> list[int]:
-    """The processes of a session, as Linux shows them."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
+    """Return the processes of a session."""
+    members = []
+    for pid in psutil.pids():
         with suppress(OSError):
-            if os.getsid(int(entry.name)) == leader:
-                found.append(int(entry.name))
-    return found
+            if os.getsid(pid) == leader:
+                members.append(pid)
+    return members

@@ -1,4 +1,4 @@
-"""How far a study is: a bar on a terminal, lines in a log, both with what is left."""
+"""Progress of a study: a bar on a terminal, lines in a log, both with the time that is left."""
 
 import sys
 from collections.abc import Sequence
@@ -11,11 +11,15 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from msmpetsc.comm import log
 from msmpetsc.output.progress import duration
-from msmpetsc.study.metrics import Row
+from msmpetsc.study.table import Row
 
 
 class StudyProgress:
-    """Tell of each case that is done. work: of each case still to do, in any unit; ``done`` cases were before."""
+    """Shows each case that is done.
+
+    work : of each case still to do, in any unit
+    done : cases that were done before
+    """
 
     def __init__(self, work: Sequence[float], done: int = 0, stream: TextIO | None = None):
         self._total, self._done = done + len(work), done
@@ -28,14 +32,14 @@ class StudyProgress:
             self._bar = tqdm(total=self._total, initial=done, unit="case", file=self._stream, dynamic_ncols=True)
             self._redirected.enter_context(logging_redirect_tqdm([log]))
         elif done:
-            self._tell(f"{done} of {self._total} cases are done already")
+            self._print(f"{done} of {self._total} cases are done already")
 
     def update(self, row: Row, work: float) -> None:
-        """A case is done."""
+        """Show a case that is done."""
         self._done, self._left, self._spent = self._done + 1, self._left - work, self._spent + work
         left = duration((monotonic() - self._begun) * self._left / self._spent)
         if self._bar is None:
-            self._tell(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
+            self._print(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
             return
         if row["status"] != "ok" and not row.get("map"):
             self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
@@ -43,29 +47,27 @@ class StudyProgress:
         self._bar.update()
 
     def close(self) -> None:
+        """Leave the bar as it is."""
         self._redirected.close()
         if self._bar is not None:
             self._bar.close()
 
-    def _tell(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         print(line, file=self._stream, flush=True)
 
 
 def described(row: Row) -> str:
-    """A case in a few words."""
+    """Return a case in a few words."""
     if row.get("map"):
         x = "" if row["x"] == row["label"] else f"{row['x']}, "
         return f"{row['map']} {row['label']} at {x}{row['y']}"
-    goal = (
-        f"error {row['error']:g}"
-        if row["error"]
-        else f"{row['max_iterations']} iterations"
-        if row["max_iterations"]
-        else ""
-    )
-    step = f"t = {row['substep'] or row['time_step']:.3g} s"
-    parts = [row["scene"], row["label"], f"{row['cells']:.0f} cells" if row["cells"] else "", step, goal]
-    return " ".join(part for part in parts if part)
+    parts = [row["scene"], row["label"], f"{row['cells']:.0f} cells" if row["cells"] else ""]
+    parts.append(f"t = {row['substep'] or row['time_step']:.3g} s")
+    if row["error"]:
+        parts.append(f"error {row['error']:g}")
+    elif row["max_iterations"]:
+        parts.append(f"{row['max_iterations']} iterations")
+    return " ".join(filter(None, parts))
 
 
 def _outcome(row: Row) -> str:
@@ -74,9 +76,9 @@ def _outcome(row: Row) -> str:
     if row["status"] != "ok":
         return f"{row['status']}: {row['reason']}"
     errors = {"step": row.get("true_error"), "trajectory": row.get("trajectory_error")}
-    told = [f"{name} error {value:.1e}" for name, value in errors.items() if value is not None]
+    reached = [f"{name} error {value:.1e}" for name, value in errors.items() if value is not None]
     time = row.get("time_frame")
     low, high = row.get("time_frame_min"), row.get("time_frame_max")
     range_of_repeats = f" ({low:.3g} to {high:.3g})" if low is not None and high is not None else ""
     stepping = f"{time:.3g} s a step{range_of_repeats}" if time else "no step"
-    return "  ".join([stepping, *told, *filter(None, [row["reason"]])])
+    return "  ".join([stepping, *reached, *filter(None, [row["reason"]])])

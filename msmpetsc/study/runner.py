@@ -1,46 +1,159 @@
-"""A study is carried out: case after case, the table written after each, so that it can be stopped and continued."""
+"""A study is carried out: a bench runs each case, and the table is written after each, so that it can be continued."""
 
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 
 from msmpetsc.errors import InputError
-from msmpetsc.study.case import Case
-from msmpetsc.study.measure import Bench, Measured
-from msmpetsc.study.metrics import Row
-from msmpetsc.study.process import Processes, too_long
+from msmpetsc.study.cases import Case, command, shown_command, study_cases
+from msmpetsc.study.distances import trajectory_error
+from msmpetsc.study.metrics import of_frames, outcome, rates, read_costs, read_failure, read_trace, together
+from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.progress import StudyProgress
-from msmpetsc.study.reading import load_study
-from msmpetsc.study.schema import Study
-from msmpetsc.study.sweep import cases
-from msmpetsc.study.table import read_table, write_table
+from msmpetsc.study.schema import Study, load_study
+from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
 
 PARTS = "parts"  # folder of the parts' folders
 
 
+# One case
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """The row of a case, its trace if one was asked for, and the time all of it took [s]."""
+
+    row: Row
+    trace: dict | None
+    seconds: float
+
+
 @dataclass
-class Findings:
-    """What is known so far, in its folder: rows and traces by case, in the order of ``order``."""
+class Bench:
+    """Runs cases in a folder: results come and go in it, references stay."""
+
+    folder: Path
+    processes: Processes
+    study: str = ""
+    _locks: dict[str, Lock] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def measure(self, case: Case) -> CaseResult:
+        """Run a case as often as it says; what goes wrong stands in its row."""
+        runs: list[Row] = []
+        path, seconds = self.folder / "runs" / f"{case.id}.h5", 0.0
+        reference, why = self._reference(case)
+        trace, kind = None, ""
+        for repeat in range(case.repeats):
+            ended = self._run(case if repeat == 0 else case.unmeasured(), path)
+            seconds += ended.seconds
+            row, problem = self._figures(case, path, ended)
+            if repeat == 0:
+                trace = read_trace(path.with_suffix(".json"))
+                if reference is not None and not ended.reason:
+                    row["trajectory_error"], why = _distance(path, reference)
+            kind = read_failure(path.with_suffix(".json"))
+            _remove_files(path, log=not ended.reason)
+            runs.append(row)
+            if ended.reason:
+                break
+            why = why or problem
+        status = "ok" if not ended.reason else "timeout" if ended.status is None else "failed"
+        row = self._named(case) | together(runs) | {"status": status, "reason": ended.reason or why}
+        if case.point:
+            row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
+        return CaseResult(row | rates(row, case.time_step), trace, seconds)
+
+    def references(self) -> list[Path]:
+        """Return the results of the references made so far."""
+        return sorted((self.folder / "references").glob("*.h5"))
+
+    def _named(self, case: Case) -> Row:
+        """Return what is known of a case before it runs."""
+        return case.columns | {"study": self.study, "command": shown_command(case)}
+
+    def _run(self, case: Case, path: Path) -> Ended:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figures, log = path.with_suffix(".json"), path.with_suffix(".log")
+        # no time is asked of a point of a map
+        return self.processes.run(command(case, path, figures), log, case.timeout, warm=case.point is not None)
+
+    def _figures(self, case: Case, path: Path, ended: Ended) -> tuple[Row, str]:
+        """Return the figures of a run, as far as it came; and what is missing, in words."""
+        row: Row = {}
+        problem = ""
+        try:
+            row |= read_costs(path.with_suffix(".json"))
+            row |= of_frames(path, case.time_step)
+            if case.integrator == "verlet":
+                row["estimated_error"] = None  # nothing is solved
+        except (OSError, ValueError, InputError) as error:
+            problem = "" if ended.reason else f"no figures: {error}"
+        return row, problem
+
+    def _reference(self, case: Case) -> tuple[Path | None, str]:
+        """Return the result of the case's reference, made if need be; or why there is none."""
+        if case.reference is None:
+            return None, ""
+        path = self.folder / "references" / f"{case.reference.id}.h5"
+        with self._lock:
+            lock = self._locks.setdefault(case.reference.id, Lock())
+        with lock:
+            failed = path.with_suffix(".failed")
+            if not path.is_file() and not failed.is_file():
+                part = path.with_suffix(".part.h5")
+                ended = self._run(case.reference, part)
+                if self.processes.stopped:
+                    return None, "stopped"
+                if ended.reason:
+                    failed.write_text(ended.reason)
+                else:
+                    os.replace(part, path)
+                _remove_files(part, log=not ended.reason)
+        return (path, "") if path.is_file() else (None, f"no reference: {failed.read_text()}")
+
+
+def _distance(path: Path, reference: Path) -> tuple[float | None, str]:
+    try:
+        return trajectory_error(path, reference), ""
+    except InputError as error:
+        return None, f"no trajectory error: {error}"
+
+
+def _remove_files(path: Path, log: bool) -> None:
+    """Remove a run's files, large as they are; its log only if ``log``."""
+    for suffix in (".h5", ".xdmf", ".json", *((".log",) if log else ())):
+        path.with_suffix(suffix).unlink(missing_ok=True)
+
+
+# All cases
+
+
+@dataclass
+class StudyResults:
+    """Rows and traces of a study so far, by case, in its folder and in the order of ``order``."""
 
     folder: Path
     order: Sequence[str]
     rows: dict[str, Row] = field(default_factory=dict)
     traces: dict[str, dict] = field(default_factory=dict)
 
-    def add(self, found: Measured) -> None:
-        case = found.row["case"]
-        self.rows[case] = found.row
-        if found.trace:
-            self.traces[case] = {key: found.row[key] for key in ("case", "scene", "label")} | {"trace": found.trace}
+    def add(self, result: CaseResult) -> None:
+        """Keep the result of a case."""
+        case = result.row["case"]
+        self.rows[case] = result.row
+        if result.trace:
+            self.traces[case] = {key: result.row[key] for key in ("case", "scene", "label")} | {"trace": result.trace}
         self.write()
 
     def write(self) -> None:
-        """Table and traces, each replaced whole."""
+        """Write table and traces, each replaced whole."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
         part = self.folder / "traces.json.part"
         part.write_text(json.dumps([self.traces[case] for case in self.order if case in self.traces]))
@@ -48,7 +161,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Part:
+class StudyPart:
     """The ``index``-th of ``count`` parts of a study, from 1: cases that follow each other, for they share references.
 
     Its table stands in a folder of its own, so that parts may run at the same time, on any machines.
@@ -58,20 +171,23 @@ class Part:
     count: int
 
     def of(self, cases: Sequence[str]) -> Sequence[str]:
+        """Return the part's cases."""
         return cases[len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count]
 
     def folder(self, study: Path) -> Path:
+        """Return the part's folder in that of the study."""
         return study / PARTS / f"{self.index}-of-{self.count}"
 
 
 def run_study(
     path: Path,
     folder: Path,
-    presets: Collection[str],
+    presets: Collection[str] | None,
+    *,
     full: bool = False,
     jobs: int | None = None,
     restart: bool = False,
-    part: Part | None = None,
+    part: StudyPart | None = None,
 ) -> list[Row]:
     """Run what is not done yet of a study file, as many cases at a time as ``jobs`` or else the file says; all rows.
 
@@ -79,6 +195,7 @@ def run_study(
     file are kept, those of its parts too; ``restart`` forgets them. With a ``part`` only that is run, in a folder of
     its own, and only its rows are returned. Raises InputError before anything is run.
     """
+    require_extra()
     study = load_study(path, presets)
     every, wanted = _cases(study, path, full, presets)
     wanted = part.of(wanted) if part else wanted
@@ -87,44 +204,50 @@ def run_study(
     if restart:
         _forget(own)
     known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
-    findings = _continued(known, {case: every[case] for case in wanted} if part else every)
+    results = _continued(known, {case: every[case] for case in wanted} if part else every)
     (own / "study.toml").write_bytes(path.read_bytes())
-    findings.write()
-    todo = [every[case] for case in wanted if not _is_done(every[case], findings.rows)]
-    _carry_out(Bench(own, Processes(), path.stem), todo, findings, jobs or study.jobs, len(wanted) - len(todo))
-    return [findings.rows[case] for case in wanted]
+    results.write()
+    todo = [every[case] for case in wanted if not _is_done(every[case], results.rows)]
+    bench = Bench(own, Processes(), path.stem)
+    _carry_out(bench, todo, results, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
+    return [results.rows[case] for case in wanted]
 
 
-def list_study(path: Path, folder: Path, presets: Collection[str], full: bool = False) -> list[tuple[Case, bool]]:
-    """The cases of a study file in their order, and whether each is done; nothing is run or written."""
+def list_study(
+    path: Path, folder: Path, presets: Collection[str] | None, full: bool = False
+) -> list[tuple[Case, bool]]:
+    """Return the cases of a study file in their order, and whether each is done; nothing is run or written."""
+    require_extra()
     every, wanted = _cases(load_study(path, presets), path, full, presets)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
     return [(every[case], _is_done(every[case], rows)) for case in wanted]
 
 
-def _cases(study: Study, path: Path, full: bool, presets: Collection[str]) -> tuple[dict[str, Case], list[str]]:
-    """All cases by their id, and the ids of those that are wanted."""
-    every = {case.id: case for case in cases(study, path.parent, True, presets)}
-    return every, [case.id for case in cases(study, path.parent, full, presets)]
+def _cases(
+    study: Study, path: Path, full: bool, presets: Collection[str] | None
+) -> tuple[dict[str, Case], Sequence[str]]:
+    """Return all cases by their id, and the ids of those that are wanted."""
+    every = {case.id: case for case in study_cases(study, path.parent, True, presets)}
+    return every, [case.id for case in study_cases(study, path.parent, full, presets)]
 
 
-def _carry_out(bench: Bench, todo: Sequence[Case], findings: Findings, jobs: int, done: int) -> None:
-    """Run cases and keep what is found; ``done`` were before."""
+def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
+    """Run cases and keep their results; ``done`` were before."""
     work = {case.id: case.work for case in todo}
     progress = StudyProgress(list(work.values()), done)
     try:
-        with closing(measure_all(bench, todo, jobs)) as all_found:
-            for found in all_found:
-                findings.add(found)
-                progress.update(found.row, work[found.row["case"]])
+        with closing(measure_all(bench, todo, jobs)) as finished:
+            for result in finished:
+                results.add(result)
+                progress.update(result.row, work[result.row["case"]])
     finally:
         progress.close()
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()
 
 
-def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Iterable[Measured]:
-    """Each case's figures when it is done; whatever ends this early ends the runs under way."""
+def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Generator[CaseResult, None, None]:
+    """Yield each case's result when it is done; whatever ends this early ends the runs under way."""
     pool = ThreadPoolExecutor(jobs)
     try:
         futures = [pool.submit(bench.measure, case) for case in todo]
@@ -135,34 +258,51 @@ def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Iterable[M
         pool.shutdown(cancel_futures=True)
 
 
-def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> Findings:
-    """What earlier runs left of these cases, called by their present names; the first of the folders is continued.
+# What earlier runs left
 
-    Of a case in several of them the first row counts that need not be run again.
+
+def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
+    """Return what earlier runs left of these cases, called by their present names.
+
+    The first of the folders is continued. Of a case in several of them the first row counts that need not be run again.
     """
-    findings = Findings(folders[0], list(by_id))
+    results = StudyResults(folders[0], list(by_id))
     for folder in dict.fromkeys(folders):
-        found = {row["case"]: row for row in read_table(folder) if row["case"] in by_id}
-        new = {case: row for case, row in found.items() if not _is_done(by_id[case], findings.rows)}
-        findings.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
-        findings.traces |= _traces(folder, new)
-    for case, entry in findings.traces.items():
+        rows = {row["case"]: row for row in _earlier_rows(folder) if row["case"] in by_id}
+        new = {case: row for case, row in rows.items() if not _is_done(by_id[case], results.rows)}
+        results.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
+        results.traces |= _traces(folder, new)
+    for case, entry in results.traces.items():
         entry["label"] = by_id[case].label
-    return findings
+    return results
+
+
+def _earlier_rows(folder: Path) -> list[Row]:
+    """Return the rows of a table to be continued; none where there is no table."""
+    path = folder / "table.csv"
+    if not path.is_file():
+        return []
+    try:
+        table = read_table(folder)
+    except InputError:
+        table = None
+    if table is None or (table["case"] == "").any() or table[["ranks", "repeats"]].isna().any(axis=None):
+        raise InputError(f"{path} is not the table of a study of this version: --restart begins anew")
+    return records(table)
 
 
 def _traces(folder: Path, cases: Collection[str]) -> dict[str, dict]:
-    """Of these cases, what traces.json of a folder has."""
+    """Return what traces.json of a folder has of these cases."""
     traces = folder / "traces.json"
     try:
-        told = json.loads(traces.read_text()) if traces.is_file() else []
-        return {entry["case"]: entry for entry in told if entry["case"] in cases}
+        entries = json.loads(traces.read_text()) if traces.is_file() else []
+        return {entry["case"]: entry for entry in entries if entry["case"] in cases}
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{traces} is not what a study left: --restart begins anew") from None
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """A case that was given up is worth another try once it may take longer (or less long)."""
+    """Return whether a case need not be run: one given up is worth another try once it may take longer, or less."""
     row = rows.get(case.id)
     return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
 

@@ -3,24 +3,27 @@
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import tomlkit
 
 from msmpetsc.scene.reading import read_toml
-from msmpetsc.study.overrides import inline
-from msmpetsc.study.plan import Method
+from msmpetsc.study.cases import inline, scene_tables
+from msmpetsc.study.plan import Candidate
 
 
-def tables(method: Method) -> dict[str, dict[str, str | float | None]]:
-    """What the method says of a scene; None: the key must not stand there."""
-    if method.integrator == "verlet":
-        return {"time": {"integrator": "verlet", "step": method.time_step, "substep": None}}
-    time = {"integrator": None, "step": method.time_step, "substep": None}
-    return {"time": time, "solver": {"preset": method.preset, "error": method.step_error, "max_iterations": None}}
+def tables(method: Candidate) -> dict[str, dict[str, Any]]:
+    """Return what the method says of a scene; None: the key must not stand there."""
+    return scene_tables(
+        {
+            "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
+            "error": method.step_error, "max_iterations": None,
+        }
+    )  # fmt: skip
 
 
-def lines(method: Method) -> str:
-    """TOML lines to paste."""
+def lines(method: Candidate) -> str:
+    """Return TOML lines to paste."""
     shown = {
         name: {key: value for key, value in table.items() if value is not None}
         for name, table in tables(method).items()
@@ -28,8 +31,8 @@ def lines(method: Method) -> str:
     return tomlkit.dumps(shown).strip()
 
 
-def overrides(scene: Path, method: Method) -> list[str]:
-    """The same as changes of the scene file, as --set takes them. Raises InputError for a file that is no TOML."""
+def overrides(scene: Path, method: Candidate) -> list[str]:
+    """Return the same as changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
     (_, document), changes = read_toml(scene), []
     for name, table in tables(method).items():
         given = document.get(name, {})
@@ -40,7 +43,7 @@ def overrides(scene: Path, method: Method) -> list[str]:
     return changes
 
 
-def put_into(scene: Path, method: Method) -> None:
+def put_into(scene: Path, method: Candidate) -> None:
     """Change the scene file; comments, order and all else stay as they are. Raises OSError if it cannot be written."""
     with open(scene, "r+", encoding="utf-8", newline="") as file:  # a file that is read-only is meant to stay
         text = file.read()
@@ -49,11 +52,12 @@ def put_into(scene: Path, method: Method) -> None:
     for name, table in tables(method).items():
         if name not in document:
             document[name] = tomlkit.table()
+        old: Any = document[name]
         for key, value in table.items():
             if value is None:
-                document[name].pop(key, None)
-            elif document[name].get(key) != value:
-                document[name][key] = value
+                old.pop(key, None)
+            elif old.get(key) != value:
+                old[key] = value
     part = scene.with_name(scene.name + ".part")
     with open(part, "w", encoding="utf-8", newline="") as file:  # new lines end like the others
         file.write(tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))

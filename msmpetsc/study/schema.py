@@ -1,12 +1,15 @@
-"""The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
+"""The schema of a study file: which scenes are run, and with what; and how it is read (TOML)."""
 
 import shlex
+from collections.abc import Collection
+from pathlib import Path
 from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from msmpetsc.errors import did_you_mean
-from msmpetsc.scene.problems import rule
+from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.scene.problems import problem_lines, rule
+from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.schema import Count, FileName, Integrator, ListOf, Positive, Preset, Table
 from msmpetsc.solve.petsc.words import unsafe_word
 
@@ -37,8 +40,8 @@ def _differ(names: list[str], what: str) -> None:
 
 
 def _known(wanted: list[str], what: str, info: ValidationInfo) -> None:
-    """``wanted`` are names of scenes, or labels of methods, of this study."""
-    names = [getattr(one, "name", None) or one.label for one in info.data.get(what, ())]
+    """Refuse ``wanted`` names that no scene, or no method, of this study has; ``what``: "scene" or "method"."""
+    names = [getattr(entry, "name", None) or entry.label for entry in info.data.get(what, ())]
     unknown = next((name for name in wanted if what in info.data and name not in names), None)
     if unknown is not None:
         raise rule(f"names a {what} {unknown!r} that is not there{did_you_mean(unknown, names)}")
@@ -47,32 +50,34 @@ def _known(wanted: list[str], what: str, info: ValidationInfo) -> None:
 Options = Annotated[str, AfterValidator(_words)]
 
 
-class Reference(Table):
-    """The run that a scene's motion is measured against: steps so short that it stands for the true motion."""
+class ReferenceRun(Table):
+    """The run that a scene's motion is measured against, with steps so short that it stands for the true motion."""
 
-    integrator: Integrator = Field("verlet", description="how it is stepped")
-    step: Positive | None = Field(None, description="implicit-euler: time step [s]")
-    substep: Positive | None = Field(None, description="verlet: longest substep [s]; the stability limit's if absent")
-    preset: Preset = Field("newton", description="implicit-euler: solver preset")
-    error: Error = Field(1e-6, description="implicit-euler: relative error of a step [-]")
-    timeout: Positive = Field(600.0, description="longest run [s]")
+    integrator: Integrator = Field(default="verlet", description="how it is stepped")
+    step: Positive | None = Field(default=None, description="implicit-euler: time step [s]")
+    substep: Positive | None = Field(
+        default=None, description="verlet: longest substep [s]; the stability limit's if absent"
+    )
+    preset: Preset = Field(default="newton", description="implicit-euler: solver preset")
+    error: Error = Field(default=1e-6, description="implicit-euler: relative error of a step [-]")
+    timeout: Positive = Field(default=600.0, description="longest run [s]")
 
     @model_validator(mode="after")
-    def _fits_together(self) -> "Reference":
+    def _fits_together(self) -> "ReferenceRun":
         if self.integrator != "verlet" and self.step is None:
             raise rule(f'needs step for integrator = "{self.integrator}"')
         return self
 
 
 class Length(Table):
-    """How long a run is."""
+    """The length of a run."""
 
-    steps: Count | None = Field(None, description="time steps of a run [-]")
-    duration: Positive | None = Field(None, description="or: simulated time [s]; the scene's own if absent")
+    steps: Count | None = Field(default=None, description="time steps of a run [-]")
+    duration: Positive | None = Field(default=None, description="or: simulated time [s]; the scene's own if absent")
 
     @field_validator("duration")
     @classmethod
-    def _one_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
+    def _single_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
         if duration is not None and info.data.get("steps") is not None:
             raise rule("must not stand beside steps", "steps")
         return duration
@@ -83,36 +88,47 @@ class StudyScene(Length):
 
     name: str = Field(min_length=1, description="what charts call it")
     file: FileName = Field(description="scene file, a path from the study file")
-    set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
+    set: ListOf[Override] = Field(default=(), description='changes of the scene: "key.path=value"')
     frame: Positive | None = Field(
-        None, description="moments compared with the reference lie this far apart [s]; the scene's time step if absent"
+        default=None,
+        description="moments compared with the reference lie this far apart [s]; the scene's time step if absent",
     )
-    reference: Reference | None = Field(
-        None, description="what the trajectory error is measured against; none if absent"
+    reference: ReferenceRun | None = Field(
+        default=None, description="what the trajectory error is measured against; none if absent"
     )
-    true_error: Count | None = Field(None, description="every so many steps the true step error is measured [-]")
-    trace: Count | None = Field(None, description="the step whose iterates are followed, in sweeps with trace = true")
-    full: bool = Field(False, description="only with --full")
+    true_error: Count | None = Field(
+        default=None, description="every so many steps the true step error is measured [-]"
+    )
+    trace: Count | None = Field(
+        default=None, description="the step whose iterates are followed, in sweeps with trace = true"
+    )
+    full: bool = Field(default=False, description="only with --full")
 
 
 class Sweep(Table):
-    """Cases: every choice from each list, for every scene. An empty list leaves what the scene has."""
+    """Cases of every choice from each list, for every scene. An empty list leaves what the scene has."""
 
-    scenes: ListOf[str] = Field((), description="names of the scenes; all if absent")
-    integrators: ListOf[Integrator] = Field(("implicit-euler",), description="how they are stepped")
-    presets: ListOf[Preset] = Field((), description="implicit-euler: solver presets")
-    options: ListOf[Options] = Field(("",), description='PETSc options, each one string: "-pc_type icc"')
-    cells: ListOf[Count] = Field((), description="numbers of valid cells [-]")
-    time_steps: ListOf[Positive] = Field((), description="time steps; of verlet, what is between two frames [s]")
-    substeps: ListOf[Positive] = Field((), description="verlet: longest substeps [s]; the stability limit's if absent")
-    errors: ListOf[Error] = Field((), description="relative errors of a step aimed at [-]")
-    max_iterations: ListOf[Count] = Field((), description="and budgets of outer iterations, beside those errors [-]")
-    ranks: ListOf[Count] = Field((1,), description="MPI ranks [-]")
-    steps: Count | None = Field(None, description="time steps of these cases in place of the scene's [-]")
-    set: ListOf[Override] = Field((), description="further changes of the scenes")
-    label: str = Field("", description="what curves are called, in place of preset and options")
-    trace: bool = Field(False, description="follow the iterates of the scene's trace step")
-    full: bool = Field(False, description="only with --full")
+    scenes: ListOf[str] = Field(default=(), description="names of the scenes; all if absent")
+    integrators: ListOf[Integrator] = Field(default=("implicit-euler",), description="how they are stepped")
+    presets: ListOf[Preset] = Field(default=(), description="implicit-euler: solver presets")
+    options: ListOf[Options] = Field(default=("",), description='PETSc options, each one string: "-pc_type icc"')
+    cells: ListOf[Count] = Field(default=(), description="numbers of valid cells [-]")
+    time_steps: ListOf[Positive] = Field(
+        default=(), description="time steps; of verlet, what is between two frames [s]"
+    )
+    substeps: ListOf[Positive] = Field(
+        default=(), description="verlet: longest substeps [s]; the stability limit's if absent"
+    )
+    errors: ListOf[Error] = Field(default=(), description="relative errors of a step aimed at [-]")
+    max_iterations: ListOf[Count] = Field(
+        default=(), description="and budgets of outer iterations, beside those errors [-]"
+    )
+    ranks: ListOf[Count] = Field(default=(1,), description="MPI ranks [-]")
+    steps: Count | None = Field(default=None, description="time steps of these cases in place of the scene's [-]")
+    set: ListOf[Override] = Field(default=(), description="further changes of the scenes")
+    label: str = Field(default="", description="what curves are called, in place of preset and options")
+    trace: bool = Field(default=False, description="follow the iterates of the scene's trace step")
+    full: bool = Field(default=False, description="only with --full")
 
     @field_validator("integrators", "options", "ranks")
     @classmethod
@@ -121,30 +137,32 @@ class Sweep(Table):
 
 
 class Method(Table):
-    """How the scenes of maps are stepped and solved."""
+    """A way to step and solve the scenes of maps."""
 
     label: str = Field(min_length=1, description="what maps call it")
-    integrator: Integrator = Field("implicit-euler", description="how it is stepped")
-    preset: Preset = Field("newton", description="solver preset; of no use to verlet")
-    error: Error | None = Field(None, description="relative error of a step aimed at; the preset's if absent [-]")
-    max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
-    options: Options = Field("", description="PETSc options")
+    integrator: Integrator = Field(default="implicit-euler", description="how it is stepped")
+    preset: Preset = Field(default="newton", description="solver preset; of no use to verlet")
+    error: Error | None = Field(
+        default=None, description="relative error of a step aimed at; the preset's if absent [-]"
+    )
+    max_iterations: Count | None = Field(default=None, description="outer iterations allowed in a step [-]")
+    options: Options = Field(default="", description="PETSc options")
 
 
 class Axis(Table):
-    """What changes along a side of a map: a key of the scene, or several changes that name their {value}."""
+    """A side of a map: a key of the scene that changes along it, or several changes that name their {value}."""
 
-    one_of = ("key", "template")
+    one_of: ClassVar[tuple[str, ...]] = ("key", "template")
     name: str = Field(min_length=1, description="what it is, for the reader")
-    key: str | None = Field(None, min_length=1, description='what is set: "material.young_modulus"')
+    key: str | None = Field(default=None, min_length=1, description='what is set: "material.young_modulus"')
     template: ListOf[Override] = Field(
-        (), description='or changes: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"'
+        default=(), description='or changes: "obstacle.0.path=[{time = 1, by = [0, 0, -{value}]}]"'
     )
     values: ListOf[float] = Field(min_length=1, description="in the order of the axis")
-    unit: str = Field("", description='for the reader; "%" shows 0.2 as 20% and s as 10 ms')
+    unit: str = Field(default="", description='for the reader; "%" shows 0.2 as 20% and s as 10 ms')
 
     def changes(self, value: float) -> tuple[str, ...]:
-        """Overrides of the scene at this value."""
+        """Return overrides of the scene at this value."""
         templates = (f"{self.key}={{value}}",) if self.key else self.template
         return tuple(text.replace("{value}", repr(value)) for text in templates)
 
@@ -154,24 +172,24 @@ class MapCase(Length):
 
     name: str = Field(min_length=1, description="what the map calls it")
     file: FileName = Field(description="scene file, a path from the study file")
-    set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
-    recovers: bool = Field(False, description="the body should be in its rest shape at the end")
-    options: Options = Field("", description="PETSc options for all methods that solve")
+    set: ListOf[Override] = Field(default=(), description='changes of the scene: "key.path=value"')
+    recovers: bool = Field(default=False, description="the body should be in its rest shape at the end")
+    options: Options = Field(default="", description="PETSc options for all methods that solve")
 
 
 class Map(Length):
-    """What happens to a scene over two axes, a panel a method; or to named cases, a column a method."""
+    """A map of what happens to a scene over two axes, a panel a method; or to named cases, a column a method."""
 
     one_of: ClassVar[tuple[str, ...]] = ("file", "case")
     name: str = Field(min_length=1, description="of its files and of its rows")
-    title: str = Field("", description="for the reader; the name if absent")
-    file: FileName | None = Field(None, description="scene file, a path from the study file")
-    set: ListOf[Override] = Field((), description='changes of the scene: "key.path=value"')
-    methods: ListOf[str] = Field((), description="labels of the methods; all if absent")
-    x: Axis | None = Field(None, description="what changes from left to right")
-    y: Axis | None = Field(None, description="what changes from bottom to top")
-    case: ListOf[MapCase] = Field((), description="or: named cases")
-    full: bool = Field(False, description="only with --full")
+    title: str = Field(default="", description="for the reader; the name if absent")
+    file: FileName | None = Field(default=None, description="scene file, a path from the study file")
+    set: ListOf[Override] = Field(default=(), description='changes of the scene: "key.path=value"')
+    methods: ListOf[str] = Field(default=(), description="labels of the methods; all if absent")
+    x: Axis | None = Field(default=None, description="what changes from left to right")
+    y: Axis | None = Field(default=None, description="what changes from bottom to top")
+    case: ListOf[MapCase] = Field(default=(), description="or: named cases")
+    full: bool = Field(default=False, description="only with --full")
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Map":
@@ -187,21 +205,25 @@ class Order(Table):
     """A scene whose sweep over time steps is drawn as the order of the integrators."""
 
     scene: str = Field(min_length=1, description="name of the scene; it needs a reference")
-    frequency: Positive | None = Field(None, description="of its slowest vibration, for implicit Euler's loss [Hz]")
+    frequency: Positive | None = Field(
+        default=None, description="of its slowest vibration, for implicit Euler's loss [Hz]"
+    )
 
 
 class Study(Table):
     """A study file."""
 
-    title: str = Field("", description="for the reader")
-    repeats: Count = Field(1, description="runs of each case, of which medians are taken [-]")
-    timeout: Positive = Field(300.0, description="a run that takes longer is ended, and its case has no figures [s]")
-    jobs: Count = Field(1, description="cases at a time, unless --jobs says otherwise [-]")
-    scene: ListOf[StudyScene] = Field((), description="what is run")
-    sweep: ListOf[Sweep] = Field((), description="how it is run")
-    method: ListOf[Method] = Field((), description="the methods of maps")
-    map: ListOf[Map] = Field((), validate_default=True, description="what happens where")
-    order: ListOf[Order] = Field((), description="scenes that show the order of the integrators")
+    title: str = Field(default="", description="for the reader")
+    repeats: Count = Field(default=1, description="runs of each case, of which medians are taken [-]")
+    timeout: Positive = Field(
+        default=300.0, description="a run that takes longer is ended, and its case has no figures [s]"
+    )
+    jobs: Count = Field(default=1, description="cases at a time, unless --jobs says otherwise [-]")
+    scene: ListOf[StudyScene] = Field(default=(), description="what is run")
+    sweep: ListOf[Sweep] = Field(default=(), description="how it is run")
+    method: ListOf[Method] = Field(default=(), description="the methods of maps")
+    map: ListOf[Map] = Field(default=(), validate_default=True, description="what happens where")
+    order: ListOf[Order] = Field(default=(), description="scenes that show the order of the integrators")
 
     @field_validator("scene")
     @classmethod
@@ -211,7 +233,7 @@ class Study(Table):
 
     @field_validator("sweep")
     @classmethod
-    def _scenes_are_there(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
+    def _scenes_known(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
         _known([name for sweep in sweeps for name in sweep.scenes], "scene", info)
         return sweeps
 
@@ -226,14 +248,26 @@ class Study(Table):
     def _has_what_it_needs(cls, maps: tuple[Map, ...], info: ValidationInfo) -> tuple[Map, ...]:
         if not maps and not all(info.data.get(name, True) for name in ("scene", "sweep")):
             raise rule("required, or else scene and sweep")
-        _differ([one.name for one in maps], "maps")
-        _known([name for one in maps for name in one.methods], "method", info)
+        _differ([map.name for map in maps], "maps")
+        _known([name for map in maps for name in map.methods], "method", info)
         if maps and not info.data.get("method", True):
             raise rule("needs methods: [[method]]", "method")
         return maps
 
     @field_validator("order")
     @classmethod
-    def _orders_are_there(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
+    def _orders_known(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
         _known([order.scene for order in orders], "scene", info)
         return orders
+
+
+def load_study(path: Path, presets: Collection[str] | None = None) -> Study:
+    """Read and check a study file; ``presets`` are the names known, any will do if None.
+
+    Raises InputError naming every problem, one a line.
+    """
+    text, data = read_toml(path, "study")
+    try:
+        return Study.model_validate(data, context={"presets": presets})
+    except ValidationError as error:
+        raise InputError("\n".join(problem_lines(path, error, text, {}))) from None

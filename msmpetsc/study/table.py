@@ -1,12 +1,15 @@
-"""The table of a study: one row a case, as CSV and as HDF5, each replaced whole when a case is done."""
+"""The table of a study: a row a case, written as CSV and HDF5, read as a pandas DataFrame, and its rows chosen.
 
-import csv
+pandas is imported where it is used: the commands that need no table do not wait for it.
+"""
+
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -14,11 +17,15 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import FRAME_FIELDS
 
-Row = dict[str, Any]
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Row = dict[str, Any]  # one case, by column; None where nothing was measured
+EXTRA = ("pandas", "jinja2", "matplotlib")  # packages of msmpetsc[study]
 
 
 class Column(NamedTuple):
-    """kind: str, int or float; only a float can be missing."""
+    """A column of the table; kind: str, int or float, of which only a float can be missing."""
 
     kind: type
     unit: str
@@ -35,7 +42,7 @@ COLUMNS = {
     "study": Column(str, "", "name of the study"),
     "case": Column(str, "", "what defines the case, as a number"),
     "scene": Column(str, "", "the scene's name in the study"),
-    "map": Column(str, "", "the map that it is a place of"),
+    "map": Column(str, "", "the map that it is a point of"),
     "x": Column(str, "", "place on the map's horizontal axis"),
     "y": Column(str, "", "place on the map's vertical axis, or the name of its case"),
     "integrator": Column(str, "", "implicit-euler, bdf2 or verlet"),
@@ -88,66 +95,185 @@ COLUMNS = {
 }
 
 
+TEXT = tuple(name for name, column in COLUMNS.items() if column.kind is str)
+NUMBERS = tuple(name for name in COLUMNS if name not in TEXT)
+ONCE_NOTE = (
+    "Each was run once: how much its time varies is not known, so that close times decide nothing; "
+    "repeats = 3 would tell."
+)
+
+
+def require_extra() -> None:
+    """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
+    for name in EXTRA:
+        if find_spec(name) is None:
+            raise InputError(f"{name} is not installed: pip install 'msmpetsc[study]' brings it")
+
+
+# Writing and reading
+
+
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
-    """Write table.csv and table.h5."""
-    with _replaced(folder / "table.csv") as part, open(part, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows({name: _text(row.get(name)) for name in COLUMNS} for row in rows)
+    """Write table.csv and table.h5, each replaced whole."""
+    table = as_table(rows)
+    with _replaced(folder / "table.csv") as part:
+        table.map(_text).to_csv(part, index=False, lineterminator="\r\n")
     with _replaced(folder / "table.h5") as part, h5py.File(part, "w") as file:
-        _fill(file, rows)
+        _fill(file, table)
 
 
-def read_table(folder: Path) -> list[Row]:
-    """The rows of table.csv; none where there is no table. Raises InputError for one that is no such table."""
+def read_table(folder: Path) -> "DataFrame":
+    """Return the rows of table.csv, see ``typed``. Raises InputError without a table, or for one that is none."""
+    import pandas
+
     path = folder / "table.csv"
     if not path.is_file():
-        return []
+        raise InputError(f"no table.csv in {folder}: it is no folder of a study")
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            return [{name: _value(name, row.get(name) or "") for name in COLUMNS} for row in csv.DictReader(file)]
-    except (KeyError, ValueError, TypeError, csv.Error):
-        raise InputError(f"{path} is not the table of a study of this version: --restart begins anew") from None
+        return typed(pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna(""))
+    except ValueError as error:  # of pandas' parser, of text that is not UTF-8
+        raise InputError(f"{path} is not the table of a study: {str(error).splitlines()[0]}") from None
 
 
-def _fill(file: h5py.File, rows: Sequence[Row]) -> None:
-    """One dataset a column along one dimension, so that xarray finds them; a figure that is missing is NaN."""
-    file["row"] = np.arange(len(rows))
-    file["row"].make_scale("row")
-    for name, column in COLUMNS.items():
-        values = [row.get(name) for row in rows]
-        if column.kind is str:
-            file.create_dataset(
-                name, data=[value or "" for value in values], dtype=h5py.string_dtype(), shape=(len(rows),)
-            )
-        elif column.kind is int:
-            file[name] = np.array(values, dtype="i8")
-        else:
-            file[name] = np.array([math.nan if value is None else value for value in values], dtype="f8")
-        file[name].dims[0].attach_scale(file["row"])
-        file[name].attrs.update({"units": column.unit, "long_name": column.about})
+def as_table(rows: Sequence[Row]) -> "DataFrame":
+    """Return rows as a table with all columns in their order; a number that is missing is NaN, a text empty."""
+    from pandas import DataFrame
+
+    table = DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(NUMBERS, float))
+    return table.astype(dict.fromkeys(TEXT, object)).fillna(dict.fromkeys(TEXT, ""))
+
+
+def typed(texts: "DataFrame | Iterable[Mapping[str, str]]") -> "DataFrame":
+    """Return rows of text as a table with numbers for numbers; columns of no study stay, as text.
+
+    What is missing, not a number, infinite or unreadable was not measured: NaN.
+    """
+    from pandas import DataFrame
+
+    texts = DataFrame(texts if isinstance(texts, DataFrame) else list(texts))
+    stripped = texts.fillna("").map(str.strip)
+    unknown = [name for name in stripped if name not in COLUMNS]
+    table = stripped.reindex(columns=[*COLUMNS, *unknown], fill_value="").astype(object).fillna("")
+    return table.assign(**{name: table[name].map(_number).astype(float) for name in NUMBERS})
+
+
+def records(table: "DataFrame") -> list[Row]:
+    """Return the rows of a table one by one, None for what is missing."""
+    plain = table.astype(object)
+    return plain.where(plain.notna(), None).to_dict("records")  # type: ignore[return-value]  # columns are called by text
+
+
+def _number(text: str) -> float:
+    """Return a finite number exactly as Python reads it, or NaN."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
 
 
 def _text(value: Any) -> str:
-    """The same for a value as it came and as it was read again: a count comes back as a float."""
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
+    """Return a value as the table has it: a count as a whole number, a text in one line, NaN as nothing."""
     if isinstance(value, float):
+        if math.isnan(value):
+            return ""
         return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(float(value))
     return " ".join(str(value).split())
 
 
-def _value(name: str, text: str) -> Any:
-    kind = COLUMNS[name].kind
-    return None if kind is float and text == "" else kind(text)
+def _fill(file: h5py.File, table: "DataFrame") -> None:
+    """Write one dataset a column along one dimension, so that xarray finds them; what is missing is NaN."""
+    file["row"] = np.arange(len(table))
+    file["row"].make_scale("row")
+    kinds = {str: h5py.string_dtype(), int: "i8", float: "f8"}
+    for name, column in COLUMNS.items():
+        file.create_dataset(name, data=table[name].to_numpy(), dtype=kinds[column.kind], shape=(len(table),))
+        file[name].dims[0].attach_scale(file["row"])
+        file[name].attrs.update({"units": column.unit, "long_name": column.about})
 
 
 @contextmanager
-def _replaced(path: Path) -> Iterable[Path]:
-    """A name to write under; what stands there afterwards takes the place of ``path`` at once."""
+def _replaced(path: Path) -> Iterator[Path]:
+    """Yield a name to write under; what was written replaces ``path`` at once."""
     part = path.with_name(path.name + ".part")
     try:
         yield part
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
+
+
+# Choosing rows
+
+
+def succeeded(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that ran to their end."""
+    return table[table["status"] == "ok"]
+
+
+def failed(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that did not run to their end."""
+    return table[table["status"] != "ok"]
+
+
+def swept(table: "DataFrame") -> "DataFrame":
+    """Return the rows of sweeps; those of maps stand apart, for a run that fails there is an answer."""
+    return table[table["map"] == ""]
+
+
+def mapped(table: "DataFrame") -> dict[str, "DataFrame"]:
+    """Return the rows of maps, by map."""
+    return grouped(table[table["map"] != ""], "map")
+
+
+def measured(table: "DataFrame", *columns: str) -> "DataFrame":
+    """Return the rows with a positive number in each of these columns: what a logarithmic axis can show."""
+    return table[(table[list(columns)] > 0).all(axis=1)]
+
+
+def timed(table: "DataFrame") -> "DataFrame":
+    """Return the rows of cases that ran to their end and have a time."""
+    return measured(succeeded(table), "time_frame")
+
+
+def grouped(table: "DataFrame", *columns: str) -> dict[Any, "DataFrame"]:
+    """Return a table's parts by the values of columns, values and rows in their order."""
+    by: Any = columns[0] if len(columns) == 1 else list(columns)
+    return dict(iter(table.groupby(by, sort=False, dropna=False)))
+
+
+# The spread of the repeats of a case; from one run alone nothing is known of it
+
+
+def spread(table: "DataFrame", cost: str) -> "DataFrame":
+    """Return the least and the greatest of the repeats of a cost, as columns; NaN where they are not known.
+
+    cost : a column in proportion to the time of a step, or "fps", in inverse proportion
+    """
+    ends = (table["time_frame_min"], table["time_frame_max"])
+    if cost == "fps":
+        greatest, least = (table[cost] * table["time_frame"] / end for end in ends)
+    else:
+        least, greatest = (table[cost] / table["time_frame"] * end for end in ends)
+    known = least.notna() & greatest.notna()
+    return table.assign(least=least.where(known), greatest=greatest.where(known))[["least", "greatest"]]
+
+
+def reach(table: "DataFrame", cost: str) -> "DataFrame":
+    """Return the spread; where it is not known, twice the cost itself."""
+    return spread(table, cost).apply(lambda column: column.fillna(table[cost]))
+
+
+def is_repeated(table: "DataFrame") -> bool:
+    """Return whether each of these cases was repeated."""
+    return bool(table["time_frame_min"].notna().all())
+
+
+def within_noise(table: "DataFrame", first: Any, cost: str) -> "DataFrame":
+    """Return the rows of other methods whose repeats reach those of the row ``first``, the nearest of each method.
+
+    first : index of a row of the table
+    """
+    ends = reach(table, cost)
+    near = table[ends["least"] <= ends.loc[first, "greatest"]].sort_values(cost, kind="stable")
+    return near[near["label"] != table.loc[first, "label"]].drop_duplicates("label")

@@ -24,7 +24,7 @@ from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc import limits
 from msmpetsc.study import forecast
-from msmpetsc.study.forecast import Forecast, Network, Trial, held, units
+from msmpetsc.study.forecast import Forecast, Network, ShortRun, held, units
 
 WORKER = WORKERS / "shares_worker.py"
 SELF = MPI.COMM_SELF
@@ -136,12 +136,12 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
 # Memory and time
 
 
-def trial(side: int, program: float, factor: float, its: float) -> Trial:
+def trial(side: int, program: float, factor: float, its: float) -> ShortRun:
     """As of a machine that takes 2e-5 s + 3e-9 s a spring for an iteration."""
     cube = a_cube(side)
     cells, nodes, springs, nonzeros = (float(v[0]) for v in (cube.cells, cube.nodes, cube.inner, cube.nonzeros))
     memory = program + factor * held(cells, nodes, springs, nonzeros)
-    return Trial(cells, nodes, springs, nonzeros, memory, units(its, 2) * (2e-5 + 3e-9 * springs), 2, its)
+    return ShortRun(cells, nodes, springs, nonzeros, memory, units(its, 2) * (2e-5 + 3e-9 * springs), 2, its)
 
 
 def test_the_laws_of_memory_and_time_are_found():

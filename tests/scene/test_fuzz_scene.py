@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.reading import load_study
-from msmpetsc.study.sweep import cases
+from msmpetsc.study.cases import study_cases
+from msmpetsc.study.schema import load_study
 
 SCENES = [path.read_bytes() for path in sorted((ROOT / "scenes").rglob("*.toml"))]
 ONCE = {"step": 0.01, "duration": 0.02}
@@ -110,8 +110,8 @@ def test_a_study_chooses_solvers_and_no_more(folder, options):
 
 def test_a_study_names_no_mesh_outside(folder):
     (folder / "study.toml").write_text(STUDY.format("mesh.source=../out.ply", "-pc_type jacobi -ksp_rtol 1e-2"))
-    with pytest.raises(InputError, match=r"mesh.source"):
-        cases(load_study(folder / "study.toml"), folder, False)
+    with pytest.raises(InputError, match="mesh.source"):
+        study_cases(load_study(folder / "study.toml"), folder, False)
 
 
 def test_the_own_scenes_and_studies_name_what_they_may():

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
-from test_study import alive
+from study_files import alive
 
 from msmpetsc.study import process
 from msmpetsc.study.forkserver import COLD

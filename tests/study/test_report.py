@@ -1,67 +1,38 @@
 """The report of a study: charts and page from the table alone."""
 
-import csv
 import json
 import re
-import xml.etree.ElementTree as ElementTree
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from study_files import Balance, row_of, spaced, svgs, tooltips, write_rows
 
 from msmpetsc.errors import InputError
-from msmpetsc.study.charts.cells import curves
+from msmpetsc.study.charts.cells import curves, figure6_charts, growth_charts, is_cholesky
 from msmpetsc.study.charts.convergence import convergence_charts
-from msmpetsc.study.charts.figure6 import figure6_charts, is_cholesky
-from msmpetsc.study.charts.growth import growth_charts
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, cheapest, front, front_rows, pareto_charts, winners
-from msmpetsc.study.charts.style import looks
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, winners
+from msmpetsc.study.charts.style import curve_styles
 from msmpetsc.study.report import write_report
-from msmpetsc.study.rows import NUMBERS, TEXT, read_rows, succeeded, typed
-
-VOID = {"meta", "br"}  # elements of HTML that need no end
-
-
-def case(label: str, **given) -> dict[str, str]:
-    """A row of the table as text; frames a second and seconds a simulated second follow from the time a frame."""
-    row = {"label": label, "preset": label, "scene": "block", "integrator": "implicit-euler", "status": "ok"}
-    row |= {"study": "try", "time_step": 0.01, "cells": 1000, "ranks": 1} | given
-    if row.get("time_frame"):
-        row |= {"fps": 1 / row["time_frame"], "time_second": row["time_frame"] / row["time_step"]}
-    row.setdefault("command", "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()))
-    return {name: str(value) for name, value in row.items()}
-
-
-def write_table(folder: Path, rows: list[dict[str, str]], columns: tuple[str, ...] = TEXT + NUMBERS) -> Path:
-    with (folder / "table.csv").open("w", newline="") as stream:
-        table = csv.DictWriter(stream, columns, extrasaction="ignore")
-        table.writeheader()
-        table.writerows(rows)
-    return folder
-
-
-def typed_rows(*rows: dict[str, str]) -> list:
-    return [typed(row) for row in rows]
-
+from msmpetsc.study.table import read_table, records, succeeded, typed
 
 ERRORS = [
-    case("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
-    case("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
-    case("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
-    case("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
-    case("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
-    case("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
+    row_of("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
+    row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
+    row_of("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
+    row_of("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
+    row_of("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
 ]
 SWEEP = [
-    case(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
+    row_of(label, scene="bunny", cells=n, time_frame=time, preset=preset, true_error=5e-4, ksp_its=its, memory=1e6 * n)
     for label, preset, times, its in (
         ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
         ("cg", "anderson", (0.02, 0.09, 0.5), 40),
     )
-    for n, time in zip((1000, 10000, 100000), times)
+    for n, time in zip((1000, 10000, 100000), times, strict=True)
 ]
 TRACES = [
     {
@@ -84,7 +55,7 @@ TRACES = [
 @pytest.fixture(scope="module")
 def study(tmp_path_factory) -> Path:
     """A folder with a report that has all four charts."""
-    folder = write_table(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
+    folder = write_rows(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
     (folder / "traces.json").write_text(json.dumps(TRACES))
     (folder / "study.toml").write_text('title = "Fast & exact"\n')
     assert write_report(folder) == folder / "report.html"
@@ -94,35 +65,6 @@ def study(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def text(study: Path) -> str:
     return spaced((study / "report.html").read_text())
-
-
-def spaced(text: str) -> str:
-    """With plain spaces between numbers and units."""
-    return text.replace("\N{NO-BREAK SPACE}", " ")
-
-
-def svgs(text: str) -> list[ElementTree.Element]:
-    return [ElementTree.fromstring(svg) for svg in re.findall(r"<svg.*?</svg>", text, re.DOTALL)]
-
-
-def tooltips(text: str) -> list[str]:
-    return [title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")]
-
-
-class Balance(HTMLParser):
-    """Fails where an element ends that is not open."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.open: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, _attributes):
-        self.open += [tag] if tag not in VOID else []
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
 
 # The Pareto front
@@ -141,21 +83,21 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
-    rows = typed_rows(*(case("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))))
-    assert [row["time_frame"] for row in front_rows(rows, STEP)] == [3, 1]
+    rows = typed(row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3)))
+    assert list(front_rows(rows, STEP)["time_frame"]) == [3, 1]
 
 
 # What the charts show
 
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
-    rows = succeeded(typed_rows(*ERRORS))
-    assert [(row["label"], row["error"]) for row in (cheapest(rows, STEP, e) for e in (1e-1, 5e-3, 1e-4))] == [
+    rows = succeeded(typed(ERRORS))
+    assert [(row["label"], row["error"]) for row in (winners(rows, STEP, e)[0] for e in (1e-1, 5e-3, 1e-4))] == [
         ("anderson", 1e-2), ("newton", 1e-2), ("newton", 1e-4),
     ]  # fmt: skip
-    assert cheapest(rows, STEP, 1e-6) is None
-    assert cheapest(rows, TRAJECTORY, 0.2)["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    assert winners(rows, STEP, 1e-6) == []
+    assert winners(rows, TRAJECTORY, 0.2)[0]["label"] == "verlet", "0.02 s for 0.01 s: 2 s a simulated second"
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert step[0] == "1e-1 or less: anderson, 30 ms a frame (asked for 1e-2, reached 6e-3)."
     assert step[3] == "1e-6 or less: nothing measured reaches it."
@@ -163,7 +105,7 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
 
 
 def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
-    return case(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
+    return row_of(label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given)
 
 
 NOISY = [  # of those that reach 1e-2 the first overlaps with two others, not with the fourth
@@ -176,11 +118,11 @@ NOISY = [  # of those that reach 1e-2 the first overlaps with two others, not wi
 
 
 def test_the_cheapest_names_all_within_its_noise():
-    rows = succeeded(typed_rows(*NOISY))
+    rows = succeeded(typed(NOISY))
     assert [row["label"] for row in winners(rows, STEP, 1e-2)] == ["newton", "pipecg", "anderson"]
     assert [row["label"] for row in winners(rows, STEP, 1e-3)] == ["anderson", "lbfgs"]
     assert winners(rows, STEP, 1e-6) == []
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert step[1] == (
         "1e-2 or less: newton, 10 ms [9 ms to 21 ms] a frame (reached 4e-3); "
@@ -191,22 +133,27 @@ def test_the_cheapest_names_all_within_its_noise():
 
 
 def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_path: Path, text: str):
-    rows = succeeded(typed_rows(*ERRORS))
+    rows = succeeded(typed(ERRORS))
     assert [row["label"] for row in winners(rows, STEP, 1e-1)] == ["anderson"]
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     unknown = "Each was run once: how much its time varies is not known"
     assert all(lines[-1].startswith(unknown) for lines in chart.findings.values())
     assert f"<dt>Repeats</dt><dd>1. {unknown}" in text
-    page = spaced(write_report(write_table(tmp_path, NOISY)).read_text())
+    page = spaced(write_report(write_rows(tmp_path, NOISY)).read_text())
     assert unknown not in page and "<dt>Repeats</dt><dd>3: times are medians" in page
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = typed_rows(
-        *NOISY,
-        *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm") for n, t in ((10, 0.1), (99, 1.0))),
+    rows = typed(
+        [
+            *NOISY,
+            *(
+                repeated("cg", t / 2, t, 3 * t, cells=n, scene="s", preset="fast-msm")
+                for n, t in ((10, 0.1), (99, 1.0))
+            ),
+        ]
     )
-    named = looks(row["label"] for row in rows)
+    named = curve_styles(rows["label"])
     (pareto,), (figure6,), (growth,) = (
         pareto_charts(rows, named),
         figure6_charts(rows, named),
@@ -234,7 +181,7 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     assert "least of the repeats: 9 ms\ngreatest of the repeats: 21 ms" in spaced(
         str(next(iter(pareto.points["over the step error, time step 10\N{NO-BREAK SPACE}ms"].values()))[0])
     )
-    once = pareto_charts(typed_rows(*ERRORS), looks(row["label"] for row in ERRORS))[0]
+    once = pareto_charts(typed(ERRORS), curve_styles(row["label"] for row in ERRORS))[0]
     assert not any(whiskers(axes) for axes in once.figure.axes)
 
 
@@ -251,23 +198,23 @@ def test_within_the_noise_nothing_overtakes(ends: tuple[float, float], expected:
         repeated("cholesky", 0.009, 0.01, 0.02, scene="bunny", cells=1000, preset="fast-msm"),
         *(repeated("cg", ends[0], 0.5, ends[1], scene="bunny", cells=n) for n in (1000, 100000)),
     ]
-    (chart,) = figure6_charts(typed_rows(*rows), looks(["cholesky", "cg"]))
+    (chart,) = figure6_charts(typed(rows), curve_styles(["cholesky", "cg"]))
     ((line,),) = chart.findings.values()
     assert line.startswith(expected)
 
 
 def test_what_failed_is_listed_and_counts_nowhere():
-    rows = typed_rows(*ERRORS)
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    rows = typed(ERRORS)
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     assert [row["label"] for row in chart.failed] == ["paper"]
     shown = {point.label for groups in chart.points.values() for group in groups.values() for point in group}
     assert shown == {"newton", "anderson", "verlet"}
 
 
 def test_only_equal_time_steps_are_compared_by_the_step_error():
-    longer = case("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
-    rows = typed_rows(*ERRORS, longer)
-    (chart,) = pareto_charts(rows, looks(row["label"] for row in rows))
+    longer = row_of("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
+    rows = typed([*ERRORS, longer])
+    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     panels = chart.points.items()
     shown = {spaced(panel): {p.label for group in groups.values() for p in group} for panel, groups in panels}
     assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
@@ -285,9 +232,12 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
 )
 def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
     counts = (1000, 10000, 100000)
-    cg = [case("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4) for n, time in zip(counts, times)]
-    rows = typed_rows(*SWEEP[:3], *cg)
-    (chart,) = figure6_charts(rows, looks(["cholesky", "cg"]))
+    cg = [
+        row_of("cg", scene="bunny", cells=n, time_frame=time, true_error=5e-4)
+        for n, time in zip(counts, times, strict=True)
+    ]
+    rows = typed([*SWEEP[:3], *cg])
+    (chart,) = figure6_charts(rows, curve_styles(["cholesky", "cg"]))
     ((line,),) = chart.findings.values()
     assert line.startswith(expected)
 
@@ -302,20 +252,21 @@ def test_where_cg_overtakes_cholesky(times: tuple[float, ...], expected: str):
     ],
 )
 def test_what_counts_as_cholesky(preset: str, options: str, expected: bool):
-    assert is_cholesky(typed({"preset": preset, "options": options})) is expected
+    (row,) = records(typed([{"preset": preset, "options": options}]))
+    assert is_cholesky(row) is expected
 
 
 def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = typed_rows(*(case("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000)))
-    assert {name: [row["cells"] for row in rows] for name, rows in curves(rows).items()} == {
+    rows = typed(row_of("cg", cells=c, error=e) for e in (1e-2, 1e-4) for c in (2000, 1000))
+    assert {name: list(rows["cells"]) for name, rows in curves(rows).items()} == {
         "cg, error 1e-2": [1000, 2000],
         "cg, error 1e-4": [1000, 2000],
     }
 
 
 def test_every_method_has_its_own_look():
-    assert len(set(looks(map(str, range(40))).values())) == 40
-    assert looks(["a", "b", "a"])["b"] == looks(["a", "b"])["b"]
+    assert len(set(curve_styles(map(str, range(40))).values())) == 40
+    assert curve_styles(["a", "b", "a"])["b"] == curve_styles(["a", "b"])["b"]
 
 
 # The page
@@ -369,9 +320,9 @@ def test_the_whole_table_and_every_command_are_in_it(text: str):
 
 def test_labels_are_escaped(tmp_path: Path):
     label = "a<b>&\"c'"
-    rows = [case(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
-    rows.append(case(label, status="failed", reason=label, scene=label))
-    text = write_report(write_table(tmp_path, rows)).read_text()
+    rows = [row_of(label, true_error=1e-3, time_frame=0.1, reason="", scene=label, study=label)]
+    rows.append(row_of(label, status="failed", reason=label, scene=label))
+    text = write_report(write_rows(tmp_path, rows)).read_text()
     assert Balance(text).open == []
     assert "<b>" not in text and label in unescape(text)
     assert tooltips(text)[0].startswith(label)
@@ -384,24 +335,24 @@ def test_labels_are_escaped(tmp_path: Path):
         ([], 0),
         (ERRORS[:1], 1),
         (ERRORS[-1:] * 3, 0),
-        ([case("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
-        ([case("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
+        ([row_of("a", true_error=bad, time_frame=0.1) for bad in ("nan", "inf", "0", "-1", "", "?")], 0),
+        ([row_of("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
     ],
     ids=["no case", "one case", "all failed", "no number", "no cells"],
 )
 def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
-    text = write_report(write_table(tmp_path, rows)).read_text()
+    text = write_report(write_rows(tmp_path, rows)).read_text()
     assert Balance(text).open == [] and len(svgs(text)) == charts
 
 
 def test_a_table_without_some_columns_is_read(tmp_path: Path):
-    write_table(tmp_path, ERRORS, ("label", "status", "command"))
-    assert read_rows(tmp_path)[0]["true_error"] is None
+    write_rows(tmp_path, ERRORS, ("label", "status", "command"))
+    assert records(read_table(tmp_path))[0]["true_error"] is None
     assert "newton" in write_report(tmp_path).read_text()
 
 
 def test_a_folder_without_a_table_is_named(tmp_path: Path):
-    with pytest.raises(InputError, match="no table.csv"):
+    with pytest.raises(InputError, match=r"no table\.csv"):
         write_report(tmp_path)
 
 
@@ -410,13 +361,13 @@ def test_of_several_traces_of_a_method_the_furthest_is_shown():
         return {"scene": "a", "label": "b", "trace": {"iteration": [0, 1], "seconds": [0, 1], "position_error": errors}}
 
     traces = [entry(0.5, 0.1), entry(0.5, 1e-6), entry(0.5, 1e-3)]
-    (chart,) = convergence_charts(traces, looks(["b"]), {})
+    (chart,) = convergence_charts(traces, curve_styles(["b"]), {})
     points = chart.points["over the iterations"].values()
     assert [[point.numbers["step error"][1] for point in group] for group in points] == [[0.5, 1e-6]]
 
 
 def test_a_trace_without_errors_is_left_out(tmp_path: Path):
-    write_table(tmp_path, [])
+    write_rows(tmp_path, [])
     traces = [{"scene": "a", "label": "b", "trace": trace} for trace in (None, {}, {"position_error": [None]})]
     (tmp_path / "traces.json").write_text(json.dumps(traces))
     assert svgs(write_report(tmp_path).read_text()) == []

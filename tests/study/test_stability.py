@@ -1,5 +1,6 @@
 """Maps of a study: their cases, how a run is judged, and what the charts show of it. The runs are stand-ins."""
 
+# ruff: noqa: F811 (fixtures are imported)
 import csv
 import math
 import re
@@ -12,27 +13,30 @@ import pytest
 from conftest import ROOT
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
+from study_files import (
+    Balance,
+    carry_out,
+    row_of,
+    stand_in,  # noqa: F401 (fixtures)
+    study_file,
+    svgs,
+    tooltips,
+    write_rows,
+)
 from study_stand_in import blank_frame
-from test_report import Balance, svgs, tooltips
-from test_report import case as row_of
-from test_report import write_table as write_rows
-from test_study import carry_out, stand_in, study_file  # noqa: F401 (stand_in is a fixture)
 
 from msmpetsc.cli.study import log_failures
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.writer import ResultFile
-from msmpetsc.study.case import shown_command
+from msmpetsc.study.cases import shown_command, study_cases
 from msmpetsc.study.charts.order import closed_form, order
-from msmpetsc.study.charts.stability import COLORS, LIMIT, MARKS, Scale, stability_charts, worded
-from msmpetsc.study.metrics import of_frames
-from msmpetsc.study.outcome import MEANING, OUTCOMES, counted, outcome
-from msmpetsc.study.reading import load_study
+from msmpetsc.study.charts.stability import COLORS, LIMIT, SYMBOLS, Scale, stability_charts, worded
+from msmpetsc.study.distances import distance_of_shapes
+from msmpetsc.study.metrics import MEANING, OUTCOMES, counted, of_frames, outcome
 from msmpetsc.study.report import write_report
-from msmpetsc.study.rows import read_rows, typed
-from msmpetsc.study.shape import distance_of_shapes
-from msmpetsc.study.sweep import cases
-from msmpetsc.study.table import COLUMNS, read_table
+from msmpetsc.study.schema import load_study
+from msmpetsc.study.table import COLUMNS, read_table, records, typed
 
 METHODS = """
 [[method]]
@@ -52,7 +56,7 @@ NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nste
 
 
 def all_cases(folder: Path, text: str) -> list:
-    return cases(load_study(study_file(folder, text)), folder, False)
+    return study_cases(load_study(study_file(folder, text)), folder, False)
 
 
 # The cases
@@ -60,7 +64,7 @@ def all_cases(folder: Path, text: str) -> list:
 
 def test_a_map_is_each_method_at_each_place(tmp_path: Path):
     found = all_cases(tmp_path, METHODS + GRID + X + Y)
-    assert [(one.label, one.place.x, one.place.y) for one in found] == [
+    assert [(one.label, one.point.x, one.point.y) for one in found] == [
         (label, x, y) for y in (10.0, 20.0) for x in (0.001, 5.0) for label in ("newton", "explicit")
     ]
     assert len({one.id for one in found}) == 8
@@ -81,7 +85,7 @@ def test_a_duration_holds_as_many_steps_as_fit(tmp_path: Path):
 def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
     newton, explicit = all_cases(tmp_path, METHODS + NAMED + 'options = "-ksp_max_it 1"\nrecovers = true')
     assert newton.options == "-pc_type icc -ksp_max_it 1" and explicit.options == ""
-    assert (newton.place.x, newton.place.y, newton.place.recovers) == ("newton", "a", True)
+    assert (newton.point.x, newton.point.y, newton.point.recovers) == ("newton", "a", True)
 
 
 @pytest.mark.parametrize(
@@ -105,8 +109,8 @@ def test_a_mistake_in_a_map_is_told(tmp_path: Path, text: str, words: list[str])
 
 def test_the_atlas_shipped_is_sound():
     path = ROOT / "scenes" / "studies" / "stability.toml"
-    found = cases(load_study(path), path.parent, False)
-    assert 500 < len(found) < 1000 and {one.place.map for one in found if one.place} >= {"beam", "press", "cases"}
+    found = study_cases(load_study(path), path.parent, False)
+    assert 500 < len(found) < 1000 and {one.point.map for one in found if one.point} >= {"beam", "press", "cases"}
 
 
 # How a run is judged
@@ -146,8 +150,8 @@ def test_the_worst_that_befell_a_run_is_its_outcome(status, kind, figures, recov
 
 def test_every_outcome_has_a_meaning_a_colour_and_a_mark():
     assert len(OUTCOMES) == len(set(COLORS.values())) == 10
-    assert set(OUTCOMES) == set(MEANING) == set(COLORS) == {*MARKS, "slow", "ok"}
-    assert len(set(MARKS.values())) == len(MARKS)
+    assert set(OUTCOMES) == set(MEANING) == set(COLORS) == {*SYMBOLS, "slow", "ok"}
+    assert len(set(SYMBOLS.values())) == len(SYMBOLS)
 
 
 def block(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +161,7 @@ def block(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_rigid_motion_is_no_error_of_shape():
     rest, mass = block()
-    moved = Rotation.from_rotvec([1, 2, -2]).apply(rest) + [5, -7, 100]
+    moved = Rotation.from_rotvec([1, 2, -2]).apply(rest) + np.array([5, -7, 100])
     assert distance_of_shapes(moved, rest, mass) < 1e-12
 
 
@@ -207,7 +211,7 @@ def method(label: str, options: str = "") -> str:
     return f'[[method]]\nlabel = "{label}"\noptions = "{options}"\n'
 
 
-def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noqa: F811
+def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):
     methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
@@ -218,7 +222,7 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
         ("worst", "crashed", "failed"),
     ]
     assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
-    assert counted(rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
+    assert counted(row["outcome"] for row in rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
     with caplog.at_level(INFO, log.name):
         log_failures(rows)
     assert [record.levelno for record in caplog.records if "map n: 1 ok" in record.message] == [INFO]
@@ -227,17 +231,17 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
     assert "Failed cases" not in page and "4: 1 ok, 1 energy, 1 refused, 1 crashed" in page
 
 
-def test_a_table_of_before_is_continued(tmp_path: Path, stand_in):  # noqa: F811
+def test_a_table_of_before_is_continued(tmp_path: Path, stand_in):
     text = '[[scene]]\nname = "a"\nfile = "scene.toml"\n[[sweep]]\npresets = ["newton"]'
     (before,) = carry_out(tmp_path, text)
     table = tmp_path / "out" / "table.csv"
     new = ("map", "x", "y", "outcome", "energy_left", "inverted")
     kept = [index for index, name in enumerate(COLUMNS) if name not in new]
     with open(table, newline="") as file:
-        records = [[record[index] for index in kept] for record in csv.reader(file)]
+        lines = [[record[index] for index in kept] for record in csv.reader(file)]
     with open(table, "w", newline="") as file:
-        csv.writer(file).writerows(records)
-    (after,) = read_table(tmp_path / "out")
+        csv.writer(file).writerows(lines)
+    (after,) = records(read_table(tmp_path / "out"))
     assert after | dict.fromkeys(new) == before | dict.fromkeys(new) and after["energy_left"] is None
 
 
@@ -290,10 +294,10 @@ def test_places_are_worded(value: float, unit: str, text: str):
 
 
 def test_the_explicit_limit_crosses_the_map(folder: Path):
-    (chart,) = stability_charts(read_rows(folder), tomllib.loads(STUDY))
+    (chart,) = stability_charts(read_table(folder), tomllib.loads(STUDY))
     axes = chart.figure.axes[0]
     (line,) = (line for line in axes.lines if line.get_label() == LIMIT)
-    drawn = [point for point in zip(*line.get_data()) if not math.isnan(point[0])]
+    drawn = [point for point in zip(*line.get_data(), strict=True) if not math.isnan(point[0])]
     # the cells of 1e-2 s lie around 1.5; 1e-3 s is half way between the first two, so at their common edge
     assert np.allclose(drawn, [(1.5, 0), (1.5, 1), (1.0, 1), (1.0, 2)])
 
@@ -324,7 +328,7 @@ def test_a_map_without_its_study_file_is_drawn(tmp_path: Path):
 
 
 def timed(step: float, error: float, **given) -> dict:
-    return typed(row_of("m", time_step=step, trajectory_error=error, **given))
+    return row_of("m", time_step=step, trajectory_error=error, **given)
 
 
 @pytest.mark.parametrize("power", [1, 2])
@@ -332,17 +336,17 @@ def test_the_slope_is_that_of_the_short_steps(power: int):
     """The two longest steps are off the line."""
     steps = [0.1, 0.05, 0.02, 0.01]
     rows = [timed(step, (5 if step > 0.03 else 1) * step**power) for step in steps]
-    assert order(rows) == pytest.approx(power)
-    assert order(rows[:1]) is None
+    assert order(typed(rows)) == pytest.approx(power)
+    assert order(typed(rows[:1])) is None
 
 
 def test_verlet_steps_by_its_substep():
     rows = [timed(0.1, s**2, integrator="verlet", substep=s) for s in (1e-3, 5e-4)]
-    assert order(rows) == pytest.approx(2)
+    assert order(typed(rows)) == pytest.approx(2)
 
 
 def test_the_closed_form_of_what_implicit_euler_leaves():
     """omega t = 1 and 4 steps: (1 + 1)^-4; and a quarter of the step has (1 + 1/16)^-16."""
     rows = [timed(0.1, 0.1, steps=4), timed(0.025, 0.1, steps=16)]
-    t, left = closed_form(rows, 10 / (2 * math.pi))
+    _, left = closed_form(typed(rows), 10 / (2 * math.pi))
     assert left[-1] == pytest.approx(1 / 16) and left[0] == pytest.approx((17 / 16) ** -16)

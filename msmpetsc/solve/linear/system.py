@@ -50,6 +50,17 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     return matrix
 
 
+def assembly_bytes(
+    nodes: float | np.ndarray, springs: float | np.ndarray, nonzeros: float | np.ndarray
+) -> float | np.ndarray:
+    """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
+
+    They are those of A with one column: row of each node; weight, ends and kept of each spring; of each nonzero rows,
+    nodes, values, the last two again, COO's two indices, then CSR's index and value.
+    """
+    return 8 * nodes + (8 + 4 * 8 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
+
+
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:
     mat_type, on_gpu = matrix.getType(), "cusparse" in unknowns.memory.mat_type
     if ("cusparse" in mat_type) != on_gpu:

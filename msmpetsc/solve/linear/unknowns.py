@@ -16,6 +16,8 @@ from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
+BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node: a forecast of memory asks for them
+
 
 class Unknowns:
     """The free nodes of a lattice, numbered over all ranks, and the scatter that fills the ghosts.

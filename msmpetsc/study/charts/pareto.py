@@ -5,20 +5,46 @@ can be compared by it where the time step is the same. The trajectory error says
 of the lattice: explicit and implicit runs of any time step can be compared by it.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.chart import Chart, Point, handle, legend_below, new_figure, repeats
-from msmpetsc.study.charts.style import ERROR, FAINT, INK, SECONDS, Look, log_axes
-from msmpetsc.study.rows import Row, failed, grouped, measured, stepping, succeeded
-from msmpetsc.study.spread import UNKNOWN, ends, is_known, spread, within_noise
+from msmpetsc.study.charts.style import (
+    ERROR,
+    FAINT,
+    INK,
+    SECONDS,
+    Chart,
+    CurveStyle,
+    Numbers,
+    Styles,
+    legend_below,
+    log_axes,
+    new_figure,
+    title_axes,
+)
+from msmpetsc.study.table import (
+    ONCE_NOTE,
+    Row,
+    failed,
+    grouped,
+    is_repeated,
+    measured,
+    reach,
+    records,
+    spread,
+    succeeded,
+    within_noise,
+)
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front"
 CAPTION = (
@@ -31,8 +57,8 @@ CAPTION = (
 
 
 @dataclass(frozen=True)
-class Measure:
-    """One panel: which error, and what it costs."""
+class ErrorMeasure:
+    """A panel: the columns of an error and of what it costs, and their words."""
 
     error: str
     cost: str
@@ -41,22 +67,57 @@ class Measure:
     y_label: str
     unit: str
 
+    @property
+    def columns(self) -> tuple[str, str]:
+        """The columns of both axes."""
+        return self.error, self.cost
 
-STEP = Measure(
-    "true_error", "time_frame", "step error",
-    "true step error |x − x*| / |y − x*|, rms over steps", "computing time a frame", "a frame",
-)  # fmt: skip
-TRAJECTORY = Measure(
-    "trajectory_error", "time_second", "trajectory error",
-    "trajectory error against a reference with a tiny step", "computing time a simulated second",
-    "a simulated second",
-)  # fmt: skip
+    @property
+    def numbers(self) -> Numbers:
+        """Numbers that a point tells of itself; its rows have the spread of their cost."""
+        return {
+            self.name: (formatting.error, self.error),
+            self.y_label: (formatting.seconds, self.cost),
+            "least of the repeats": (formatting.seconds, "least"),
+            "greatest of the repeats": (formatting.seconds, "greatest"),
+            "time step": (formatting.seconds, "time_step"),
+            "substep": (formatting.seconds, "substep"),
+            "error asked for": (formatting.error, "error"),
+            "most iterations": (formatting.count, "max_iterations"),
+            "iterations a step": (formatting.count, "iterations"),
+            "ranks": (formatting.count, "ranks"),
+        }
+
+
+STEP = ErrorMeasure(
+    error="true_error",
+    cost="time_frame",
+    name="step error",
+    x_label="true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|, rms over steps",
+    y_label="computing time a frame",
+    unit="a frame",
+)
+TRAJECTORY = ErrorMeasure(
+    error="trajectory_error",
+    cost="time_second",
+    name="trajectory error",
+    x_label="trajectory error against a reference with a tiny step",
+    y_label="computing time a simulated second",
+    unit="a simulated second",
+)
 MEASURES = {measure.name: measure for measure in (STEP, TRAJECTORY)}
 
 
+# What is best
+
+
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
-    """Indices of the points that no other beats: none is at most as great in both and smaller in one. By rising x."""
-    best, lowest = [], float("inf")
+    """Return indices of the points that no other beats: none is at most as great in both and smaller in one.
+
+    They come by rising x.
+    """
+    best: list[int] = []
+    lowest = float("inf")
     for index in sorted(range(len(x)), key=lambda i: (x[i], y[i])):
         twin = bool(best) and (x[best[-1]], y[best[-1]]) == (x[index], y[index])
         if y[index] < lowest or twin:
@@ -65,145 +126,139 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
     return best
 
 
-def front_rows(rows: list[Row], measure: Measure) -> list[Row]:
-    """The front of measured rows, by rising error. Errors that read alike, to two digits, count as equal: no step can
-    better the trajectory error of its time step but in the last digits, and those are no reason to pay more."""
-    errors, costs = columns(rows, measure)
-    return [rows[i] for i in front([float(f"{error:.1e}") for error in errors], costs)]
+def front_rows(rows: "DataFrame", measure: ErrorMeasure) -> "DataFrame":
+    """Return the front of measured rows, by rising error.
+
+    Errors that read alike, to two digits, count as equal: no step can better the trajectory error of its time step but
+    in the last digits, and those are no reason to pay more.
+    """
+    return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 
 
-def cheapest(rows: list[Row], measure: Measure, level: float) -> Row | None:
-    """The row of least cost among those whose measured error is at most this level; nothing is interpolated."""
-    reached = [row for row in measured(rows, measure.error, measure.cost) if row[measure.error] <= level]
-    return min(reached, key=lambda row: row[measure.cost], default=None)
+def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]:
+    """Return the cheapest row with an error of at most this level, then those that its repeats do not tell from it.
 
-
-def winners(rows: list[Row], measure: Measure, level: float) -> list[Row]:
-    """The cheapest, then those that its repeats do not tell from it, each method once; none where nothing reaches the
-    level."""
-    first = cheapest(rows, measure, level)
-    if first is None:
+    Nothing is interpolated; each method comes once; nothing comes where nothing reaches the level.
+    """
+    reached = measured(rows, *measure.columns)
+    reached = reached[reached[measure.error] <= level]
+    if reached.empty:
         return []
-    reached = [row for row in measured(rows, measure.error, measure.cost) if row[measure.error] <= level]
-    return [first, *(within_noise(first, reached, itemgetter(measure.cost)) if is_known([first]) else [])]
+    first = reached[measure.cost].idxmin()
+    ends = spread(reached, measure.cost)
+    best = records(reached.assign(least=ends["least"], greatest=ends["greatest"]).loc[[first]])
+    if is_repeated(reached.loc[[first]]):
+        near = within_noise(reached, first, measure.cost)
+        best += records(near.assign(least=ends["least"], greatest=ends["greatest"]))
+    return best
 
 
-def pareto_charts(rows: list[Row], looks: dict[str, Look]) -> list[Chart]:
-    """One chart for each scene, and for each of its cell counts where a method was swept over errors or time steps."""
+# The charts
+
+
+def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
+    """Return one chart for each scene, and for each of its cell counts where a method was swept."""
     charts = []
-    for scene, here in grouped(rows, lambda row: row["scene"]).items():
-        sizes = grouped(succeeded(here), lambda row: row["cells"])
-        swept = {cells: group for cells, group in sizes.items() if len(sizes) == 1 or is_swept(group)}
+    for scene, rows in grouped(table, "scene").items():
+        sizes = grouped(succeeded(rows), "cells")
+        swept = {cells: group for cells, group in sizes.items() if len(sizes) == 1 or group["label"].duplicated().any()}
         for cells, group in swept.items():
             name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{formatting.plain(cells)}"
-            chart = pareto_chart(name, scene, cells, group, looks)
+            title = f"{KIND}: {scene}, {formatting.count(cells)} cells" if cells > 0 else f"{KIND}: {scene}"
+            chart = pareto_chart(name, title, group, styles)
             if chart:
-                chart.failed = failed(here)
+                chart.failed = records(failed(rows))
                 charts.append(chart)
     return charts
 
 
-def is_swept(rows: list[Row]) -> bool:
-    """Some method was measured more than once."""
-    return max(Counter(row["label"] for row in rows).values()) > 1
-
-
-def pareto_chart(name: str, scene: str, cells: float | None, rows: list[Row], looks: dict[str, Look]) -> Chart | None:
-    """The panels that have data; None where neither has."""
-    step = common_time_step(measured(rows, STEP.error, STEP.cost))
-    trajectory = measured(rows, TRAJECTORY.error, TRAJECTORY.cost)
-    panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if shown]
+def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Chart | None:
+    """Return the panels that have data; None where neither has."""
+    step, trajectory = common_time_step(measured(rows, *STEP.columns)), measured(rows, *TRAJECTORY.columns)
+    panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if len(shown)]
     if not panels:
         return None
-    labels = dict.fromkeys(row["label"] for _, shown in panels for row in shown)
-    handles = {label: handle(looks[label]) for label in labels}
+    labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
+    handles = {label: styles[label].handle() for label in labels}
     handles[FRONT] = Line2D([], [], color=FAINT, marker="o", markersize=10, markerfacecolor="none", markeredgecolor=INK)
-    figure, axes = new_figure(len(panels), list(handles))
-    where = f"{scene}, {formatting.count(cells)} cells" if cells else scene
-    chart = Chart(name, "Speed against accuracy", f"Speed against accuracy: {where}", CAPTION, figure)
-    for ax, (measure, shown) in zip(axes, panels):
-        draw(chart, ax, measure, shown, looks)
-        chart.cheapest[measure.name] = [winners(shown, measure, level) for level in LEVELS]
-        lines = [finding(measure, *pair) for pair in zip(LEVELS, chart.cheapest[measure.name])]
-        chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_known(shown) else [UNKNOWN])
+    figure, all_axes = new_figure(len(panels), list(handles))
+    chart = Chart(name, KIND, title, CAPTION, figure)
+    for axes, (measure, shown) in zip(all_axes, panels, strict=True):
+        draw_panel(chart, axes, shown, measure=measure, styles=styles)
+        chart.cheapest[measure.name] = best = [winners(shown, measure, level) for level in LEVELS]
+        lines = [cheapest_line(measure, level, rows) for level, rows in zip(LEVELS, best, strict=True)]
+        chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
     legend_below(figure, handles)
     return chart
 
 
-def common_time_step(rows: list[Row]) -> list[Row]:
-    """The rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
-    steps = grouped(rows, lambda row: row["time_step"])
-    return max(steps.values(), key=lambda group: (len(group), group[0]["time_step"] or 0), default=[])
+def common_time_step(rows: "DataFrame") -> "DataFrame":
+    """Return the rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
+    groups = grouped(rows, "time_step")
+    return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
-def draw(chart: Chart, axes: Axes, measure: Measure, rows: list[Row], looks: dict[str, Look]) -> None:
-    """One panel: the front first, the methods over it."""
-    step = formatting.seconds(rows[0]["time_step"])
-    where = f", time step {step}" if measure is STEP and step else ""
-    axes.set_title(f"over the {measure.name}{where}", loc="left")
-    axes.set_xlabel(measure.x_label)
-    axes.set_ylabel(measure.y_label)
-    costs = [end for row in rows for end in ends(row, itemgetter(measure.cost))]
-    log_axes(axes, [row[measure.error] for row in rows], costs, ERROR, SECONDS)
+def draw_panel(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, styles: Styles) -> None:
+    """Draw a panel: the front first, the methods over it."""
+    step = formatting.seconds(rows["time_step"].iloc[0])
+    at_step = f", time step {step}" if measure is STEP and step else ""
+    title_axes(axes, f"over the {measure.name}{at_step}", measure.x_label, measure.y_label)
+    ends = reach(rows, measure.cost)
+    log_axes(axes, rows[measure.error], ends.to_numpy().ravel(), (ERROR, SECONDS))
     draw_front(axes, front_rows(rows, measure), measure)
-    for label, group in grouped(rows, lambda row: row["label"]).items():
-        best = front_rows(group, measure)
-        axes.plot(*columns(best, measure), color=looks[label].color, linewidth=1.6, zorder=3)
-        chart.whiskers(axes, columns(group, measure)[0], group, itemgetter(measure.cost), looks[label])
-        others = [row for row in group if not any(row is one for one in best)]
-        hollow = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": looks[label].color}
-        for chosen, style in ((best, {}), (others, hollow)):
-            points = [point(row, measure) for row in chosen]
-            chart.mark(axes, *columns(chosen, measure), points, looks[label], **style)
+    for label, group in grouped(rows.join(spread(rows, measure.cost)), "label").items():
+        draw_method(chart, axes, group, measure=measure, style=styles[label])
 
 
-def columns(rows: list[Row], measure: Measure) -> tuple[list[float], list[float]]:
-    return [row[measure.error] for row in rows], [row[measure.cost] for row in rows]
+def draw_method(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, style: CurveStyle) -> None:
+    """Draw a line through a method's own best points, and its other ones small and hollow."""
+    best = front_rows(rows, measure)
+    axes.plot(best[measure.error], best[measure.cost], color=style.color, linewidth=1.6, zorder=3)
+    chart.whiskers(axes, rows, measure.columns, style)
+    chart.mark(axes, best, measure.columns, style, numbers=measure.numbers)
+    beaten = rows.drop(best.index)
+    hollow: dict[str, Any] = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.color}
+    chart.mark(axes, beaten, measure.columns, style, numbers=measure.numbers, **hollow)
 
 
-def draw_front(axes: Axes, rows: list[Row], measure: Measure) -> None:
-    """A grey stair through the front, and a ring around each of its points."""
-    x, y = columns(rows, measure)
+def draw_front(axes: Axes, rows: "DataFrame", measure: ErrorMeasure) -> None:
+    """Draw a grey stair through the front, and a ring around each of its points."""
+    x, y = list(rows[measure.error]), list(rows[measure.cost])
     right, top = axes.get_xlim()[1], axes.get_ylim()[1]
-    stair = {"drawstyle": "steps-post", "color": FAINT, "linewidth": 1.2, "zorder": 2}
-    axes.plot([x[0], *x, right], [top, *y, y[-1]], **stair)
-    ring = {"markersize": 12, "markerfacecolor": "none", "markeredgecolor": INK, "markeredgewidth": 1.1, "zorder": 5}
+    stair = [x[0], *x, right], [top, *y, y[-1]]
+    axes.plot(*stair, drawstyle="steps-post", color=FAINT, linewidth=1.2, zorder=2)
+    ring: dict[str, Any] = {
+        "markersize": 12,
+        "markerfacecolor": "none",
+        "markeredgecolor": INK,
+        "markeredgewidth": 1.1,
+        "zorder": 5,
+    }
     axes.plot(x, y, "o", clip_on=False, **ring)
 
 
-def point(row: Row, measure: Measure) -> Point:
-    """The numbers of one point."""
-    numbers = {
-        measure.name: (formatting.error, row[measure.error]),
-        measure.y_label: (formatting.seconds, row[measure.cost]),
-        **repeats(row, itemgetter(measure.cost), formatting.seconds),
-        "time step": (formatting.seconds, row["time_step"]),
-        "substep": (formatting.seconds, row["substep"]),
-        "error asked for": (formatting.error, row["error"]),
-        "most iterations": (formatting.count, row["max_iterations"]),
-        "iterations a step": (formatting.count, row["iterations"]),
-        "ranks": (formatting.count, row["ranks"]),
-    }
-    return Point(row["label"], numbers, row["command"])
+# In words
 
 
-def finding(measure: Measure, level: float, best: list[Row]) -> str:
-    """Which method is the cheapest that reached this level, and which may be just as cheap, in plain words."""
+def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
+    """Say which method is the cheapest that reached this level, and which may be just as cheap."""
     start = f"{formatting.error(level)} or less:"
     if not best:
         return f"{start} nothing measured reaches it."
-    row, *others = best
+    row, *near = best
     reached = formatting.error(row[measure.error])
-    step = f", {stepping(row)}" if measure is TRAJECTORY else ""
+    step = f", {formatting.stepping(row)}" if measure is TRAJECTORY else ""
     asked = f"asked for {formatting.error(row['error'])}, " if row["error"] else ""
     sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
-    if not others:
+    if not near:
         return f"{sentence}."
-    near = ", ".join(f"{other['label']} {cost_of(other, measure)}" for other in others)
-    return f"{sentence}; within its noise: {near}."
+    rivals = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in near)
+    return f"{sentence}; within its noise: {rivals}."
 
 
-def cost_of(row: Row, measure: Measure) -> str:
-    """34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
-    cost, repeats_range = formatting.seconds(row[measure.cost]), spread(row, itemgetter(measure.cost))
-    return f"{cost} [{' to '.join(map(formatting.seconds, repeats_range))}]" if repeats_range else cost
+def cost_of(row: Row, measure: ErrorMeasure) -> str:
+    """Return 34 ms, or with the range of the repeats 34 ms [31 ms to 40 ms]."""
+    cost = formatting.seconds(row[measure.cost])
+    if row["least"] is None:
+        return cost
+    return f"{cost} [{formatting.seconds(row['least'])} to {formatting.seconds(row['greatest'])}]"

@@ -1,0 +1,399 @@
+"""The cases of a study: what defines a run, the command that runs it, and the products of sweeps and maps."""
+
+import hashlib
+import json
+import math
+import os
+import shlex
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from msmpetsc import __version__
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
+from msmpetsc.study.forkserver import COLD
+from msmpetsc.study.schema import Axis, Length, Map, Method, ReferenceRun, Study, StudyScene, Sweep
+
+
+class Key(NamedTuple):
+    """The destinations of the value of a case's key.
+
+    override : table and key of the scene
+    argument : of ``msmpetsc run``
+    column   : whether the table of the study has it, by its own name
+    """
+
+    override: tuple[str, str] | None = None
+    argument: str = ""
+    column: bool = True
+
+
+KEYS = {
+    "scene": Key(),
+    "integrator": Key(override=("time", "integrator")),
+    "preset": Key(override=("solver", "preset")),
+    "options": Key(),  # PETSc's own arguments
+    "label": Key(),
+    "ranks": Key(),  # mpiexec's argument
+    "repeats": Key(),
+    "time_step": Key(override=("time", "step")),
+    "substep": Key(override=("time", "substep")),
+    "error": Key(override=("solver", "error")),
+    "max_iterations": Key(override=("solver", "max_iterations")),
+    "cells": Key(override=("cages", "count")),
+    "true_error": Key(argument="--true-error", column=False),
+    "trace": Key(argument="--trace", column=False),
+}
+NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "point")
+
+
+@dataclass(frozen=True)
+class MapPoint:
+    """A point of a map, and whether its body should be in its rest shape at the end."""
+
+    map: str
+    x: str | float
+    y: str | float
+    recovers: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One run, repeated. Where its values go is in KEYS.
+
+    content    : digest of the scene file and of the files that it names
+    set        : all overrides, "key.path=value", as --set takes them; what follows repeats them for the table
+    error, max_iterations, cells, substep : None where the scene or the program decides
+    preset     : "" for verlet
+    true_error : every so many steps the true step error is measured; None for never
+    trace      : the step that is followed; None for none
+    reference  : the run its motion is measured against
+    point      : of a map; None for the case of a sweep
+    """
+
+    scene: str
+    file: Path
+    content: str
+    set: tuple[str, ...]
+    integrator: str
+    time_step: float  # [s]
+    preset: str = ""
+    options: str = ""
+    cells: int | None = None
+    substep: float | None = None  # [s]
+    error: float | None = None
+    max_iterations: int | None = None
+    ranks: int = 1
+    repeats: int = 1
+    true_error: int | None = None
+    trace: int | None = None
+    label: str = ""
+    timeout: float = 300.0  # [s]
+    reference: "Case | None" = None
+    point: MapPoint | None = None
+
+    @property
+    def id(self) -> str:
+        """Digest of what defines the run, whatever it is called, however long it may take."""
+        what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
+        what |= {"version": __version__, "reference": self.reference and self.reference.id}
+        what |= {"place": asdict(self.point)} if self.point else {}  # as tables of before have it
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def work(self) -> float:
+        """A guess, in cells: a process counts as 10^4 of them, and so does a scene that names none."""
+        return self.repeats * (1e4 + (self.cells or 1e4))
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns of the table that are known before the case runs."""
+        row = {name: getattr(self, name) for name, key in KEYS.items() if key.column}
+        if self.point:
+            row |= {"map": self.point.map, "x": str(self.point.x), "y": str(self.point.y)}
+        return row | {"case": self.id}
+
+    def unmeasured(self) -> "Case":
+        """Return the same run without what it measures beside its work."""
+        return replace(self, true_error=None, trace=None)
+
+    def changed(self, *changes: str) -> "Case":
+        """Return the same run with further overrides of its scene."""
+        return replace(self, set=(*self.set, *changes))
+
+
+# Commands
+
+
+def run_arguments(case: Case) -> list[str]:
+    """Return what follows ``msmpetsc``, outputs aside."""
+    changes = [word for change in case.set for word in ("--set", change)]
+    given = [(key.argument, getattr(case, name)) for name, key in KEYS.items() if key.argument]
+    extra = [word for name, value in given if value is not None for word in (name, str(value))]
+    return ["run", os.path.relpath(case.file), *changes, *extra, *shlex.split(case.options)]
+
+
+def launcher(ranks: int) -> list[str]:
+    """Return the words that start a program on so many ranks."""
+    return ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+
+
+def command(case: Case, result: Path, measure: Path) -> list[str]:
+    """Return the command of one run: its frames go to ``result``, its figures to ``measure``."""
+    outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
+    # before PETSc's options: the last of these may be one without a value
+    name, scene, *rest = run_arguments(case)
+    return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
+
+
+def shown_command(case: Case) -> str:
+    """Return the line that repeats the case by hand."""
+    return shlex.join([*launcher(case.ranks), "msmpetsc", *run_arguments(case)])
+
+
+# Overrides of the scene
+
+
+def digest(file: Path, scene: Scene) -> str:
+    """Return the digest of a scene file and of the files that it names."""
+    names = sorted({name for _, name in scene.named_files()})
+    paths = [file, *(file.parent / name for name in names)]
+    return hashlib.sha256(b"\0".join(path.read_bytes() for path in paths if path.is_file())).hexdigest()[:16]
+
+
+def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the tables time and solver of a scene with a case's values; None: the key must not stand there.
+
+    Verlet solves nothing, so it has no solver table; implicit Euler is what a scene means that names no integrator.
+    """
+    values = {**values, "integrator": None if values["integrator"] == "implicit-euler" else values["integrator"]}
+    names = ("time",) if values["integrator"] == "verlet" else ("time", "solver")
+    tables: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for name, value in values.items():
+        table, key = KEYS[name].override or ("", "")
+        if table in tables:
+            tables[table][key] = value
+    return tables
+
+
+def with_solver(case: Case, scene: Scene) -> Case:
+    """Return a case with the overrides of its solver table; none for verlet."""
+    solver = scene_tables(override_values(case)).get("solver")
+    if solver is None:
+        return case
+    return case.changed(f"solver={inline(scene.solver.model_dump(exclude_unset=True) | solver)}")
+
+
+def with_time(case: Case, duration: float, every: int, scene: Scene) -> Case:
+    """Return a case with the overrides of its time and output tables."""
+    time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
+    time |= scene_tables(override_values(case))["time"]
+    output = ("output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
+    return case.changed(f"time={inline(time)}", *output)
+
+
+def override_values(case: Case) -> dict[str, Any]:
+    """Return the values of a case that override its scene."""
+    return {name: getattr(case, name) for name, key in KEYS.items() if key.override}
+
+
+def inline(table: Mapping[str, Any]) -> str:
+    """Return a TOML inline table of plain values; None is left out."""
+    return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None) + "}"
+
+
+# All cases
+
+
+def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
+    """Return all cases, each once, in the order of the file; ``folder`` is that of the study file.
+
+    Raises InputError for a scene file or a change of it that is wrong.
+    """
+    by_id: dict[str, Case] = {}
+    for sweep in study.sweep:
+        for scene in study.scene:
+            wanted = (not sweep.scenes or scene.name in sweep.scenes) and (full or not (sweep.full or scene.full))
+            for case in sweep_cases(study, scene, sweep, folder=folder, presets=presets) if wanted else ():
+                by_id.setdefault(case.id, case)
+    for map in study.map:
+        for case in map_cases(study, map, folder, presets) if full or not map.full else ():
+            by_id.setdefault(case.id, case)
+    return list(by_id.values())
+
+
+def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    """Yield every choice from each list, by the name of the list; the last one changes fastest."""
+    return (dict(zip(lists, values, strict=True)) for values in product(*lists.values()))
+
+
+# Sweeps
+
+
+def sweep_cases(
+    study: Study, scene: StudyScene, sweep: Sweep, *, folder: Path, presets: Collection[str] | None
+) -> Iterator[Case]:
+    """Yield the cases of a sweep over a scene: its lists multiplied with each other."""
+    file = folder / scene.file
+    changes = (*scene.set, *sweep.set)
+    as_given = load_scene(file, changes, presets, by_user=False)
+    for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
+        base = Case(
+            scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator, cells=cells,
+            set=(*changes, *((f"cages.count={cells}",) if cells else ())), time_step=as_given.time.step,
+            repeats=study.repeats, timeout=study.timeout,
+        )  # fmt: skip
+        base = replace(base, reference=_reference(base, scene, as_given))
+        for case in _methods(base, scene, sweep, as_given):
+            load_scene(file, case.set, presets, by_user=False)  # what is wrong is said before anything is run
+            yield case
+
+
+def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Iterator[Case]:
+    """Yield the cases of one lattice and integrator."""
+    steps = {"time_step": sweep.time_steps or (as_given.time.step,)}
+    if base.integrator == "verlet":
+        for values in combinations(steps | {"substep": sweep.substeps or (None,), "ranks": sweep.ranks}):
+            case = replace(base, **values, label=_label(sweep, "verlet", "", values["ranks"]))
+            yield _timed(case, scene, sweep, as_given)
+        return
+    goals: list[dict[str, Any]] = [{"error": error} for error in sweep.errors]
+    goals += [{"max_iterations": budget} for budget in sweep.max_iterations]
+    goals = goals or [{"error": as_given.solver.error, "max_iterations": as_given.solver.max_iterations}]
+    lists = {"preset": sweep.presets or (as_given.solver.preset,), "options": sweep.options, **steps}
+    for values in combinations(lists | {"goal": goals, "ranks": sweep.ranks}):
+        method = values["preset"] if base.integrator == "implicit-euler" else f"{base.integrator} {values['preset']}"
+        case = replace(
+            base, **values.pop("goal"), **values, label=_label(sweep, method, values["options"], values["ranks"]),
+            true_error=scene.true_error, trace=scene.trace if sweep.trace else None,
+        )  # fmt: skip
+        yield _timed(with_solver(case, as_given), scene, sweep, as_given)
+
+
+def _label(sweep: Sweep, method: str, options: str, ranks: int) -> str:
+    """Return what the curve of a case is called."""
+    name = sweep.label or f"{method} {options}".strip()
+    return name if ranks == 1 or sweep.ranks == (ranks,) else f"{name}, {ranks} ranks"
+
+
+def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
+    """Return a case with its time table, and its output at the moments that are compared.
+
+    Nothing is measured beyond its end.
+    """
+    steps = sweep.steps or (scene.steps if scene.duration is None else None)
+    duration = steps * case.time_step if steps else scene.duration or as_given.time.duration
+    steps = max(1, round(duration / case.time_step))
+    if case.trace and case.trace > steps:
+        raise InputError(f"scene {case.scene}: trace = {case.trace}, but {case.label} takes {steps} steps")
+    case = replace(case, true_error=case.true_error and min(case.true_error, steps))
+    every = 1
+    if case.reference is not None:
+        every = max(1, round((scene.frame or as_given.time.step) / case.time_step))
+    return with_time(case, duration, every, as_given)
+
+
+def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
+    """Return the run that this lattice's motion is measured against, stored at the moments that are compared."""
+    if scene.reference is None:
+        return None
+    frame = scene.frame or as_given.time.step
+    duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
+    return reference_case(base, scene.reference, as_given, frame=frame, duration=duration)
+
+
+def reference_case(base: Case, reference: ReferenceRun, scene: Scene, *, frame: float, duration: float) -> Case:
+    """Return a run of the same lattice with tiny steps; frame, duration [s]."""
+    case = replace(
+        base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
+    )
+    if reference.integrator == "verlet":
+        return with_time(replace(case, substep=reference.substep), duration, 1, scene)
+    step = reference.step or frame  # the schema asks for it
+    every = round(frame / step)
+    if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
+        raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
+    case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
+    solver = inline({"preset": reference.preset, "error": reference.error})
+    return with_time(case.changed(f"solver={solver}"), duration, every, scene)
+
+
+# Maps
+
+
+@dataclass(frozen=True)
+class MapScene:
+    """A scene with its changes, which all methods are tried on. y may be the name of a case, x is then the method's.
+
+    length : of a run; the scene's own duration where it says nothing
+    """
+
+    file: str
+    set: tuple[str, ...]
+    x: float | None
+    y: float | str
+    length: Length
+    recovers: bool = False
+    options: str = ""
+
+
+def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | None = None) -> Iterator[Case]:
+    """Yield all cases of a map: each method at each point of two axes, or with each named case.
+
+    folder : of the study file
+
+    Raises InputError for a scene that is wrong.
+    """
+    methods = [method for method in study.method if not map.methods or method.label in map.methods]
+    for point in named_scenes(map) if map.case else grid_scenes(map):
+        file = folder / point.file
+        scene = load_scene(file, point.set, presets, by_user=False)
+        base = Case(
+            scene=map.name, file=file, content=digest(file, scene), set=point.set, integrator="verlet",
+            time_step=scene.time.step, timeout=study.timeout,
+        )  # fmt: skip
+        for method in methods:
+            yield map_case(base, point, method, scene)
+
+
+def grid_scenes(map: Map) -> Iterator[MapScene]:
+    """Yield the scenes at the points of two axes."""
+    if map.x is None or map.y is None or map.file is None:
+        return  # the schema asks for them
+    for y, x in product(map.y.values, map.x.values):
+        changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
+        yield MapScene(map.file, changes, x, y, map)
+
+
+def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
+    """Yield the changes of an axis; a time step may be longer than the scene, whose duration so changes with it."""
+    yield from axis.changes(value)
+    if axis.key == "time.step":
+        duration = length.steps * value if length.steps else max(length.duration or value, value)
+        yield f"time.duration={duration!r}"
+
+
+def named_scenes(map: Map) -> Iterator[MapScene]:
+    """Yield the scenes of named cases."""
+    for case in map.case:
+        length = case if case.steps or case.duration else map
+        changes = (*map.set, *case.set)
+        yield MapScene(case.file, changes, None, case.name, length, recovers=case.recovers, options=case.options)
+
+
+def map_case(base: Case, point: MapScene, method: Method, scene: Scene) -> Case:
+    """Return the run of a method at a point of a map."""
+    solves = method.integrator != "verlet"
+    case = replace(
+        base, integrator=method.integrator, preset=method.preset if solves else "", error=method.error,
+        max_iterations=method.max_iterations, label=method.label,
+        options=" ".join(filter(None, (method.options, point.options if solves else ""))),
+        point=MapPoint(base.scene, method.label if point.x is None else point.x, point.y, point.recovers),
+    )  # fmt: skip
+    step, length = scene.time.step, point.length
+    duration = length.steps * step if length.steps else length.duration or scene.time.duration
+    return with_time(with_solver(case, scene), max(duration, step), 1, scene)

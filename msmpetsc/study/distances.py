@@ -1,0 +1,66 @@
+"""Distances of motions: the shape error, from the rest shape, and the trajectory error, from the true motion."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from msmpetsc.errors import InputError
+from msmpetsc.output.compare import common_times, refuse_different_lattices
+from msmpetsc.output.reader import Result
+
+
+def shape_error(run: Result, frame: int) -> float | None:
+    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite."""
+    position = run.frames.position[frame]
+    if not np.isfinite(position).all():
+        return None
+    return distance_of_shapes(position, run["lattice/nodes"][:], run["lattice/mass"][:])
+
+
+def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:
+    """Return the distance of nodes x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
+
+        min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side    [-]
+
+    R is a rotation: a mirrored body is not in its rest shape. (Kabsch 1976, as scipy has it.)
+    """
+    side = np.ptp(rest, axis=0).max()
+    if side == 0:  # one node
+        return 0.0
+    x, rest = (points - mass @ points / mass.sum() for points in (x, rest))
+    size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a flat body several rotations are the best: any will do
+        rotation, _ = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
+    squared = ((x - rotation.apply(rest)) ** 2).sum(axis=1) / size**2  # scipy's own figure ends at 1e-8
+    return float(np.sqrt(mass @ squared / mass.sum()) * size / side)
+
+
+def trajectory_error(result: Path, reference: Path) -> float:
+    """Return the distance of a run from a reference run, relative to how far the reference has moved [-].
+
+        sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
+
+    Sums over the times that both files have, masses M and rest positions of the lattice. x_ref stands for the limit
+    of the time step to zero, so this is the error of the time step and of unfinished steps together, unlike the
+    step error, which knows the step alone. Nothing else is subtracted: a body that flies as a whole counts its
+    flight as motion, so the same error of its shape is a smaller figure there than of one that only swings.
+
+    Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
+    """
+    with Result(result) as run, Result(reference) as true:
+        refuse_different_lattices(run, true)
+        rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
+        pairs = common_times(run.frames.time[:], true.frames.time[:])
+        if len(pairs) < 2:
+            raise InputError(f"{result} and {reference} have {len(pairs)} times in common, 2 are needed")
+        off = moved = 0.0
+        for of_run, of_reference in pairs:
+            x, x_ref = run.frames.position[of_run], true.frames.position[of_reference]
+            off += mass @ ((x - x_ref) ** 2).sum(axis=1)
+            moved += mass @ ((x_ref - rest) ** 2).sum(axis=1)
+    if moved == 0:
+        raise InputError(f"{reference}: nothing moves in it")
+    return float(np.sqrt(off / moved))

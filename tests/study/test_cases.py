@@ -1,0 +1,151 @@
+"""The cases of a study file: what is refused, what a sweep multiplies, and what defines a case."""
+
+# ruff: noqa: F811 (fixtures are imported)
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import ENVIRONMENT, ROOT
+from study_files import ONE_SCENE, all_cases, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.study.cases import shown_command, study_cases
+from msmpetsc.study.schema import load_study
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (ONE_SCENE + "[[sweep]]\nprests = []", ["sweep.0.prests", "'presets'", "(line 5)"]),
+        (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "'newton'"]),
+        (ONE_SCENE + '[[sweep]]\nscenes = ["b"]', ["sweep", "'b'"]),
+        (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be < 1"]),
+        (ONE_SCENE + '[[sweep]]\noptions = ["-pc_type \'icc"]', ["sweep.0.options.0", "no closing quotation"]),
+        (ONE_SCENE + '[[sweep]]\nintegrators = ["verlett"]', ["sweep.0.integrators.0", "'verlet'"]),
+        (ONE_SCENE + 'reference = { integrator = "implicit-euler" }\n[[sweep]]', ["scene.0.reference", "needs step"]),
+        (ONE_SCENE + "steps = 3\nduration = 0.5\n[[sweep]]", ["scene.0.duration", "beside steps"]),
+        (ONE_SCENE + ONE_SCENE + "[[sweep]]", ["scene", "two scenes", "'a'"]),
+        ("[[sweep]]", ["scene", "required"]),
+        ("scene = [", ["is not TOML"]),
+    ],
+)
+def test_a_mistake_in_a_study_file_is_one_line(tmp_path: Path, wrong: str, words: list[str]):
+    with pytest.raises(InputError) as told:
+        load_study(study_file(tmp_path, wrong), ["newton", "anderson"])
+    assert len(str(told.value).splitlines()) == 1
+    assert all(word in str(told.value) for word in words), str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ('file = "gone.toml"', ["gone.toml", "no such scene"]),
+        ('file = "scene.toml"\nset = ["cages.cuont=3"]', ["cages.cuont", "'count'"]),
+        ('file = "scene.toml"\nreference = { integrator = "implicit-euler", step = 0.003 }', ["no multiple", "0.003"]),
+    ],
+)
+def test_a_wrong_scene_is_told_before_anything_is_run(tmp_path: Path, stand_in, wrong: str, words: list[str]):
+    with pytest.raises(InputError) as told:
+        carry_out(tmp_path, f'[[scene]]\nname = "a"\n{wrong}\n[[sweep]]')
+    assert len(str(told.value).splitlines()) == 1 and all(word in str(told.value) for word in words), str(told.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_line_refuses_with_status_2_and_one_line(tmp_path: Path):
+    path = study_file(tmp_path, ONE_SCENE + "[[sweep]]\nerors = [0.1]")
+    words = [sys.executable, "-m", "msmpetsc.cli.main", "study", str(path), "-o", str(tmp_path / "out")]
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        f"msmpetsc: error: {path}: sweep.0.erors: unknown key, did you mean 'errors'? (line 5)"
+    ]
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path, capsys, own_log):
+    path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
+    (tmp_path / "file").touch()
+    (tmp_path / "taken" / "traces.json.part").mkdir(parents=True)
+    for folder, said in {"file/out": "Not a directory", "taken": "Is a directory", "file": "not a folder"}.items():
+        assert main(["study", str(path), "-o", str(tmp_path / folder)]) == 2
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1 and said in told[0] and str(tmp_path / folder) in told[0]
+
+
+def test_a_sweep_is_a_product(tmp_path: Path):
+    lists = {
+        "presets": ["newton", "anderson"], "options": ["", "-pc_type icc"], "cells": [10, 20],
+        "time_steps": [0.01, 0.02], "errors": [0.1, 0.01], "max_iterations": [5], "ranks": [1, 2],
+    }  # fmt: skip
+    text = ONE_SCENE + "[[sweep]]\n" + "\n".join(f"{name} = {json.dumps(values)}" for name, values in lists.items())
+    found = all_cases(tmp_path, text)
+    assert len(found) == 2 * 2 * 2 * 2 * (2 + 1) * 2  # an error or a budget, not both
+    assert len({one.id for one in found}) == len(found)
+    assert {one.label for one in found} == {
+        "newton", "anderson", "newton -pc_type icc", "anderson -pc_type icc",
+        "newton, 2 ranks", "anderson, 2 ranks", "newton -pc_type icc, 2 ranks", "anderson -pc_type icc, 2 ranks",
+    }  # fmt: skip
+    last = shown_command(found[-1])
+    assert last.startswith("mpiexec -n 2 msmpetsc run ")
+    assert last.endswith("-pc_type icc")
+    for told in ("cages.count=20", 'preset = "anderson", max_iterations = 5', "step = 0.02, duration = 0.1"):
+        assert told in last
+
+
+def test_what_has_no_meaning_for_verlet_is_not_multiplied(tmp_path: Path):
+    sweep = '[[sweep]]\nintegrators = ["verlet", "implicit-euler"]\npresets = ["newton", "anderson"]\n'
+    sweep += "substeps = [1e-4, 1e-5]"
+    found = all_cases(tmp_path, ONE_SCENE + sweep)
+    assert [(one.integrator, one.preset, one.substep) for one in found] == [
+        ("verlet", "", 1e-4), ("verlet", "", 1e-5),
+        ("implicit-euler", "newton", None), ("implicit-euler", "anderson", None),
+    ]  # fmt: skip
+
+
+def test_nothing_is_measured_beyond_the_end_of_a_case(tmp_path: Path):
+    """The scene's steps are of 0.01 s: 3 of them, or 1."""
+    scene = ONE_SCENE + "duration = 0.03\ntrue_error = 2\ntrace = 3\n"
+    sweep = "[[sweep]]\ntrace = true\ntime_steps = "
+    study = load_study(study_file(tmp_path, scene + "[[sweep]]\ntime_steps = [0.01, 0.03]"))
+    assert [case.true_error for case in study_cases(study, tmp_path, False)] == [2, 1]
+    assert study_cases(load_study(study_file(tmp_path, scene + sweep + "[0.01]")), tmp_path, False)[0].trace == 3
+    with pytest.raises(InputError, match="scene a: trace = 3, but newton takes 1 steps"):
+        study_cases(load_study(study_file(tmp_path, scene + sweep + "[0.03]")), tmp_path, False)
+
+
+def test_full_cases_are_for_full_studies_and_none_comes_twice(tmp_path: Path):
+    text = ONE_SCENE + "[[sweep]]\nerrors = [0.1]\n[[sweep]]\nerrors = [0.1, 0.01]\nfull = true"
+    assert [one.error for one in all_cases(tmp_path, text)] == [0.1]
+    assert [one.error for one in all_cases(tmp_path, text, full=True)] == [0.1, 0.01]
+
+
+def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
+    (tmp_path / "box.ply").write_text("a mesh")
+    text = ONE_SCENE + "[[sweep]]"
+    (before,) = all_cases(tmp_path, text)
+    assert replace(before, label="x", timeout=1.0).id == before.id
+    assert replace(before, options="-pc_type icc").id != before.id
+    (tmp_path / "box.ply").write_text("another mesh")
+    (after,) = all_cases(tmp_path, text)
+    assert after.id != before.id
+
+
+def test_the_studies_shipped_are_sound():
+    presets = {
+        "newton",
+        "newton-multigrid",
+        "anderson",
+        "lbfgs",
+        "chebyshev",
+        "ngmres",
+        "fast-msm",
+        "paper",
+        "fast-msm-kronecker",
+    }
+    for name in ("pareto", "figure6", "growth"):
+        path = ROOT / "scenes" / "studies" / f"{name}.toml"
+        few, many = (study_cases(load_study(path, presets), path.parent, full) for full in (False, True))
+        assert 10 < len(few) < 130 and len(few) < len(many)

@@ -1,0 +1,93 @@
+"""The figures of a run: its error against a reference, means of its steps, medians of its repeats."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from study_stand_in import blank_frame
+
+from msmpetsc.errors import InputError
+from msmpetsc.output.writer import ResultFile
+from msmpetsc.study.distances import common_times, trajectory_error
+from msmpetsc.study.metrics import of_frames, together
+
+
+def result(path: Path, times: list[float], positions: list[np.ndarray], mass: list[float], **series) -> Path:
+    """A result file; positions (n, 3) of each time, the first at rest."""
+    with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
+        file.write("lattice/nodes", positions[0])
+        file.write("lattice/mass", np.array(mass, float))
+        file.start_frames(len(times), len(mass))
+        for index, now in enumerate(times):
+            values = {name: column[index] for name, column in series.items()}
+            file.append(blank_frame(index=index, time=now, position=positions[index], **values))
+    return path
+
+
+def test_the_trajectory_error_of_a_motion_by_hand(tmp_path: Path):
+    """Two nodes of 1 and 4 kg: node 0 moves by 3 and 0 at the two common times, node 1 by 0 and 2; node 1 is off by 1
+    once, node 0 by 2 once: sqrt((4 * 1 + 1 * 4) / (1 * 9 + 4 * 4)) = sqrt(8 / 25)."""
+    rest = np.array([[0.0, 0, 0], [1, 0, 0]])
+    x, z = np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, 0], [0, 0, 1]])
+    reference = result(tmp_path / "r.h5", [0, 0.1, 0.2], [rest, rest + 3 * x, rest + 2 * z], [1, 4])
+    times = [0, 0.05, 0.1 + 1e-12, 0.15, 0.2]
+    positions = [rest, rest + 99, rest + 3 * x + z, rest - 99, rest + 2 * z + 2 * x]
+    run = result(tmp_path / "x.h5", times, positions, [1, 4])
+    assert trajectory_error(run, reference) == pytest.approx(np.sqrt(8 / 25))
+    assert trajectory_error(reference, reference) == 0
+
+
+def test_runs_without_common_times_or_nodes_have_no_trajectory_error(tmp_path: Path):
+    rest = np.zeros((1, 3))
+    reference = result(tmp_path / "r.h5", [0, 0.1], [rest, rest + 1], [1])
+    with pytest.raises(InputError, match="1 times in common"):
+        trajectory_error(result(tmp_path / "a.h5", [0, 0.03], [rest, rest], [1]), reference)
+    with pytest.raises(InputError, match="different lattices"):
+        trajectory_error(result(tmp_path / "b.h5", [0, 0.1], [np.zeros((2, 3))] * 2, [1, 1]), reference)
+    with pytest.raises(InputError, match="different lattices"):
+        trajectory_error(result(tmp_path / "d.h5", [0, 0.1], [rest + 1, rest], [1]), reference)
+    with pytest.raises(InputError, match="nothing moves"):
+        trajectory_error(reference, result(tmp_path / "c.h5", [0, 0.1], [rest, rest], [1]))
+
+
+@pytest.mark.parametrize(
+    ("times", "others", "pairs"),
+    [
+        ([0, 1, 2], [0, 2, 4], [[0, 0], [2, 1]]),
+        ([0, 0.3], [0, 0.1, 0.2, 0.1 + 0.2], [[0, 0], [1, 3]]),
+        ([0], [0], [[0, 0]]),
+        ([], [0], []),
+        ([5], [0, 1], []),
+    ],
+)
+def test_common_times(times: list, others: list, pairs: list):
+    assert common_times(np.array(times, float), np.array(others, float)).tolist() == pairs
+
+
+def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
+    """Frames of 2 steps: 9 s, 2 s and 4 s of computing; the first does not count."""
+    positions = [np.zeros((1, 3))] * 4
+    file = result(
+        tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0], iterations=[0, 50, 4, 8],
+        ksp_its=[0, 0, 40, 0], step_error=[0, 0.3, 0.4, 0.0],
+    )  # fmt: skip
+    row = of_frames(file, 0.1)
+    assert (row["frames"], row["steps"]) == (4, 6)
+    assert row["time_frame"] == pytest.approx(6 / 4)
+    assert (row["iterations"], row["ksp_its"]) == (3, 10)
+    assert row["estimated_error"] == pytest.approx(np.sqrt((0.09 + 0.16) / 3))
+
+
+def test_repeats_become_medians():
+    runs = [
+        {"time_ksp": t, "memory": m, "true_error": e} for t, m, e in ((1.0, 9, 0.1), (5.0, 7, None), (2.0, 8, None))
+    ]
+    assert together(runs) == {"time_ksp": 2.0, "memory": 7, "true_error": 0.1}
+
+
+def test_the_range_of_the_repeats_is_kept_and_a_single_run_has_none():
+    runs = [{"time_frame": t} for t in (0.3, 0.1, 0.2)]
+    assert together(runs) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+    assert together(runs[:1]) == {"time_frame": 0.3}
+    assert together([*runs[:2], {}]) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}

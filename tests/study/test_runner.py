@@ -1,0 +1,167 @@
+"""What a study runs, how often, and what it does about what goes wrong. The runs are stand-ins."""
+
+# ruff: noqa: F811 (fixtures are imported)
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ENVIRONMENT
+from study_files import ONE_SCENE, STAND_IN, alive, calls, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.study import table
+from msmpetsc.study.runner import StudyPart, list_study, run_study
+from msmpetsc.study.table import COLUMNS, read_table, records
+
+
+def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
+    text = "repeats = 3\n" + ONE_SCENE + 'frame = 0.02\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
+    text += 'trace = 2\n[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]\ntrace = true'
+    (row,) = carry_out(tmp_path, text)
+    assert set(row) == set(COLUMNS)
+    # run 1 is the reference, 2, 3 and 4 are the repeats
+    assert row["status"] == "ok" and row["ranks"] == 2 and row["repeats"] == 3
+    assert (row["cells"], row["nodes"], row["frames"], row["steps"]) == (1, 8, 6, 10)
+    assert row["time_setup"] == 3  # 2, 3 and 4
+    assert row["time_frame"] == pytest.approx(0.01 * 3)
+    assert row["fps"] == pytest.approx(1 / 0.03) and row["time_second"] == pytest.approx(3)
+    assert (row["iterations"], row["ksp_its"]) == (3, 30)
+    assert row["trajectory_error"] == pytest.approx(1.01 / 1.001 - 1)
+    assert row["memory"] == 1000 - 4  # of the leanest run
+    assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
+    assert sum("--trace 2" in call for call in calls(tmp_path)) == 1  # in the first repeat alone
+    (told,) = json.loads((tmp_path / "out" / "traces.json").read_text())
+    assert (told["scene"], told["label"], told["trace"]["frame"]) == ("a", "newton", 2)
+    with h5py.File(tmp_path / "out" / "table.h5") as file:
+        assert file["label"].asstr()[:].tolist() == ["newton"]
+        assert file["time_frame"][0] == row["time_frame"] and np.isnan(file["true_error"][0])
+        assert file["ksp_its"].dims[0].keys() == ["row"]
+    left = [path.name for path in (tmp_path / "out").rglob("*") if path.is_file() and "references" not in str(path)]
+    assert sorted(left) == ["calls.txt", "study.toml", "table.csv", "table.h5", "traces.json"]
+
+
+def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = '
+    first = carry_out(tmp_path, text + "[0.1, 0.01]")
+    assert len(calls(tmp_path)) == 2
+    again = carry_out(tmp_path, text + "[0.2, 0.01]")  # one gone, one new, one kept
+    assert len(calls(tmp_path)) == 3
+    assert [row["error"] for row in again] == [0.2, 0.01] and again[1] == first[1]
+    carry_out(tmp_path, text + "[0.2, 0.01]", restart=True)
+    assert len(calls(tmp_path)) == 5
+
+
+def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
+    """Three cases in two parts of 1 and 2; one part is run twice, its cases once."""
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = [0.3, 0.2, 0.1]'
+    path, out = study_file(tmp_path, text), tmp_path / "out"
+    found = {index: run_study(path, out, None, part=StudyPart(index, 2)) for index in (2, 1, 2)}
+    assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3], [0.2, 0.1]]
+    assert not (out / "table.csv").exists() and [done for _, done in list_study(path, out, None)] == [True] * 3
+    assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [1, 2]
+    rows = carry_out(tmp_path, text)
+    assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
+    assert rows == [row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))]
+
+
+def test_what_a_part_lacks_the_whole_runs(tmp_path: Path, stand_in):
+    text = ONE_SCENE + 'trace = 2\n[[sweep]]\ntrace = true\npresets = ["newton"]\nerrors = [0.2, 0.1]'
+    path, out = study_file(tmp_path, text), tmp_path / "out"
+    run_study(path, out, None, part=StudyPart(2, 2))
+    assert [done for _, done in list_study(path, out, None)] == [False, True]
+    assert run_study(path, out, None, part=StudyPart(9, 9))[0]["error"] == 0.1  # done by another part
+    assert not (out / "parts" / "9-of-9" / "calls.txt").exists()
+    assert run_study(path, out, None, part=StudyPart(1, 9)) == []  # more parts than cases
+    carry_out(tmp_path, text)
+    assert len(calls(tmp_path)) == 1
+    assert len(json.loads((out / "traces.json").read_text())) == 2
+
+
+@pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3", "1/", "-1/3"])
+def test_a_part_that_is_none_is_refused(tmp_path: Path, capsys, own_log, part: str):
+    path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
+    assert main(["study", str(path), "-o", str(tmp_path / "out"), f"--part={part}"]) == 2
+    assert capsys.readouterr().err == f"msmpetsc: error: --part must read I/N, 1 <= I <= N, not {part}\n"
+
+
+def test_the_list_names_each_case_and_runs_none(tmp_path: Path, capsys, own_log):
+    path = study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton", "anderson"]')
+    assert main(["study", str(path), "-o", str(tmp_path / "out"), "--list"]) == 0
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("   1 open  a: newton  msmpetsc run ") and second.startswith("   2 open  a: anderson  ")
+    assert last == "2 cases, 0 done" and not (tmp_path / "out").exists()
+
+
+def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
+    rows = carry_out(
+        tmp_path, "repeats = 2\n" + ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]', jobs=2
+    )
+    assert [(row["status"], row["reason"]) for row in rows] == [("failed", "planted, with reason"), ("ok", "")]
+    assert rows[0]["time_frame"] is None and rows[0]["options"] == "-ksp_fail"
+    assert len(calls(tmp_path)) == 3  # what fails is not repeated
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
+def test_a_case_that_takes_too_long_is_ended_with_all_it_started(tmp_path: Path, stand_in):
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_children -ksp_hang"]\n'
+    begin = time.monotonic()
+    (row,) = carry_out(tmp_path, "timeout = 2\n" + text)
+    assert time.monotonic() - begin < 20
+    assert (row["status"], row["reason"]) == ("timeout", "took longer than 2 s")
+    assert not alive(int((tmp_path / "out" / "child").read_text()))
+    carry_out(tmp_path, "timeout = 2\n" + text)
+    assert len(calls(tmp_path)) == 1
+    carry_out(tmp_path, "timeout = 3\n" + text)  # more time: another try
+    assert len(calls(tmp_path)) == 2
+
+
+STUDY_IN_ITS_OWN_PROCESS = """
+import sys
+from pathlib import Path
+from msmpetsc.study import runner
+real = runner.command
+def stands_in(of, result, figures):
+    words = real(of, result, figures)
+    at = words.index("-m")
+    return [*words[:at], sys.argv[1], *words[at + 2:]]
+runner.command = stands_in
+runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]), None)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
+def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
+    words = [
+        sys.executable,
+        "-c",
+        STUDY_IN_ITS_OWN_PROCESS,
+        str(STAND_IN),
+        str(study_file(tmp_path, text)),
+        str(tmp_path / "out"),
+    ]
+    heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
+    study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL, preexec_fn=heard)
+    child, deadline = tmp_path / "out" / "child", time.monotonic() + 60
+    while not (child.is_file() and child.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(study.pid, signal.SIGINT)
+    assert study.wait(20) != 0
+    assert list(read_table(tmp_path / "out")["status"]) == ["ok"]
+    assert not alive(int(child.read_text()))
+    assert len(calls(tmp_path)) == 2
+
+
+def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path, stand_in, monkeypatch):
+    monkeypatch.setattr(table, "find_spec", lambda name: None if name == "pandas" else name)
+    with pytest.raises(InputError, match=r"^pandas is not installed: pip install .msmpetsc\[study\]. brings it$"):
+        carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
+    assert not (tmp_path / "out").exists()

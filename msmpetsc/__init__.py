@@ -3,33 +3,37 @@
 import hashlib
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from msmpetsc.output.reader import Result
 
 __version__ = "0.1.0"
 
 
 def _kernel_folder() -> Path:
-    """A folder for the compiled kernels of just these sources.
+    """Return a folder for the compiled kernels of just these sources.
 
     numba looks for changes in a kernel's own file alone, not in those of the kernels it calls: after an update it
     would go on with parts of the old version.
     """
-    here = Path(__file__).parent
-    sources = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
+    package = Path(__file__).parent
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
     kernels = b"".join(source for source in sources if b"njit" in source or b"@kernel" in source)
-    return here / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
+    return package / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
 
 
-def open(path: str | Path) -> "Result":  # noqa: F821
-    """A result file, to be read: frames, lattice, surface, embedding, scene. Needs neither MPI nor PETSc.
+def open(path: str | Path) -> "Result":
+    """Open a result file to read its frames, lattice, surface, embedding and scene; needs h5py and numpy alone.
 
         with msmpetsc.open("out/bunny_fall.h5") as run:
             last = run.frames.position[-1]
 
     Raises InputError, one line, if the file is no result, or damaged.
     """
-    from msmpetsc.output.reader import Result  # here: the package itself stays quick to import
+    from msmpetsc.output.reader import Result  # late: the package itself stays quick to import
 
     return Result(path)

@@ -31,9 +31,8 @@ from petsc4py import PETSc
 from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.profile import machine, versions
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.build import to_device
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.model.build import Model, build_model, to_device
+from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -84,11 +83,11 @@ def run(scene: str, overrides: list[str], where: str, folder: Path, args: argpar
 
 def figures(path: Path) -> dict:
     """Cells, frames a second, the largest error, and the last positions and how far the body is long."""
-    with open_result(path) as file:
-        frames, count = file["frames"], finished(file)
-        seconds = frames["wall_time"][1:count][COMPILING:]
-        last, extent = frames["position"][count - 1], np.ptp(file["lattice/nodes"][:], axis=0).max()
-        error, cells = frames["step_error"][1:count].max(), len(file["lattice/cells"])
+    with Result(path) as result:
+        frames = result.frames
+        seconds = frames.wall_time[1:][COMPILING:]
+        last, extent = frames.position[-1], np.ptp(result.lattice.nodes[:], axis=0).max()
+        error, cells = frames.step_error[1:].max(), len(result.lattice.cells)
     return {
         "cells": cells,
         "speed": float(1 / np.median(seconds)),

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from msmpetsc.model.inversion import least_volumes
 from msmpetsc.model.loads import Motion
+from msmpetsc.output.reader import Result
 from msmpetsc.output.render import read_scene
-from msmpetsc.output.writer import finished, open_result
 
 ROOT = Path(__file__).parents[1]
 SCENE, OUT = ROOT / "scenes" / "lung_press.toml", ROOT / "out" / "press_study"
@@ -43,10 +43,10 @@ def shape_error(rest: np.ndarray, q: np.ndarray, mass: np.ndarray) -> float:
 
 
 def row(law: str, share: float, path: Path) -> list[str]:
-    with open_result(path) as file:
-        scene, count, cells = read_scene(file), finished(file), file["lattice/cells"][:]
-        nodes, mass, times = file["lattice/nodes"][:], file["lattice/mass"][:], file["frames/time"][:count]
-        q, iterations = file["frames/position"][:count], file["frames/iterations"][1:count]
+    with Result(path) as result:
+        scene, count, cells = read_scene(result), len(result.frames.time), result.lattice.cells[:]
+        nodes, mass, times = result.lattice.nodes[:], result.lattice.mass[:], result.frames.time[:]
+        q, iterations = result.frames.position[:], result.frames.iterations[1:]
     plate = scene.obstacle[1]
     low = np.array([plate.box[0][2] + Motion.through(plate.path).at(time)[2] for time in times])
     above = (q[:, :, 2].max(axis=1) - low)[times < plate.stop - 1e-9].max()

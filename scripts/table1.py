@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.output.reader import Result
 
 ROOT = Path(__file__).parents[1]
 # vertices, facets, valid cells, springs, frames a second on the CPU and on the GPU
@@ -54,12 +54,11 @@ def run(scene: str, folder: Path, frames: int | None) -> Path:
 
 def figures(path: Path) -> dict[str, float]:
     """Our columns of a result."""
-    with open_result(path) as file:
+    with Result(path) as result:
         counts = [
-            len(file[name]) for name in ("surface/points", "surface/triangles", "lattice/cells", "lattice/springs")
+            len(result[name]) for name in ("surface/points", "surface/triangles", "lattice/cells", "lattice/springs")
         ]
-        frames = file["frames"]
-        wall_time, error = frames["wall_time"][1 : finished(file)], frames["step_error"][1 : finished(file)]
+        wall_time, error = result.frames.wall_time[1:], result.frames.step_error[1:]
     slowest = np.sort(wall_time)[-max(1, len(wall_time) // 10) :]
     values = *counts, counts[3] / counts[2], 1 / wall_time.mean(), 1 / slowest.mean(), error.max()
     return dict(zip((*COLUMNS, *SPEEDS), values, strict=True))

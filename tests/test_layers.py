@@ -78,4 +78,4 @@ def test_a_planted_violation_is_found(layer: str, source: str, expected: str):
 
 def test_what_is_allowed_is_not_reported():
     assert violations("cli", "import argparse\nimport petsc4py\nfrom msmpetsc.solve import step\nprint(1)") == []
-    assert violations("output", "from msmpetsc import __version__\nfrom msmpetsc.model.frame import Frame") == []
+    assert violations("output", "from msmpetsc import __version__\nfrom msmpetsc.model.fields import Frame") == []

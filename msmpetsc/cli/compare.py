@@ -6,7 +6,7 @@ import numpy as np
 
 from msmpetsc.cli.arguments import file_argument, refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import AT_REST, Comparison, Field, compare, place
+from msmpetsc.output.compare import Comparison, FieldError, compare, point_text, rest_of
 from msmpetsc.output.reader import Result, refuse_deadly
 
 SAME, DIFFERENT = 0, 1
@@ -62,7 +62,7 @@ def tell_what_is_not_shared(one: Result, other: Result, found: Comparison) -> No
         print(f"{name} is in {one.path if name in one.frames else other.path} only: not compared")
 
 
-def row(field: Field, found: Comparison, rtol: float) -> str:
+def row(field: FieldError, found: Comparison, rtol: float) -> str:
     """A line of the table; frames are numbered as in the first file."""
     at, first = int(np.argmax(field.errors)), field.first_above(rtol)
     since = "-" if first is None else found.pairs[first, 0]
@@ -80,16 +80,15 @@ def tell_first_difference(one: Result, found: Comparison, rtol: float) -> bool:
     names = ", ".join(name for name, at in firsts.items() if at == first)
     print(f"they differ from frame {found.pairs[first, 0]} on, t = {found.times[first]:g} s: {names}")
     for field in found.fields:
-        if field.name in AT_REST and field.name in firsts:
+        if field.name in ("position", "surface") and field.name in firsts:
             tell_node(one, found, field, firsts[field.name])
             break
     return True
 
 
-def tell_node(one: Result, found: Comparison, field: Field, first: int) -> None:
-    group, stored = AT_REST[field.name]
-    number, array = field.worst[first], getattr(one, group).get(stored)
-    rest = f", at rest at {place(array[number])}" if array is not None else ""
+def tell_node(one: Result, found: Comparison, field: FieldError, first: int) -> None:
+    number, rest_rows = field.worst[first], rest_of(one, field.name)
+    rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
     off = f"{field.errors[first] * field.scale:.3g} m off at frame {found.pairs[first, 0]}"
     print(f"{kind} {number}{rest}, is {off}, farther than any other")

@@ -13,10 +13,9 @@ from msmpetsc import __version__
 from msmpetsc.cli.arguments import RESULT_NAMES, refuse_other_format
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
-from msmpetsc.output.continued import Anew, InPlace
 from msmpetsc.output.reader import refuse_deadly
-from msmpetsc.output.restart import Earlier, read_saved, refuse_other_lattice
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.reading import load_scene, scene_of
 from msmpetsc.scene.schema import Scene
 from msmpetsc.study.schema import beside_solving
@@ -61,7 +60,7 @@ def read_scene(args: argparse.Namespace, earlier: Earlier | None, changes: list[
 def look_closely(path: Path) -> Earlier:
     """For one rank."""
     refuse_deadly(path)
-    return Earlier.look(path)
+    return Earlier.read(path)
 
 
 def _stored_options(earlier: Earlier, given: Collection[str]) -> Iterator[str]:
@@ -131,15 +130,15 @@ class Resumed:
             if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
                 yield f"-{name}: {_told(was.get(name))} in {earlier.path}, {_told(options.get(name))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """To write into (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
-            return InPlace(earlier.path, comm, attributes)
+            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
         attributes["scene_file"] = attributes["scene_file"] or earlier.texts["scene_file"]
-        return Anew(earlier.path, comm, attributes, earlier.finished)
+        return ResultFile(earlier.path, comm, attributes, Begin.COPY, gathers)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
         """Raises InputError where the mesh makes another lattice than it did (collective)."""
@@ -147,17 +146,17 @@ class Resumed:
         found = {"lattice/nodes": lattice.nodes[: lattice.owned]}
         if not self.differs:
             found["lattice/mass"] = lattice.mass
-        refuse_other_lattice(comm, self.earlier.path, found)
+        refuse_changed_lattice(comm, self.earlier.path, found)
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
-        path, saved = self.earlier.path, read_saved(comm, self.earlier.path, simulation.model.lattice.owned)
+        path, saved = self.earlier.path, read_checkpoint(comm, self.earlier.path, simulation.model.lattice.owned)
         if saved is not None and saved.step >= simulation.steps:
             raise InputError(f"{path} has come to step {saved.step} already: it cannot end at step {simulation.steps}")
         kept = 0 if saved is None else simulation.stored_until(saved.step)
         if kept > self.earlier.finished:
             raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
-        if isinstance(file, Anew) and self.differs:  # later frames are of how it was
+        if self.differs:  # later frames are of how it was
             file.keep(kept)
         if saved is None:
             return

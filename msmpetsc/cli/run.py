@@ -30,7 +30,7 @@ from msmpetsc.cli.storing import tell_stop, write_frames, write_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.restart import Earlier
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.petsc.initialise import initialise
@@ -140,9 +140,10 @@ def run(args: argparse.Namespace) -> int:
         with (
             compilation_logged(all_are_new),
             Signals(comm) as signals,
-            resumed.file(comm, about) if resumed else ResultFile(path, comm, about, args.overwrite) as file,
+            resumed.file(comm, about, args.gather)
+            if resumed
+            else ResultFile(path, comm, about, Begin.OVERWRITE if args.overwrite else Begin.NEW, args.gather) as file,
         ):
-            file.gathers = args.gather
             model = build_model(comm, scene)
             log_model(comm, model)
             if resumed:

@@ -5,7 +5,7 @@ An error is the greatest difference at a frame over the scale of its field, whic
     position, surface                       the largest displacement from rest, at least 1e-6 of the body's longest side
     kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
                                             at least that of the stiffest spring strained by 1e-6
-    momentum                                sqrt(2 m K) of the whole mass m, K the largest kinetic energy or that least one
+    momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
     anything else                           its own largest |value|
 
 each over both runs and all frames compared. What the digits of the coarser of the two stored types cannot tell apart
@@ -14,23 +14,24 @@ is equal, and so are two NaN, or two infinities of one sign.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.model.fields import FRAME_FIELDS
 from msmpetsc.output.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 DEFAULT = ("position", "surface", *ENERGIES, "momentum")
-AT_REST = {"position": ("lattice", "nodes"), "surface": ("surface", "points")}
 LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
-SAME_PLACE = 1e-6  # of a cell
+SAME_POINT = 1e-6  # of a cell
 SAME_TIME = 1e-6  # of the spacing of frames
 
 
 @dataclass
-class Field:
-    """How far one field is apart.
+class FieldError:
+    """How far one field of two runs is apart.
 
     scale  : what errors are relative to
     errors : (p,) relative, one a frame compared; inf where only one run has a number
@@ -44,81 +45,102 @@ class Field:
     worst: np.ndarray = field(default_factory=lambda: np.empty(0, int))
 
     def first_above(self, rtol: float) -> int | None:
-        """Where in the frames compared an error is first above rtol."""
+        """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
 
 @dataclass
 class Comparison:
-    """pairs (p, 2): frames of equal time in the one and the other run. left_out: fields that one run alone has."""
+    """Two runs compared, frame by frame.
+
+    pairs    : (p, 2) frames of equal time in the two runs
+    times    : (p,) [s]
+    left_out : fields that only one run has
+    """
 
     pairs: np.ndarray
-    times: np.ndarray  # (p,) [s]
-    fields: list[Field]
+    times: np.ndarray
+    fields: list[FieldError]
     left_out: list[str]
 
 
-@np.errstate(all="ignore")  # what overflows differs, and is told of as that
-def compare(one: Result, other: Result, names: Sequence[str] | None = None) -> Comparison:
+class Distances(NamedTuple):
+    """One field of two runs at p pairs of frames.
+
+    greatest : (p,) greatest distance of two rows
+    worst    : (p,) its row
+    size     : greatest size in any frame, from rest where the field is one of positions
+    """
+
+    greatest: np.ndarray
+    worst: np.ndarray
+    size: float
+
+
+@np.errstate(all="ignore")  # what overflows differs, and is reported as that
+def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
     """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
 
-    Raises InputError if the lattices do not match, or the runs have no time or not these fields.
+    Raises InputError if the lattices do not match, or the runs have no time or not these fields in common.
     """
-    refuse_other_lattice(one, other)
-    chosen, left_out = _chosen(one, other, names)
-    times = one.frames.time[:]
-    pairs = common_times(times, other.frames.time[:])
+    refuse_different_lattices(a, b)
+    chosen, left_out = _chosen(a, b, names)
+    times = a.frames.time[:]
+    pairs = common_times(times, b.frames.time[:])
     if not len(pairs):
-        raise InputError(f"{one.path} and {other.path} have no finished frame of the same time")
-    measured = {name: _measure(one, other, name, pairs) for name in chosen}
-    scales = _scales(one, other, measured, pairs)
+        raise InputError(f"{a.path} and {b.path} have no finished frame of the same time")
+    distances = {name: _distances(a, b, name, pairs) for name in chosen}
+    scales = _scales(a, b, distances, pairs)
     fields = []
-    for name, (apart, worst, _) in measured.items():
+    for name, (greatest, worst, _) in distances.items():
         with np.errstate(divide="ignore", invalid="ignore"):
-            errors = np.where(apart == 0, 0.0, apart / scales[name])
-        fields.append(Field(name, one.frames[name].unit, scales[name], errors, worst))
+            errors = np.where(greatest == 0, 0.0, greatest / scales[name])
+        fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
     return Comparison(pairs, times[pairs[:, 0]], fields, left_out)
 
 
-def _chosen(one: Result, other: Result, names: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Fields to compare, and those of DEFAULT that only one run has."""
-    shared = [name for name in one.frames if name in other.frames and name != "time"]
+def _chosen(a: Result, b: Result, names: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """Return the fields to compare, and those of DEFAULT that only one run has."""
+    shared = [name for name in a.frames if name in b.frames and name != "time"]
     if names is None:
-        either = [name for name in DEFAULT if name in one.frames or name in other.frames]
+        either = [name for name in DEFAULT if name in a.frames or name in b.frames]
         return [n for n in either if n in shared], [n for n in either if n not in shared]
     for name in names:
         if name not in shared:
-            raise InputError(f"{one.path} and {other.path} do not both have frames/{name}{did_you_mean(name, shared)}")
+            raise InputError(f"{a.path} and {b.path} do not both have frames/{name}{did_you_mean(name, shared)}")
     return list(dict.fromkeys(names)), []
 
 
-def _measure(one: Result, other: Result, name: str, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of each pair the greatest distance of two rows and its row, (p,) each; and the greatest size in any frame.
+def rest_of(run: Result, name: str) -> np.ndarray | None:
+    """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
+    at_rest = FRAME_FIELDS[name].at_rest if name in FRAME_FIELDS else ""
+    return run[at_rest][:] if at_rest in run else None
 
-    The size is the distance from rest where the field is one of places.
-    """
-    mine, its = one.frames[name], other.frames[name]
-    if mine.shape[1:] != its.shape[1:]:
-        raise InputError(f"frames/{name} is {mine.shape[1:]} a frame in {one.path}, {its.shape[1:]} in {other.path}")
-    group, stored = AT_REST.get(name, (None, None))
-    rest = getattr(one, group).get(stored, None) if group else None
-    rest = 0.0 if rest is None else rest[:]
-    digits = max(np.finfo(array.dtype).eps if array.dtype.kind == "f" else 0.0 for array in (mine, its))
-    apart, worst, largest = np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
-    for place, (here, there) in enumerate(pairs):
-        a, b = (np.asarray(rows, float) for rows in (mine[here], its[there]))
-        distance = _row_lengths(difference(a, b, digits))
-        worst[place] = np.argmax(distance) if distance.size else 0
-        apart[place] = distance[worst[place]] if distance.size else 0.0
-        for rows in (a, b):
-            sizes = _row_lengths(rows - rest)
-            largest = max(largest, sizes[np.isfinite(sizes)].max(initial=0.0))
-    return apart, worst, float(largest)
+
+def _distances(a: Result, b: Result, name: str, pairs: np.ndarray) -> Distances:
+    a_rows, b_rows = a.frames[name], b.frames[name]
+    if a_rows.shape[1:] != b_rows.shape[1:]:
+        raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
+    rest = rest_of(a, name)
+    digits = max(float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0 for rows in (a_rows, b_rows))
+    greatest, worst, size = np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
+    for number, (a_frame, b_frame) in enumerate(pairs):
+        a_values, b_values = (np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame]))
+        apart = _row_lengths(difference(a_values, b_values, digits))
+        worst[number] = np.argmax(apart) if apart.size else 0
+        greatest[number] = apart[worst[number]] if apart.size else 0.0
+        for values in (a_values, b_values):
+            sizes = _row_lengths(values if rest is None else values - rest)
+            size = max(size, sizes[np.isfinite(sizes)].max(initial=0.0))
+    return Distances(greatest, worst, float(size))
 
 
 def difference(a: np.ndarray, b: np.ndarray, digits: float) -> np.ndarray:
-    """|a - b| less what rounding to these relative `digits` may do; 0 of two NaN, inf of a NaN and a number."""
+    """Return |a - b| less what rounding to these relative `digits` may do.
+
+    It is 0 of two NaN, inf of a NaN and a number.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         apart = np.abs(a - b) - digits * np.maximum(np.abs(a), np.abs(b))
     apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, apart)
@@ -126,69 +148,78 @@ def difference(a: np.ndarray, b: np.ndarray, digits: float) -> np.ndarray:
 
 
 def _row_lengths(rows: np.ndarray) -> np.ndarray:
-    """(r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
+    """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
     with np.errstate(over="ignore", invalid="ignore"):
         return np.atleast_1d(np.linalg.norm(rows, axis=-1)).ravel()
 
 
-def _scales(one: Result, other: Result, measured: dict, pairs: np.ndarray) -> dict[str, float]:
-    largest = {name: size for name, (_, _, size) in measured.items()}
-    size = np.ptp(one.lattice.nodes[:], axis=0).max() if len(one.lattice.nodes) else 0.0
-    places = {name: max(largest[name], LEAST_STRAIN * size) for name in AT_REST if name in largest}
-    least = _least_energy(one)
-    energy, kinetic = (max(least, _largest(one, other, pairs, names)) for names in (ENERGIES, ["kinetic"]))
-    scales = largest | places | dict.fromkeys(largest.keys() & set(ENERGIES), energy)
-    if "momentum" in largest and "mass" in one.lattice and kinetic > 0:
-        scales["momentum"] = float(np.sqrt(2 * one.lattice.mass[:].sum() * kinetic))
+def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: np.ndarray) -> dict[str, float]:
+    """Return what the errors of each field are relative to."""
+    scales = {name: distance.size for name, distance in distances.items()}
+    side = np.ptp(a.lattice.nodes[:], axis=0).max() if len(a.lattice.nodes) else 0.0
+    least = _least_energy(a)
+    energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
+    for name in scales:
+        if name in ENERGIES:
+            scales[name] = energy
+        elif name in FRAME_FIELDS and FRAME_FIELDS[name].at_rest:
+            scales[name] = max(scales[name], LEAST_STRAIN * side)
+    if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
+        scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
     return scales
 
 
-def _largest(one: Result, other: Result, pairs: np.ndarray, names: Sequence[str]) -> float:
-    """The largest size of these energies at the frames compared, of both runs."""
-    runs = (one, pairs[:, 0]), (other, pairs[:, 1])
-    found = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
+def _largest(a: Result, b: Result, pairs: np.ndarray, names: Sequence[str]) -> float:
+    """Return the largest size of these energies at the frames compared, of both runs."""
+    runs = (a, pairs[:, 0]), (b, pairs[:, 1])
+    energies = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
     # the potential energy's zero means nothing
-    values = [energy - energy[0] if name == "potential" else energy for name, energy in found]
-    values = np.abs(np.concatenate([np.empty(0), *values]))
-    return float(values[np.isfinite(values)].max(initial=0.0))
+    values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
+    sizes = np.abs(np.concatenate([np.empty(0), *values]))
+    return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 
 def _least_energy(run: Result) -> float:
-    """[J] 1/2 k (LEAST_STRAIN r)^2 of the stiffest and longest spring; 0 where the file has no springs."""
+    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 where the file has no springs."""
     if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
         return 0.0
     return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
 
 
-def refuse_other_lattice(one: Result, other: Result) -> None:
+def rows_agree(a: np.ndarray, b: np.ndarray, slack: float) -> np.ndarray:
+    """Tell which rows (n,) of a and b, (n, 3) or (n,) each, are apart by no more than `slack`."""
+    return (np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)) <= slack
+
+
+def refuse_different_lattices(a: Result, b: Result) -> None:
     """Raise InputError with the first reason why the two are not of one lattice."""
 
     def refuse(reason: str) -> None:
-        raise InputError(f"{one.path} and {other.path} are runs of different lattices: {reason}")
+        raise InputError(f"{a.path} and {b.path} are runs of different lattices: {reason}")
 
-    nodes, its = one.lattice.nodes[:], other.lattice.nodes[:]
-    sizes = cell_size(one, nodes), cell_size(other, its)
-    if len(nodes) != len(its):
-        refuse(f"{len(nodes)} and {len(its)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m")
-    if abs(sizes[0] - sizes[1]) > SAME_PLACE * sizes[0]:
+    nodes, b_nodes = a.lattice.nodes[:], b.lattice.nodes[:]
+    sizes = cell_size(a, nodes), cell_size(b, b_nodes)
+    if len(nodes) != len(b_nodes):
+        refuse(f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m")
+    if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
         refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
-    same = np.linalg.norm(nodes - its, axis=1) <= SAME_PLACE * (sizes[0] or 1.0)
+    same = rows_agree(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0))
     if not same.all():
         node = int(np.argmin(same))
-        refuse(f"node {node} rests at {place(nodes[node])} in one, at {place(its[node])} in the other")
-    if "springs" not in one.lattice or "springs" not in other.lattice:
+        refuse(f"node {node} rests at {point_text(nodes[node])} in one, at {point_text(b_nodes[node])} in the other")
+    if "springs" not in a.lattice or "springs" not in b.lattice:
         return
-    springs, its = one.lattice.springs[:], other.lattice.springs[:]
-    if len(springs) != len(its):
-        refuse(f"{len(springs)} and {len(its)} springs")
-    if not np.array_equal(springs, its) and not np.array_equal(_sorted(springs), _sorted(its)):
+    springs, b_springs = a.lattice.springs[:], b.lattice.springs[:]
+    if len(springs) != len(b_springs):
+        refuse(f"{len(springs)} and {len(b_springs)} springs")
+    if not np.array_equal(springs, b_springs) and not np.array_equal(_sorted(springs), _sorted(b_springs)):
         refuse("their springs join other nodes")
 
 
 def cell_size(run: Result, nodes: np.ndarray) -> float:
-    """Edge of a cell [m], from the first; 0 where the file has none."""
+    """Return the edge of a cell [m], from the first; 0 where the file has none."""
     if "cells" not in run.lattice or not len(run.lattice.cells):
         return 0.0
     corners = run.lattice.cells[0].astype(np.int64)
@@ -197,23 +228,24 @@ def cell_size(run: Result, nodes: np.ndarray) -> float:
     return float(np.ptp(nodes[corners], axis=0).max())
 
 
-def place(point: np.ndarray) -> str:
+def point_text(point: np.ndarray) -> str:
+    """Return a point (3,) [m] for a message."""
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
 
 
 def _sorted(springs: np.ndarray) -> np.ndarray:
-    """Their order in the file depends on the number of ranks."""
+    """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
     springs = np.sort(springs, axis=1)
     return springs[np.lexsort(springs.T)]
 
 
-def common_times(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
-    if not len(times) or not len(others):
+def common_times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
+    if not len(a) or not len(b):
         return np.empty((0, 2), int)
-    slack = SAME_TIME * min((np.diff(others).min() if len(others) > 1 else 1.0), 1.0)
-    right = np.searchsorted(others, times).clip(1, max(1, len(others) - 1))
-    near = np.where(np.abs(others[right - 1] - times) <= np.abs(others[right % len(others)] - times), right - 1, right)
-    near = near.clip(0, len(others) - 1)
-    same = np.abs(others[near] - times) <= slack
+    slack = SAME_TIME * min((np.diff(b).min() if len(b) > 1 else 1.0), 1.0)
+    right = np.searchsorted(b, a).clip(1, max(1, len(b) - 1))
+    near = np.where(np.abs(b[right - 1] - a) <= np.abs(b[right % len(b)] - a), right - 1, right)
+    near = near.clip(0, len(b) - 1)
+    same = np.abs(b[near] - a) <= slack
     return np.column_stack([np.nonzero(same)[0], near[same]])

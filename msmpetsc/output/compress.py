@@ -1,29 +1,30 @@
 """A finished result file, packed: gzip over shuffled bytes, row by row as before, so that a frame is still read alone.
 
-Not while it is written: chunks of packed sizes have no places set aside, and a kill could spoil the file.
+It is not packed while it is written: chunks of packed sizes have no room set aside, and a kill could spoil the file.
 """
 
 import os
 from pathlib import Path
 
 import h5py
-import numpy as np
 
 from msmpetsc.errors import InputError, one_line
-from msmpetsc.output.reader import DEFLATE_MOST
-from msmpetsc.output.writer import open_new, pieces, plain_errors
+from msmpetsc.output.disk import plain_errors
+from msmpetsc.output.layout import open_new
+from msmpetsc.output.reader import DEFLATE_MOST, open_result
+from msmpetsc.output.transfer import pieces
 
 PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 LEAST = 4096  # [byte]: what is shorter is not worth a filter
 
 
 def pack(path: Path) -> None:
-    """Replace the file by its packed self, when that is whole. Raises InputError; the file then is as it was."""
+    """Replace the file by its packed self once that is whole. Raises InputError, and then the file is as it was."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        with plain_errors(part), h5py.File(path, "r", locking=False) as file, open_new(part) as packed:
+        with plain_errors(part), open_result(path) as file, open_new(part) as packed:
             packed.attrs.update(file.attrs)
-            file.visititems(lambda name, found: _copy(name, found, packed))
+            file.visititems(lambda name, source: _copy(name, source, packed))
         os.replace(part, path)
     except InputError:
         part.unlink(missing_ok=True)
@@ -33,26 +34,24 @@ def pack(path: Path) -> None:
         raise InputError(f"{path} is damaged: {one_line(error)}") from error
 
 
-def _copy(name: str, found: h5py.Group | h5py.Dataset, packed: h5py.File) -> None:
-    if isinstance(found, h5py.Group):
-        packed.require_group(name).attrs.update(found.attrs)
+def _copy(name: str, source: h5py.Group | h5py.Dataset, packed: h5py.File) -> None:
+    """Write a group or a dataset of the file, with its attributes, into the packed one."""
+    if isinstance(source, h5py.Group):
+        packed.require_group(name).attrs.update(source.attrs)
         return
-    if found.nbytes > found.file.id.get_filesize() * (DEFLATE_MOST if found.compression else 1):
+    if source.nbytes > source.file.id.get_filesize() * (DEFLATE_MOST if source.compression else 1):
         raise ValueError(f"{name} claims more than the file holds")
-    filters = PACKED if found.nbytes > LEAST else {}
-    copy = packed.create_dataset(name, found.shape, found.dtype, chunks=_chunks(found) if filters else None, **filters)
-    copy.attrs.update(found.attrs)
+    filters = PACKED if source.nbytes > LEAST else {}
+    # the chunks of the file hold no more than one frame; h5py chooses them for what has none
+    chunks = (source.chunks or True) if filters else None
+    copy = packed.create_dataset(name, source.shape, source.dtype, chunks=chunks, **filters)
+    copy.attrs.update(source.attrs)
     if not filters:
-        copy[...] = found[...]
+        copy[...] = source[...]
         return
-    frames = found.ndim == 3  # or rows that do not change with time
-    row = np.empty((0, *found.shape[2 if frames else 1 :]), found.dtype)
-    for index in range(len(found)) if frames else (None,):
-        for part in pieces(row, found.shape[1] if frames else len(found)):
-            place = (index, part) if frames else part
-            copy[place] = found[place]
-
-
-def _chunks(found: h5py.Dataset) -> tuple[int, ...] | bool:
-    """Those of the file, which hold no more than one frame; h5py's own for what had none."""
-    return found.chunks or True
+    is_series = source.ndim == 3  # else its rows do not change with time
+    rows = source.shape[1] if is_series else len(source)
+    for index in range(len(source)) if is_series else (None,):
+        for part in pieces(rows, source.dtype, source.shape[2 if is_series else 1 :]):
+            key = (index, part) if is_series else part
+            copy[key] = source[key]

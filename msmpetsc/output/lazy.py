@@ -1,6 +1,7 @@
-"""Arrays of a file, read where they are indexed."""
+"""Arrays of a file, read where they are indexed: by numpy's rules, or through xarray."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import h5py
 import numpy as np
@@ -11,21 +12,26 @@ from msmpetsc.errors import InputError, one_line
 class LazyArray:
     """A dataset that is read by indexing, as numpy's arrays are: ``array[-1]``, ``array[:, 17]``, ``np.diff(array)``.
 
-    Of frames only the finished ones are there. One index may be a list or an array; each takes its rows one by one.
+    Frames end with the finished ones. One index may be a list or an array; each takes its rows one by one.
+
+    name    : of the dataset in the file, "frames/position"
+    planned : shape of the dataset in the file, frames to come included
     """
 
     def __init__(self, dataset: h5py.Dataset, count: int | None = None):
-        """count: rows that are there, all if None."""
+        """Wrap a dataset; count: its rows that can be read, all if None."""
         self._dataset = dataset
-        self._file, self._name = dataset.file.filename, dataset.name.lstrip("/")
+        self._file, self.name = dataset.file.filename, dataset.name.lstrip("/")
         self._by_row = count is not None
-        self.shape = (len(dataset) if count is None else count, *dataset.shape[1:])
+        self.planned: tuple[int, ...] = dataset.shape
+        self.shape: tuple[int, ...] = (len(dataset) if count is None else count, *dataset.shape[1:])
         self.dtype = dataset.dtype
         unit = dataset.attrs.get("unit", "1")
         self.unit = unit if isinstance(unit, str) else "1"
 
     @property
     def ndim(self) -> int:
+        """Number of axes."""
         return len(self.shape)
 
     def __len__(self) -> int:
@@ -34,17 +40,17 @@ class LazyArray:
     def __iter__(self) -> Iterator[np.ndarray]:
         return (self[row] for row in range(len(self)))
 
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
 
     def __repr__(self) -> str:
-        return f"<{self._name} {self.shape} {self.dtype} [{self.unit}]>"
+        return f"<{self.name} {self.shape} {self.dtype} [{self.unit}]>"
 
-    def __getitem__(self, key) -> np.ndarray:
-        keys = _one_an_axis(key, self.ndim)
+    def __getitem__(self, key: Any) -> np.ndarray:
+        keys = _key_per_axis(key, self.ndim)
         arrays = [k for k in keys if not isinstance(k, int | np.integer | slice)]
         if len(arrays) > 1:
-            raise IndexError(f"{self._name}: a list or an array may stand for one axis only")
+            raise IndexError(f"{self.name}: a list or an array may stand for one axis only")
         if not arrays:
             return self._read(keys)
         if not self._by_row:
@@ -52,26 +58,30 @@ class LazyArray:
         return self._read_rows(keys)
 
     def _read_rows(self, keys: tuple) -> np.ndarray:
-        """A list or an array among the keys: row by row, for all of them together may be more than fits."""
+        """Read with a list or an array among the keys: row by row, for all together may be more than fits."""
         first, rest = keys[0], keys[1:]
         rows = np.arange(len(self))[first]
-        one = (lambda row: self._read((row, *rest))) if np.ndim(first) else (lambda row: self[int(row)][rest])
         if not rows.size:
             return np.broadcast_to(np.zeros((), self.dtype), self.shape)[keys]  # its shape alone
-        found = np.array([one(row) for row in rows.flat])
-        return found.reshape(*rows.shape, *found.shape[1:])
+        if np.ndim(first):
+            values = np.array([self._read((row, *rest)) for row in rows.flat])
+        else:
+            values = np.array([self[int(row)][rest] for row in rows.flat])
+        return values.reshape(*rows.shape, *values.shape[1:])
 
     def _read(self, keys: tuple) -> np.ndarray:
-        """The keys are numbers and slices."""
-        parts = [range(size)[int(k) if isinstance(k, np.integer) else k] for k, size in zip(keys, self.shape)]
+        """Read with numbers and slices for keys."""
+        parts: list[int | range] = [
+            range(size)[int(k) if isinstance(k, np.integer) else k] for k, size in zip(keys, self.shape, strict=True)
+        ]
         if not self._dataset:
             raise InputError(f"{self._file} is closed")
         try:
-            found = self._dataset[tuple(map(_forward, parts))]
+            values = self._dataset[tuple(map(_forward, parts))]
         except (OSError, RuntimeError, MemoryError) as error:
-            raise InputError(f"{self._file}: {self._name} cannot be read: {one_line(error)}") from error
+            raise InputError(f"{self._file}: {self.name} cannot be read: {one_line(error)}") from error
         ranges = [part for part in parts if isinstance(part, range)]
-        return found[tuple(slice(None, None, -1 if part.step < 0 else 1) for part in ranges)] if ranges else found
+        return values[tuple(slice(None, None, -1 if part.step < 0 else 1) for part in ranges)] if ranges else values
 
 
 class Arrays(Mapping):
@@ -101,20 +111,37 @@ class Arrays(Mapping):
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
 
 
-def _one_an_axis(key, ndim: int) -> tuple:
-    """The key with its ... and what is left out written as slices."""
+def _key_per_axis(key: Any, ndim: int) -> tuple:
+    """Return the key with its ... and what is left out written as slices."""
     keys = list(key) if isinstance(key, tuple) else [key]
-    dots = [place for place, k in enumerate(keys) if k is Ellipsis]
+    dots = [axis for axis, k in enumerate(keys) if k is Ellipsis]
     missing = ndim - len(keys) + len(dots)
     if missing < 0 or len(dots) > 1 or any(k is None for k in keys):
         raise IndexError(f"{ndim} axes cannot be indexed with {key!r}")
-    place = dots[0] if dots else len(keys)
-    return (*keys[:place], *[slice(None)] * missing, *keys[place + len(dots) :])
+    axis = dots[0] if dots else len(keys)
+    return (*keys[:axis], *[slice(None)] * missing, *keys[axis + len(dots) :])
 
 
 def _forward(part: int | range) -> int | slice:
-    """For h5py, whose slices only go up."""
+    """Return the index for h5py, whose slices only go up."""
     if isinstance(part, int):
         return part
     part = part if part.step > 0 else part[::-1]
     return slice(part.start, part.stop, part.step) if len(part) else slice(0, 0)
+
+
+def xarray_variable(dimensions: Sequence[str], array: LazyArray, long_name: str) -> Any:
+    """Return an xarray.Variable that reads the array where it is used, as xarray's own readers of files do it."""
+    import xarray
+    from xarray.backends import BackendArray
+    from xarray.core import indexing
+
+    class ArrayOfResult(BackendArray):
+        shape, dtype = array.shape, array.dtype
+
+        def __getitem__(self, key: Any) -> Any:
+            basic = indexing.IndexingSupport.BASIC
+            return indexing.explicit_indexing_adapter(key, self.shape, basic, array.__getitem__)
+
+    data = indexing.LazilyIndexedArray(ArrayOfResult())
+    return xarray.Variable(dimensions, data, {"long_name": long_name, "units": array.unit})

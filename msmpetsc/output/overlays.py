@@ -1,4 +1,4 @@
-"""What stands beside the body at a time: obstacles, arrows for the forces, and the parts that are held.
+"""What stands beside the body at a time: obstacles, arrows for the forces, and the parts that are fixed.
 
 Geometry only, in the scene's axes [m]; it comes from the scene and the lattice of a result, nothing is drawn here.
 """
@@ -29,8 +29,8 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Marks:
-    """Of one panel.
+class Overlays:
+    """What stands beside the body in one panel.
 
     grounds : planes drawn as they are
     glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
@@ -43,7 +43,7 @@ class Marks:
 
     @property
     def corners(self) -> np.ndarray:
-        """(n, 3) of all obstacles."""
+        """Corners (n, 3) of all obstacles [m]."""
         return np.concatenate([np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass])
 
 
@@ -57,11 +57,11 @@ class Rest:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(2, 3) corners of the surface's bounding box [m]."""
+        """Corners (2, 3) of the surface's bounding box [m]."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
     def find(self, region: Region) -> np.ndarray:
-        """Which nodes (n,) bool a region means; none if it is painted in a file, which the result does not hold."""
+        """Tell which nodes (n,) a region means; none if it is painted in a file, which the result does not hold."""
         if region.painted is None:
             return inside(region, self.nodes, self.bounds)
         where = np.zeros(len(self.nodes), bool)
@@ -72,16 +72,16 @@ class Rest:
         return where
 
 
-def marks_at(
+def overlays_at(
     scene: SceneFile, time: float, rest: Rest, position: np.ndarray, bodies: np.ndarray, camera: Camera
-) -> Marks:
-    """What stands beside the body at a time [s].
+) -> Overlays:
+    """Return what stands beside the body at a time [s].
 
     position : (n, 3) of the nodes at that time [m]
     bodies   : (b, 3) surface points of all panels [m], which say how much of an obstacle is worth showing
     """
     grounds, glass = _obstacles(scene, time, bodies, camera)
-    return Marks(grounds, glass, _arrows(scene, time, rest, position))
+    return Overlays(grounds, glass, _arrows(scene, time, rest, position))
 
 
 def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
@@ -108,10 +108,10 @@ def _reach(bodies: np.ndarray) -> float:
 
 
 def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, axes: np.ndarray) -> Ground:
-    """The rectangle of a plane that the bodies stand before, with a margin; one side as one of the axes if it can."""
+    """Return the rectangle of a plane that the bodies stand before, with a margin; a side along an axis if it can."""
     across = min(axes, key=lambda axis: abs(axis @ normal))
-    one = unit(across - (across @ normal) * normal)
-    sides = np.array([one, np.cross(normal, one)])
+    first = unit(across - (across @ normal) * normal)
+    sides = np.array([first, np.cross(normal, first)])
     reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
     (left, low), (right, high) = reached.min(axis=0) - margin, reached.max(axis=0) + margin
     corners = np.array([(left, low), (right, low), (right, high), (left, high)]) @ sides
@@ -119,13 +119,13 @@ def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, axes: np.n
 
 
 def _plate(patch: Ground, thickness: float) -> np.ndarray:
-    """(8, 3) corners of a plate on the side of the plane where no body is."""
+    """Return the corners (8, 3) of a plate on the side of the plane where no body is."""
     front = patch.corners[[0, 1, 3, 2]]
     return np.concatenate([front, front - thickness * patch.normal])
 
 
 def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
-    """(8, 3) corners of a box (2, 3), cut along the axes where it is much longer than the bodies; none if far away."""
+    """Return the corners (8, 3) of a box (2, 3), cut where it is much longer than the bodies; none if far away."""
     low, high = bodies.min(axis=0), bodies.max(axis=0)
     extent = high - low
     margin = (CUT - 1) / 2 * extent
@@ -139,16 +139,16 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
 
 def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
     length = ARROW * np.ptp(rest.bounds, axis=0).max()
-    found = []
+    arrows = []
     for force in scene.force:
         if within(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
             tail = position[where].mean(axis=0)
-            found.append(np.array([tail, tail + length * unit(force.total)]))
-    return found
+            arrows.append(np.array([tail, tail + length * unit(force.total)]))
+    return arrows
 
 
-def held(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
-    """Which nodes (n,) bool are pinned or led at a time."""
+def fixed_nodes(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
+    """Tell which nodes (n,) are pinned or anchored at a time [s]."""
     regions = [pin.region for pin in scene.pin]
     regions += [anchor.region for anchor in scene.anchor if within(time, 0.0, anchor.stop)]
     return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, regions)], axis=0)

@@ -3,21 +3,21 @@
 import sys
 import time
 from contextlib import ExitStack
-from typing import TextIO
+from typing import Any, TextIO
 
 from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
+from tqdm.contrib.logging import tqdm_logging_redirect
 
 from msmpetsc.comm import log
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 
 LINE_EVERY = 10.0  # [s] at the least between two lines of a log
 
 
 class Progress:
-    """Tell of each frame of a run of `total` steps; give `enabled` on rank 0 alone.
+    """The progress of a run of `total` steps, shown frame by frame; enabled on rank 0 alone.
 
-    Used as: update(frame) for every frame, frame 0 included; close() at the end, whatever the end.
+    Call update(frame) for every frame, frame 0 included, and close() at the end, whatever the end.
     """
 
     def __init__(self, total: int, enabled: bool = True, stream: TextIO | None = None):
@@ -25,16 +25,16 @@ class Progress:
         self._enabled = enabled
         self._stream = stream or sys.stderr
         self._bar: tqdm | None = None
-        self._redirected = ExitStack()  # log lines, above the bar
+        self._shown = ExitStack()  # the bar, with log lines above it
         if enabled and self._stream.isatty():
-            self._bar = tqdm(total=total, unit="frame", file=self._stream, dynamic_ncols=True, smoothing=0.1)
-            self._redirected.enter_context(logging_redirect_tqdm([log]))
+            style: dict[str, Any] = dict(unit="frame", file=self._stream, dynamic_ncols=True, smoothing=0.1)
+            self._bar = self._shown.enter_context(tqdm_logging_redirect(total=total, loggers=[log], **style))
         self._begun: tuple[float, int] | None = None  # when the first frame came [s], and its index
-        self._told = 0.0  # when the last line was printed [s]
-        self._untold: Frame | None = None  # the newest frame, if it had no line
+        self._printed = 0.0  # when the last line was printed [s]
+        self._unprinted: Frame | None = None  # the newest frame, if it had no line
 
     def update(self, frame: Frame) -> None:
-        """`frame` is done."""
+        """Show that `frame` is done."""
         if not self._enabled:
             return
         if self._bar is not None:
@@ -42,30 +42,25 @@ class Progress:
             self._bar.update(frame.index - self._bar.n)
             return
         now = time.monotonic()
-        first = self._begun is None
-        if first:
-            self._begun = now, frame.index
-        if first or frame.index == self._total or now - self._told >= LINE_EVERY:
-            self._tell(frame, now)
+        is_first, self._begun = self._begun is None, self._begun or (now, frame.index)
+        if is_first or frame.index == self._total or now - self._printed >= LINE_EVERY:
+            self._print(frame, now, *self._begun)
         else:
-            self._untold = frame
+            self._unprinted = frame
 
     def close(self) -> None:
-        """Leave the bar as it is, or tell of the last frame if that had no line."""
-        self._redirected.close()
-        if self._bar is not None:
-            self._bar.close()
-        elif self._untold is not None:
-            self._tell(self._untold, time.monotonic())
+        """Leave the bar as it is, or print the last frame if that had no line."""
+        self._shown.close()
+        if self._unprinted is not None and self._begun is not None:
+            self._print(self._unprinted, time.monotonic(), *self._begun)
 
-    def _tell(self, frame: Frame, now: float) -> None:
+    def _print(self, frame: Frame, now: float, begun: float, first: int) -> None:
         parts = [f"frame {frame.index}/{self._total}", f"t = {frame.time:.3f} s"]
-        begun, first = self._begun
         if frame.index > first and now > begun:
             rate = (frame.index - first) / (now - begun)
             parts += [f"{rate:.3g} frames/s", f"{duration((self._total - frame.index) / rate)} left", _solver(frame)]
         print("  ".join(parts), file=self._stream, flush=True)
-        self._told, self._untold = now, None
+        self._printed, self._unprinted = now, None
 
 
 def _solver(frame: Frame) -> str:
@@ -73,7 +68,7 @@ def _solver(frame: Frame) -> str:
 
 
 def duration(seconds: float) -> str:
-    """31 s, 12 min, 3.4 h."""
+    """Return a time for people: 31 s, 12 min, 3.4 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,33 +1,44 @@
-"""A result file whose run is to go on: what it says of itself, its last checkpoint, whether a lattice is its own."""
+"""Restart: what a result file says of the run that wrote it, its last checkpoint, whether a lattice is its own."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.comm import together
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.fields import FRAME_FIELDS
+from msmpetsc.output.compare import rows_agree
 from msmpetsc.output.reader import (
     Result,
-    checked_checkpoint,
+    as_python,
     checked_dataset,
-    damage_told,
-    finished,
+    newest_slot,
+    object_at,
     open_result,
+    plain_damage,
 )
-from msmpetsc.output.writer import SERIES, pieces
+from msmpetsc.output.transfer import scatter_rows
 
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """texts: its attributes that are text; true_error: every so many steps it was measured, 0 for never; step: of its
-    last checkpoint, 0 if it has none; finished, planned: frames that are there, and have their place; exact: whether a
-    checkpoint has all that a run goes on from."""
+    """The run that wrote a result file, as far as a run that goes on must know it.
+
+    texts      : the file's attributes that are text
+    true_error : every so many steps the true error was measured, 0 for never
+    step       : of the last checkpoint, 0 if it has none
+    finished   : frames that it has
+    planned    : frames that it has room for
+    exact      : whether a checkpoint has all that a run goes on from
+    """
 
     path: Path
     texts: dict[str, str]
@@ -38,127 +49,141 @@ class Earlier:
     exact: bool
 
     @classmethod
-    def look(cls, path: Path) -> "Earlier":
-        """For one rank. Raises InputError for what is no result, or a damaged one."""
+    def read(cls, path: Path) -> "Earlier":
+        """Read it on one rank. Raises InputError for what is no result, or a damaged one."""
         with Result(path) as result:  # which checks it
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
-        with open_result(path) as file:
-            names = checked_checkpoint(file)
-            refuse_other_series(path, file)
-            count, planned = finished(file), len(file["frames/time"])
-            step = max(0, int(np.max(file["checkpoint/step"]))) if names is not None and count else 0
+            names = _checked_numbers(path, result.file)
+            _refuse_foreign_series(result)
+            count, planned = len(result.frames.time), result.frames.time.planned[0]
+            step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
         return cls(path, texts, true_error, step, count, planned, bool(names))
 
 
-def refuse_other_series(path: Path, file: h5py.File) -> None:
+def _refuse_foreign_series(result: Result) -> None:
     """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
-    with damage_told(path):
-        for name, (dtype, shape, _) in SERIES.items():
-            if name in list(file["frames"]):
-                dataset = checked_dataset(path, file, f"frames/{name}")
-                if dataset.dtype != dtype or dataset.shape[1:] != shape:
-                    raise InputError(f"{path} is damaged: frames/{name} has shape {dataset.shape}")
+    for name, array in result.frames.items():
+        if name in FRAME_FIELDS and name not in ("position", "surface"):
+            field = FRAME_FIELDS[name]
+            if array.dtype != field.dtype or array.shape[1:] != field.shape[1:]:
+                raise InputError(f"{result.path} is damaged: frames/{name} has type {array.dtype}")
 
 
-def read_saved(comm, path: Path, owned: int) -> Checkpoint | None:
-    """The last checkpoint, this rank's rows of it; None if there is none (collective).
+def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:
+    """Return the names of the checkpoint's numbers, [] if it has none; None if the file has no checkpoint.
+
+    Raises InputError for a checkpoint that no run wrote so.
+    """
+    with plain_damage(path):
+        group = object_at(path, file, "checkpoint")
+        if group is None:
+            return None
+        if not isinstance(group, h5py.Group):
+            raise InputError(f"{path} is damaged: its checkpoint is no group")
+        names: list[str] = []
+        for name in group:
+            if not name.isprintable():  # lines that tell of it would not be lines
+                raise InputError(f"{path} is damaged: its checkpoint has {printable(name, 40)!r}")
+            dataset = checked_dataset(path, file, f"checkpoint/{name}")
+            if name == "numbers":
+                names, shape = str(as_python(dataset.attrs.get("names", ""))).split(), (2, dataset.shape[-1])
+            else:
+                shape = (2,) if name == "step" else (2, len(file["lattice/nodes"]), *dataset.shape[2:])
+            kind = "i8" if name == "step" else "f8"
+            if dataset.shape != shape or dataset.dtype != kind or (name == "numbers" and len(names) != shape[1]):
+                raise InputError(f"{path} is damaged: checkpoint/{name} has shape {dataset.shape}")
+        if not {"step", "q", "q_previous"} <= set(group):
+            raise InputError(f"{path} is damaged: its checkpoint is not whole")
+        return names
+
+
+def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
+    """Return the last checkpoint, this rank's rows of it; None if there is none (collective).
 
     owned : nodes of this rank; the ranks' follow each other
     """
-    with Source(comm, path) as source:
-        steps = source.value("checkpoint/step")
-        if steps is None or max(steps) < 0:
+    with RootFile(comm, path) as file:
+        steps = file.values("checkpoint/step")
+        slot = None if steps is None else newest_slot(steps)
+        if steps is None or slot is None:
             return None
-        slot = int(np.argmax(steps))
-        rows = {name: source.rows(f"checkpoint/{name}", owned, slot) for name in source.row_names()}
-        names, numbers = source.names(), source.value("checkpoint/numbers")
-        numbers = numbers[slot].tolist() if names else []
-        return Checkpoint(int(steps[slot]), rows, dict(zip(names, numbers, strict=True)))
+        rows = {name: file.rows(f"checkpoint/{name}", owned, slot) for name in file.checkpoint_rows()}
+        names, numbers = file.checkpoint_numbers(), file.values("checkpoint/numbers")
+        values = numbers[slot].tolist() if names and numbers is not None else []
+        return Checkpoint(int(steps[slot]), rows, dict(zip(names, values, strict=True)))
 
 
-def refuse_other_lattice(comm, path: Path, found: dict[str, np.ndarray]) -> None:
-    """Raises InputError where ``found``, the ranks' rows by dataset, is not what the file has (collective)."""
-    with Source(comm, path) as source:
-        for name, rows in found.items():
-            there, here = source.value(name, "shape"), comm.allreduce(len(rows))
-            if there is None:
+def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, np.ndarray]) -> None:
+    """Raise InputError where a lattice is not the one of the file (collective).
+
+    lattice : this rank's rows by dataset, "lattice/nodes"
+    """
+    with RootFile(comm, path) as file:
+        for name, rows in lattice.items():
+            shape, count = file.shape(name), comm.allreduce(len(rows))
+            if shape is None:
                 continue
-            same = there[0] == here
+            same = shape[0] == count
             if same:
-                rows, stored = np.asarray(rows, float), source.rows(name, len(rows)).astype(float)
+                rows, stored = np.asarray(rows, float), file.rows(name, len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
-                same = all(comm.allgather(bool(np.abs(rows - stored).max(initial=0) <= SAME * greatest)))
+                same = all(comm.allgather(bool(rows_agree(rows, stored, SAME * greatest).all())))
             if not same:
                 raise InputError(f"{path}: the mesh has changed: {name} is not what this run makes of it")
 
 
-class Source:
+class RootFile:
     """A result file, open on rank 0, from which the ranks take their rows (all methods are collective)."""
 
-    def __init__(self, comm, path: Path):
-        self._comm, self._path, self._file = comm, path, None
+    def __init__(self, comm: MPI.Comm, path: Path):
+        """Open the file. Raises InputError where it is no result."""
+        self._comm, self._path = comm, path
+        self._file: h5py.File | None = None
         with together(comm):
             if comm.rank == 0:
                 self._file = open_result(path)
 
-    def __enter__(self) -> "Source":
+    def __enter__(self) -> "RootFile":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._file is not None:
             self._file.close()
 
-    def value(self, name: str, part: str | None = None) -> np.ndarray | tuple | None:
-        """A small dataset, or its "shape"; None if it is not there."""
-        return self._asked(lambda file: None if name not in file else file[name].shape if part else file[name][...])
+    def values(self, name: str) -> np.ndarray | None:
+        """Return all numbers of a small dataset on every rank; None if the file does not have it."""
+        return self._ask(lambda file: file[name][...] if name in file else None)
 
-    def names(self) -> list[str]:
-        """Of the checkpoint's numbers."""
-        return self._asked(checked_checkpoint) or []
+    def shape(self, name: str) -> tuple[int, ...] | None:
+        """Return the shape of a dataset; None if the file does not have it."""
+        return self._ask(lambda file: file[name].shape if name in file else None)
 
-    def row_names(self) -> list[str]:
-        """Of what the checkpoint has of each node."""
-        return self._asked(lambda file: [name for name in file["checkpoint"] if name not in ("step", "numbers")])
+    def checkpoint_numbers(self) -> list[str]:
+        """Return the names of the checkpoint's numbers."""
+        return self._ask(lambda file: _checked_numbers(self._path, file)) or []
+
+    def checkpoint_rows(self) -> list[str]:
+        """Return the names of what the checkpoint has of each node."""
+        return self._ask(lambda file: [name for name in file["checkpoint"] if name not in ("step", "numbers")])
 
     def rows(self, name: str, count: int, index: int | None = None) -> np.ndarray:
-        """This rank's ``count`` rows of a dataset, or of its ``index``."""
-        counts = self._comm.allgather(count)
-        dtype, shape = self._asked(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
-        own, failure = np.empty((count, *shape), dtype), None
-        if self._comm.rank > 0:
-            for part in pieces(own, count):
-                self._comm.Recv(own[part], source=0)
-        else:
-            failure = self._send(self._file[name], counts, index, own)
+        """Return this rank's `count` rows of a dataset, or of its row `index`: (count, ...)."""
+        counts: Sequence[int] = self._comm.allgather(count)
+        dtype, shape = self._ask(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
+        own = np.empty((count, *shape), dtype)
+        file: Any = self._file
+        failure = scatter_rows(
+            self._comm, own, counts, lambda part: file[name][part if index is None else (index, part)]
+        )
         with together(self._comm):
             if failure is not None:
                 raise InputError(f"{self._path} cannot be read: {failure}")
         return own
 
-    def _send(
-        self, dataset: h5py.Dataset, counts: Sequence[int], index: int | None, own: np.ndarray
-    ) -> Exception | None:
-        """Rank 0's part of ``rows``; what could not be read."""
-        start, failure = 0, None
-        for rank, count in enumerate(counts):
-            for part in pieces(own, count):
-                place = slice(start + part.start, start + part.stop)
-                piece = np.zeros((part.stop - part.start, *own.shape[1:]), own.dtype)
-                try:
-                    piece[...] = dataset[place if index is None else (index, place)]
-                except (OSError, ValueError) as error:
-                    failure = error  # the others still wait
-                if rank > 0:
-                    self._comm.Send(piece, dest=rank)
-                else:
-                    own[part] = piece
-            start += count
-        return failure
-
-    def _asked(self, question):
-        """What rank 0 finds in the file."""
+    def _ask(self, question: Callable[[h5py.File], Any]) -> Any:
+        """Return on every rank what rank 0 reads from the file."""
         answer = None
         with together(self._comm):
             if self._file is not None:

@@ -1,77 +1,56 @@
 """The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
 Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank writes its own
-where it can reach the file (output.direct). The file is the same.
+where it can reach the file (output.transfer). The file is the same.
 
-All metadata is on disk before the first frame and does not change while frames are written: every dataset of
-``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks allocated, nothing buffered.
-A frame is its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is
-finite (`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
+All metadata is on disk before the first frame and does not change while frames are written (output.layout). A frame is
+its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
+(`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
 
 ``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``, and what else the run goes on from,
 ``numbers (2,k)`` with their names as an attribute and rows of nodes (2,n,...). The older slot is written, with its
 step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
 
-A run that goes on (output.continued) writes into the file as it lies there, if all that it needs is laid out in it: so no
-metadata change then either. Else it writes a new one, takes the frames over, and renames it when it holds them.
+A run that goes on writes into the file as it lies there, if all that it needs is laid out in it: so no metadata change
+then either. Else it writes a new one, takes the frames over, and renames it when it holds them (`Begin`).
 """
 
-import fcntl
-import math
 import os
-import re
 import shlex
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from errno import EACCES, EAGAIN
+from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from mpi4py import MPI
 
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.frame import Frame
-from msmpetsc.output.direct import chunk_places, reach, write_rows
-from msmpetsc.output.reader import FORMAT, FORMAT_VERSION, finished, open_result, read_checkpoint  # noqa: F401
+from msmpetsc.model.fields import FRAME_FIELDS, Frame, unit_of
+from msmpetsc.output.disk import Lock, bytes_taken, copy_sparse, plain_errors, refuse_small_disk
+from msmpetsc.output.layout import Layout, open_again, open_new
+from msmpetsc.output.reader import (
+    FORMAT,
+    FORMAT_VERSION,
+    checked_dataset,
+    finished,
+    open_result,
+    plain_damage,
+)
+from msmpetsc.output.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
-PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
-CHUNK_BYTES = 64 * 2**20
-STATIC_UNITS = {
-    "lattice/nodes": "m",
-    "lattice/rest_length": "m",
-    "lattice/stiffness": "N/m",
-    "lattice/mass": "kg",
-    "surface/points": "m",
-}
-CHECKPOINT_UNITS = {
-    "checkpoint/contact_bound": "N/m",
-    "checkpoint/history_v": "m/s",
-    "checkpoint/mode": "1",
-    "checkpoint/lowest_mode": "kg^-1/2",
-    "checkpoint/sides": "1",
-}
-# The numbers of a frame, named as in Frame and in /frames: dtype, shape, unit.
-SERIES = {
-    "time": ("f8", (), "s"),
-    "step_error": ("f8", (), "1"),
-    "iterations": ("i8", (), "1"),
-    "ksp_its": ("i8", (), "1"),
-    "kinetic": ("f8", (), "J"),
-    "elastic": ("f8", (), "J"),
-    "potential": ("f8", (), "J"),
-    "contact": ("f8", (), "J"),
-    "momentum": ("f8", (3,), "kg m/s"),
-    "wall_time": ("f8", (), "s"),
-    "true_error": ("f8", (), "1"),
-    "energy_error": ("f8", (), "1"),
-    "inverted": ("i8", (), "1"),
-    "substeps": ("i8", (), "1"),
-    "fallbacks": ("i8", (), "1"),
-    "energy_gained": ("f8", (), "J"),
-}
+
+class Begin(Enum):
+    """What a result file begins as."""
+
+    NEW = "a new file, of a name that is free"
+    OVERWRITE = "a new file, which may replace another"
+    IN_PLACE = "an earlier file as it lies there, laid out for all frames: only numbers in their places are written"
+    COPY = "a new file with the frames of an earlier one, which it replaces when it has them and a checkpoint"
 
 
 class ResultFile:
@@ -82,22 +61,33 @@ class ResultFile:
     file system has locks, keeps a second run from writing it at the same time.
 
     finished : number of frames that it holds
-    gathers  : rank 0 writes frames for all ranks, even where each can reach the file; to be said before they start
     """
 
-    gathers = False
+    def __init__(
+        self,
+        path: str | Path,
+        comm: MPI.Comm,
+        attributes: dict[str, Any],
+        begin: Begin = Begin.NEW,
+        gathers: bool = False,
+    ):
+        """Open the file.
 
-    def __init__(self, path: str | Path, comm, attributes: dict, overwrite: bool = False):
-        """comm: an mpi4py communicator. attributes: see design.md; format and format_version are added here."""
+        attributes : who makes it and how; format and format_version are added
+        gathers    : rank 0 writes frames for all ranks, even where each can reach the file
+        """
         self.path = Path(path)
+        self._planned = self.finished = 0
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
-        self._comm = comm
-        self._overwrite = overwrite
+        self._comm, self._begin, self._gathers = comm, begin, gathers
         self._file: h5py.File | None = None  # open on rank 0 only
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
         self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
-        self._planned = self.finished = 0
+        self._copied: int | None = None  # most frames to take over, all if None
+        self._layout = Layout()
+        self._nodes: tuple[int, ...] = ()  # of each rank
+        self._points: tuple[int, ...] = ()  # surface points of each rank, if they are stored
         self._failed = False  # to write
         with self._together():
             if comm.rank == 0:
@@ -106,7 +96,7 @@ class ResultFile:
     def __enter__(self) -> "ResultFile":
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
@@ -114,69 +104,90 @@ class ResultFile:
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
     def write(self, name: str, rows: np.ndarray) -> None:
-        """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes"."""
+        """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes".
+
+        A file that begins in place has it; raises InputError where its shape is another.
+        """
         rows = np.asarray(rows)
-        counts, shapes, dtypes = zip(*self._comm.allgather((len(rows), rows.shape[1:], rows.dtype)))
+        counts, shapes, dtypes = zip(*self._comm.allgather((len(rows), rows.shape[1:], rows.dtype)), strict=True)
         if len(set(shapes)) > 1:
             raise ValueError(f"{name}: the ranks' rows differ in shape: {set(shapes)}")
-        dtype = np.result_type(*dtypes)
+        dtype, shape = np.result_type(*dtypes), (sum(counts), *shapes[0])
         with self._together():
-            if self._file is not None:
-                dataset = self._file.create_dataset(name, (sum(counts), *shapes[0]), dtype)
-                dataset.attrs["unit"] = STATIC_UNITS.get(name, "1")
-        self._collect(rows, dtype, counts, name)
+            if self._file is not None and self._begin is Begin.IN_PLACE:
+                stored = checked_dataset(self.path, self._file, name).shape
+                if stored != shape:
+                    raise InputError(f"{self.path} is damaged: {name} has shape {stored}")
+            elif self._file is not None:
+                self._file.create_dataset(name, shape, dtype).attrs["unit"] = unit_of(name)
+        if self._begin is not Begin.IN_PLACE:
+            self._collect(rows, dtype, counts, name)
+
+    def keep(self, frames: int) -> None:
+        """Take no more than so many frames of the earlier file over."""
+        self._copied = frames
 
     def start_frames(
         self,
         count: int,
         nodes: int,
         surface_points: int | None = None,
-        surface_dtype: str = "f4",
+        surface_dtype: str = FRAME_FIELDS["surface"].dtype,
         saved: Checkpoint | None = None,
     ) -> None:
-        """Plan `count` frames, frame 0 included, of this rank's `nodes` and `surface_points` (None: not stored), and
-        checkpoints like this one; of q and q_previous alone if None."""
-        self._nodes, self._points = zip(*self._comm.allgather((nodes, surface_points)))
-        self._surface_dtype = surface_dtype
-        self._rows = {"q": (3,), "q_previous": (3,)}
+        """Plan the frames and checkpoints, and give the file its name.
+
+        count          : of frames, frame 0 included
+        nodes          : of this rank
+        surface_points : of this rank; None: not stored
+        saved          : a checkpoint like those to come; None: of q and q_previous alone
+        """
+        self._nodes, points = zip(*self._comm.allgather((nodes, surface_points)), strict=True)
+        self._points = () if points[0] is None else points
+        rows: dict[str, tuple[int, ...]] = {"q": (3,), "q_previous": (3,)}
         if saved:
-            self._rows |= {name: rows.shape[1:] for name, rows in saved.rows.items()}
-        self._numbers = list(saved.numbers) if saved else []
+            rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
+        stored = sum(self._points) if self._points else None
+        numbers = tuple(saved.numbers) if saved else ()
+        self._layout = Layout(count, sum(self._nodes), stored, surface_dtype, rows, numbers)
         with self._together():
             if self._file is not None:
-                self._start(count)
+                self._lay_out(self._file)
         self.finished, self._planned = self._comm.bcast(self.finished), count
-        self._take_over(saved)
+        if self._begin is Begin.COPY and saved is not None:
+            self.write_checkpoint(saved)
         with self._together():
             if self._file is not None:
-                self._publish()
+                self._publish(self._file)
                 self._same = os.open(self.path, os.O_RDONLY)
-        if self._comm.size > 1 and not self.gathers:
-            self._direct = reach(self._comm, self.path)
+        if self._comm.size > 1 and not self._gathers:
+            self._direct = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
         self._check(frame)
-        here = self.finished
-        self._collect(frame.position, "f8", self._nodes, "frames/position", here)
-        if self._points[0] is not None:
-            self._collect(frame.surface, self._surface_dtype, self._points, "frames/surface", here)
+        index = self.finished
+        self._collect(frame.position, np.dtype("f8"), self._nodes, "frames/position", index)
+        if frame.surface is not None and self._points:
+            dtype = np.dtype(self._layout.surface_dtype)
+            self._collect(frame.surface, dtype, self._points, "frames/surface", index)
         with self._together():
             if self._file is not None:
                 frames = self._file["frames"]
-                for name in SERIES.keys() - {"time"}:
-                    frames[name][here] = getattr(frame, name)
+                for name in FRAME_FIELDS.keys() - {"time", "position", "surface"}:
+                    frames[name][index] = getattr(frame, name)
                 self._file.flush()
-                frames["time"][here] = frame.time  # from here on the frame is there
+                frames["time"][index] = frame.time  # from here on the frame is there
                 self._file.flush()
         self.finished += 1
 
     def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
-        if (saved.rows.keys(), list(saved.numbers)) != (self._rows.keys(), self._numbers):
-            raise ValueError(f"planned were checkpoints of {list(self._rows)} and {self._numbers}")
-        for name, rows in saved.rows.items():
-            self._check_rows(name, rows, self._nodes, self._rows[name])
+        rows, numbers = self._layout.rows, self._layout.numbers
+        if (saved.rows.keys(), tuple(saved.numbers)) != (rows.keys(), numbers):
+            raise ValueError(f"planned were checkpoints of {list(rows)} and {list(numbers)}")
+        for name, values in saved.rows.items():
+            self._check_rows(name, values, self._nodes, rows[name])
         slot = None
         with self._together():
             if self._file is not None:
@@ -184,11 +195,11 @@ class ResultFile:
                 self._file["checkpoint/step"][slot] = -1
                 self._file.flush()
         slot = self._comm.bcast(slot)
-        for name, rows in saved.rows.items():
-            self._collect(rows, "f8", self._nodes, f"checkpoint/{name}", slot)
+        for name, values in saved.rows.items():
+            self._collect(values, np.dtype("f8"), self._nodes, f"checkpoint/{name}", slot)
         with self._together():
             if self._file is not None:
-                if self._numbers:
+                if numbers:
                     self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
                 self._file.flush()
                 self._file["checkpoint/step"][slot] = saved.step
@@ -196,56 +207,77 @@ class ResultFile:
                 self._refuse_removed()
 
     def close(self, trim: bool = True) -> None:
-        """Close, a second call does nothing. Before, trim the frames to the finished ones, but where the run is to go
-        on: as it lies there the file has room for the rest."""
+        """Close the file; a second call does nothing.
+
+        Before, trim the frames to the finished ones, but where the run is to go on: as it lies there the file has room
+        for the rest.
+        """
         with self._together():
             self._finish(trim)
 
     # On rank 0 alone
 
-    def _open(self, attributes: dict) -> None:
-        self._refuse_to_replace()
+    def _open(self, attributes: dict[str, Any]) -> None:
+        if self._begin is not Begin.IN_PLACE:
+            self._refuse_to_replace()
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = Lock(self.path)
-        self._create(attributes)
-
-    def _create(self, attributes: dict) -> None:
+        lock = Lock(self.path)
         try:
-            self._file = open_new(self._part)
-            self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
+            if self._begin is Begin.IN_PLACE:
+                open_result(self.path).close()
+                self._file = open_again(self.path)
+            else:
+                self._file = open_new(self._part)
+                self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
         except Exception:
             self._part.unlink(missing_ok=True)
-            self._lock.free()
+            lock.free()
             raise
+        self._lock = lock
 
     def _refuse_to_replace(self) -> None:
         if self.path.is_dir():
             raise InputError(f"{self.path} is a folder, not a file")
         if self.path.exists() and not self.path.is_file():
             raise InputError(f"{self.path} is a pipe or a device, not a file")
-        if self.path.exists() and not self._overwrite:
+        if self.path.exists() and self._begin is Begin.NEW:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
-    def _layout(self, count: int) -> list[tuple]:
-        return _layout(count, sum(self._nodes), self._points, self._surface_dtype, self._rows, len(self._numbers))
+    def _lay_out(self, file: h5py.File) -> None:
+        if self._begin is Begin.IN_PLACE:
+            if name := self._layout.first_misfit(file):
+                raise InputError(f"{self.path} has no room for {name} as it is now: --force writes the file anew")
+            # what has no room on the disk yet
+            refuse_small_disk(self.path, self.path.stat().st_size - bytes_taken(self.path))
+            self.finished = finished(file)
+            return
+        refuse_small_disk(self.path, self._layout.nbytes - bytes_taken(self.path))
+        self._layout.create(file)
+        if self._begin is Begin.COPY:
+            self._copy_frames(file)
 
-    def _start(self, count: int) -> None:
-        datasets = self._layout(count)
-        planned = sum(math.prod(shape) * np.dtype(dtype).itemsize for _, shape, _, dtype, _ in datasets)
-        refuse_small_disk(self.path, planned - _given_back(self.path))
-        for name in ("frames", "checkpoint"):
-            self._file.create_group(name)
-        for dataset in datasets:
-            _plan_dataset(self._file, *dataset)
-        self._file["frames/time"][...] = np.nan
-        self._file["checkpoint/step"][...] = -1
-        if self._numbers:
-            self._file["checkpoint/numbers"].attrs["names"] = " ".join(self._numbers)
+    def _copy_frames(self, file: h5py.File) -> None:
+        """Take the frames of the earlier file over, as far as it has them and `keep` allows."""
+        with open_result(self.path) as earlier:
+            names = sorted(earlier["frames"].keys() & file["frames"].keys())
+            datasets = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in names}
+            for name, dataset in datasets.items():
+                if dataset.shape[1:] != file["frames"][name].shape[1:]:
+                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {dataset.shape}")
+            count = finished(earlier) if self._copied is None else min(self._copied, finished(earlier))
+            for index in range(count):
+                for name, dataset in datasets.items():
+                    with plain_damage(self.path):
+                        row = dataset[index]
+                    file["frames"][name][index] = row
+        self.finished = count
 
-    def _publish(self) -> None:
-        self._file.flush()
-        self._refuse_to_replace()
-        os.replace(self._part, self.path)
+    def _publish(self, file: h5py.File) -> None:
+        """Give a new file its name."""
+        if self._begin is not Begin.IN_PLACE:
+            file.flush()
+            self._refuse_to_replace()
+            os.replace(self._part, self.path)
 
     def _refuse_removed(self) -> None:
         """Raise InputError where no name leads to the file any more; what it holds gets one again."""
@@ -276,13 +308,14 @@ class ResultFile:
                     for dataset in file["frames"].values():
                         dataset.resize(self.finished, axis=0)
         finally:
-            self._lock.free()
+            if self._lock is not None:
+                self._lock.free()
 
     # What the ranks do together
 
     @contextmanager
     def _together(self) -> Iterator[None]:
-        """What one rank cannot do in the block, all raise after it."""
+        """Raise after the block, on all ranks, what one rank could not do in it."""
         try:
             with together(self._comm), plain_errors(self.path):
                 yield
@@ -290,203 +323,45 @@ class ResultFile:
             self._failed = True
             raise
 
-    def _take_over(self, _: Checkpoint | None) -> None:
-        """Nothing was there before."""
-
     def _check(self, frame: Frame) -> None:
         if self.finished >= self._planned:
             raise ValueError(f"frame {self.finished} was not planned: {self._planned} frames were")
         if not np.isfinite(frame.time):
             raise ValueError(f"frame {self.finished} has time {frame.time}")
         self._check_rows("position", frame.position, self._nodes)
-        if self._points[0] is not None:
+        if self._points:
             self._check_rows("surface", frame.surface, self._points)
 
     def _check_rows(
         self, name: str, rows: np.ndarray | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)
     ) -> None:
-        planned = (counts[self._comm.rank], *shape)
-        if np.shape(rows) != planned:
-            raise ValueError(f"{name} has shape {np.shape(rows)} on rank {self._comm.rank}, planned were {planned}")
+        planned, given = (counts[self._comm.rank], *shape), () if rows is None else np.shape(rows)
+        if given != planned:
+            raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
 
-    def _collect(self, rows: np.ndarray, dtype, counts: Sequence[int], name: str, index: int | None = None) -> None:
+    def _collect(
+        self, rows: np.ndarray, dtype: np.dtype, counts: Sequence[int], name: str, index: int | None = None
+    ) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)
         if self._direct is not None and index is not None:
-            self._write_directly(rows, counts, name, index)
+            self._write_directly(self._direct, rows, counts, name, index)
             return
+        file: Any = self._file  # on rank 0, which alone stores
 
         def store(start: int, piece: np.ndarray) -> None:
             part = slice(start, start + len(piece))
-            self._file[name][part if index is None else (index, part)] = piece
+            file[name][part if index is None else (index, part)] = piece
 
         with self._together():
-            if self._comm.rank > 0:
-                for part in pieces(rows, len(rows)):
-                    self._comm.Send(rows[part], dest=0)
-            else:
-                _receive(self._comm, rows, counts, store)
+            gather_rows(self._comm, rows, counts, store)
 
-    def _write_directly(self, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
-        chunk, places = 0, []
+    def _write_directly(self, descriptor: int, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
+        chunk, offsets = 0, []
         with self._together():
             if self._file is not None:
                 dataset = self._file[name]
-                chunk, places = dataset.chunks[1], chunk_places(dataset, index)
-        chunk, places = self._comm.bcast((chunk, places))
+                chunk, offsets = dataset.chunks[1], chunk_offsets(dataset, index)
+        chunk, offsets = self._comm.bcast((chunk, offsets))
         with self._together():
-            write_rows(self._direct, rows, sum(counts[: self._comm.rank]), chunk, places)
-
-
-def _receive(comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int, np.ndarray], None]) -> None:
-    """Hand store(start, piece) this rank's rows, then the pieces that the other ranks send."""
-    start, failure = 0, None
-    for rank, count in enumerate(counts):
-        for part in pieces(rows, count):
-            piece = rows[part]
-            if rank > 0:
-                piece = np.empty((part.stop - part.start, *rows.shape[1:]), rows.dtype)
-                comm.Recv(piece, source=rank)
-            try:
-                if failure is None and len(piece):
-                    store(start + part.start, piece)
-            except OSError as error:
-                failure = error  # the others still send: hear them out
-        start += count
-    if failure is not None:
-        raise failure
-
-
-def pieces(rows: np.ndarray, count: int) -> Iterator[slice]:
-    """Parts of `count` rows like these, of at most PIECE_BYTES each."""
-    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
-    most = max(1, PIECE_BYTES // row_bytes)
-    return (slice(start, min(start + most, count)) for start in range(0, count, most))
-
-
-def open_new(path: Path) -> h5py.File:
-    """An empty file, of a kind that a kill cannot spoil.
-
-    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
-    cache: nothing waits to be written. No lock: a running result may be looked at.
-    """
-    return h5py.File(path, "w", libver="earliest", rdcc_nbytes=0, locking=False)
-
-
-def open_again(path: Path) -> h5py.File:
-    """A file of that kind, to be written further."""
-    return h5py.File(path, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
-
-
-def _layout(
-    count: int,
-    nodes: int,
-    points: Sequence[int | None],
-    surface_dtype: str,
-    kept: Mapping[str, tuple[int, ...]],
-    kept_numbers: int,
-) -> list[tuple]:
-    """Name, shape, chunks, dtype and unit of each dataset that is written frame by frame, in this order.
-
-    kept, kept_numbers : shapes of a node's part of the checkpoint's rows; how many numbers it has
-    """
-
-    def positions(name: str, times: int, rows: int, dtype: str, shape: tuple[int, ...] = (3,)) -> tuple:
-        most = CHUNK_BYTES // (math.prod(shape) * np.dtype(dtype).itemsize)
-        return name, (times, rows, *shape), (1, min(max(1, rows), most), *shape), dtype, CHECKPOINT_UNITS.get(name, "m")
-
-    numbers = [
-        (f"frames/{name}", (count, *shape), (count, *shape), dtype, unit)
-        for name, (dtype, shape, unit) in SERIES.items()
-    ]
-    surface = [] if points[0] is None else [positions("frames/surface", count, sum(points), surface_dtype)]
-    # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
-    # file before noting its new length; killed in between, it could not be opened.)
-    return [
-        *numbers,
-        positions("frames/position", count, nodes, "f8"),
-        *surface,
-        ("checkpoint/step", (2,), (2,), "i8", "1"),
-        *([("checkpoint/numbers", (2, kept_numbers), (1, kept_numbers), "f8", "1")] if kept_numbers else []),
-        *(positions(f"checkpoint/{name}", 2, nodes, "f8", shape) for name, shape in kept.items()),
-    ]
-
-
-def _plan_dataset(file: h5py.File, name: str, shape: tuple, chunks: tuple, dtype: str, unit: str) -> None:
-    """A dataset that can shrink, with all its place in the file set aside now and nothing written there.
-
-    Through h5py's lower layer: its create_dataset insists on filling datasets that can change their size.
-    """
-    dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    dcpl.set_chunk(chunks)
-    dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    dcpl.set_obj_track_times(False)  # the same run makes the same bytes
-    if name == "frames/time":
-        dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
-    space, kind = h5py.h5s.create_simple(shape, shape), h5py.h5t.py_create(np.dtype(dtype))
-    h5py.h5d.create(file.id, name.encode(), kind, space, dcpl)
-    file[name].attrs["unit"] = unit
-
-
-def _given_back(path: Path) -> int:
-    """[byte] that the file there takes, which is to be replaced."""
-    return path.stat().st_blocks * 512 if path.exists() else 0
-
-
-class Lock:
-    """Held on a file beside ``path`` while that is written; taken from a run that is killed by the system itself."""
-
-    def __init__(self, path: Path):
-        """Raises InputError where another run has it."""
-        self.path = path.with_name(f".{path.name}.lock")
-        while not self._take(path):
-            pass
-
-    def _take(self, path: Path) -> bool:
-        """False where the run that had it took its name away before it was locked: another may lock a new one by now."""
-        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (EACCES, EAGAIN):  # else it is a file system without locks
-                os.close(self._file)
-                raise InputError(f"{path} is being written by another run") from None
-            return True
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
-                return True
-        os.close(self._file)
-        return False
-
-    def free(self) -> None:
-        self.path.unlink(missing_ok=True)  # while it is locked: the name is still this file's
-        os.close(self._file)
-
-
-def refuse_small_disk(path: Path, planned: int) -> None:
-    """Better now than hours later. planned: [byte]."""
-    free = shutil.disk_usage(path.parent).free
-    if planned > free:
-        raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
-
-
-def copy_sparse(source: int, path: Path) -> None:
-    """The file of a descriptor under another name; zeros, which frames to come are, take no room."""
-    with open(path, "xb") as copy:
-        for start in range(0, size := os.fstat(source).st_size, 2**20):
-            if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
-                os.pwrite(copy.fileno(), piece, start)
-        copy.truncate(size)
-
-
-@contextmanager
-def plain_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""
-    try:
-        yield
-    except (OSError, RuntimeError, ValueError) as error:
-        told = re.search(r"error message = '([^']*)'", str(error))
-        if not told and not isinstance(error, OSError):
-            raise
-        raise InputError(f"{path} cannot be written: {told[1] if told else error.strerror or error}") from error
+            write_bytes(descriptor, rows, sum(counts[: self._comm.rank]), chunk, offsets)

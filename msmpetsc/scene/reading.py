@@ -1,6 +1,5 @@
 """Scene file (TOML) and what the command line changes in it -> a checked Scene."""
 
-import re
 import tomllib
 from collections.abc import Collection, Iterable
 from contextlib import suppress
@@ -14,11 +13,9 @@ from pydantic import ValidationError
 from msmpetsc.errors import InputError
 from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import Scene, SceneFile
+from msmpetsc.scene.toml import DEEPEST, toml_of
 
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
-DEEPEST = 50  # parts of a key: tomllib takes time by their square
-KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
-DEEP_KEY = re.compile(rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE)
 
 
 def load_scene(
@@ -107,16 +104,6 @@ def _read(path: Path, kind: str) -> str:
         raise InputError(f"{path}: is not UTF-8 text (byte {error.start})") from None
     except ValueError:
         raise InputError(f"{as_given(str(path))}: no path has a null character") from None
-
-
-def toml_of(text: str) -> dict[str, Any]:
-    """Return the data of a TOML text.
-
-    Raises ValueError for what is not TOML, RecursionError for what is nested too deeply.
-    """
-    if DEEP_KEY.search(text):
-        raise RecursionError
-    return tomllib.loads(text)
 
 
 def _parse(path: Path, text: str) -> dict[str, Any]:

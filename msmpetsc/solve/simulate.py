@@ -15,7 +15,7 @@ from msmpetsc.model.build import Model, to_device
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes

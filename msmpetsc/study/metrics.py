@@ -7,7 +7,7 @@ from statistics import median
 
 import numpy as np
 
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.output.reader import Result
 from msmpetsc.study.shape import shape_error
 from msmpetsc.study.table import Row
 
@@ -38,10 +38,10 @@ def trace(path: Path) -> dict | None:
 
 def of_frames(result: Path, time_step: float) -> Row:
     """Figures of the result file: times and iterations are means a step, the first frame left out."""
-    with open_result(result) as file:
-        count, frames = finished(file), file["frames"]
-        series = {name: frames[name][:count] for name in frames if frames[name].ndim == 1}
-        shape = {"shape_error": shape_error(file, count - 1)} if count else {}
+    with Result(result) as run:
+        count = len(run.frames.time)
+        series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
+        shape = {"shape_error": shape_error(run, count - 1)} if count else {}
     if count < 2:
         return {"frames": count, "steps": 0} | shape
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames

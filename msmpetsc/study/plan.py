@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.case import Case
 from msmpetsc.study.measure import Bench
@@ -215,8 +215,8 @@ class Planner:
     def deforms(self) -> bool:
         """Whether there is elastic energy to speak of in the frames tried: in free flight every method is right."""
         for path in self.bench.references():
-            with open_result(path) as file:
-                elastic, kinetic = (file["frames"][name][: finished(file)] for name in ("elastic", "kinetic"))
+            with Result(path) as run:
+                elastic, kinetic = run.frames.elastic[:], run.frames.kinetic[:]
             return bool(elastic.max() > QUIET * kinetic.max())
         return True
 

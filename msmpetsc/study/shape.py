@@ -2,17 +2,18 @@
 
 import warnings
 
-import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from msmpetsc.output.reader import Result
 
-def shape_error(file: h5py.File, frame: int) -> float | None:
+
+def shape_error(run: Result, frame: int) -> float | None:
     """Of a frame of a result file, see ``distance_of_shapes``; None where a position is not finite."""
-    position = file["frames/position"][frame]
+    position = run.frames.position[frame]
     if not np.isfinite(position).all():
         return None
-    return distance_of_shapes(position, file["lattice/nodes"][:], file["lattice/mass"][:])
+    return distance_of_shapes(position, run["lattice/nodes"][:], run["lattice/mass"][:])
 
 
 def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from msmpetsc.errors import InputError
+from msmpetsc.model.fields import FRAME_FIELDS
 
 Row = dict[str, Any]
 
@@ -22,6 +23,12 @@ class Column(NamedTuple):
     kind: type
     unit: str
     about: str
+
+
+def _of_frames(name: str, more: str = "") -> Column:
+    """Return the column of a number that every frame has, with its unit and meaning."""
+    field = FRAME_FIELDS[name]
+    return Column(float, field.unit, field.long_name + more)
 
 
 COLUMNS = {
@@ -63,10 +70,10 @@ COLUMNS = {
     "iterations": Column(float, "1", "outer iterations, mean of a step"),
     "most_iterations": Column(float, "1", "outer iterations, the most of a step"),
     "ksp_its": Column(float, "1", "KSP iterations, mean of a step"),
-    "substeps": Column(float, "1", "shorter steps taken in place of whole ones"),
-    "fallbacks": Column(float, "1", "steps solved by the robust method"),
-    "inverted": Column(float, "1", "cells turned inside out in the last frame"),
-    "energy_gained": Column(float, "J", "energy that came from nowhere"),
+    "substeps": _of_frames("substeps"),
+    "fallbacks": _of_frames("fallbacks"),
+    "inverted": _of_frames("inverted", " in the last frame"),
+    "energy_gained": _of_frames("energy_gained"),
     "energy_left": Column(float, "1", "total energy at the end over that at the start, where no load acts"),
     "shape_error": Column(float, "1", "distance of the last frame from the rest shape, moved as a rigid body"),
     "explicit_limit": Column(float, "s", "longest stable explicit step of the lattice at rest"),

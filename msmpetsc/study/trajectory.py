@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import common_times
-from msmpetsc.output.writer import finished, open_result
+from msmpetsc.output.compare import common_times, refuse_different_lattices
+from msmpetsc.output.reader import Result
 
 
 def trajectory_error(result: Path, reference: Path) -> float:
@@ -21,16 +21,15 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
     Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
     """
-    with open_result(result) as run, open_result(reference) as true:
+    with Result(result) as run, Result(reference) as true:
+        refuse_different_lattices(run, true)
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
-        if run["lattice/nodes"].shape != rest.shape:
-            raise InputError(f"{result} and {reference} are runs of different lattices")
-        pairs = common_times(*(file["frames/time"][: finished(file)] for file in (run, true)))
+        pairs = common_times(run.frames.time[:], true.frames.time[:])
         if len(pairs) < 2:
             raise InputError(f"{result} and {reference} have {len(pairs)} times in common, 2 are needed")
         off = moved = 0.0
-        for here, there in pairs:
-            x, x_ref = run["frames/position"][here], true["frames/position"][there]
+        for frame, true_frame in pairs:
+            x, x_ref = run.frames.position[frame], true.frames.position[true_frame]
             off += mass @ ((x - x_ref) ** 2).sum(axis=1)
             moved += mass @ ((x_ref - rest) ** 2).sum(axis=1)
     if moved == 0:

@@ -29,7 +29,7 @@ from pretend_gpu import pretended
 import msmpetsc
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device

@@ -13,7 +13,7 @@ import trimesh
 from conftest import ENVIRONMENT, run
 
 from msmpetsc.cli.main import split_petsc_options
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 SCENE = """
 [mesh]

@@ -14,7 +14,7 @@ from block_scene import block_scene
 from conftest import ENVIRONMENT
 
 from msmpetsc.cli.main import main
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 EVERY, STEPS = 3, 40
 STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}

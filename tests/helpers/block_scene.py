@@ -8,7 +8,7 @@ import trimesh
 from mpi4py import MPI
 
 from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.output.writer import ResultFile
 
 H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]

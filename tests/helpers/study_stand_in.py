@@ -17,8 +17,8 @@ from time import sleep
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.frame import Frame
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.model.fields import Frame
+from msmpetsc.output.writer import Begin, ResultFile
 
 NODES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 MASS = np.arange(1.0, 9.0)
@@ -55,7 +55,7 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
     """Frames off the exact motion by the time step."""
     step, own = table["step"], slice(None) if comm.rank == 0 else slice(0)
     count_of_frames = round(table["duration"] / step / every) + 1
-    with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, overwrite=True) as file:
+    with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, Begin.OVERWRITE) as file:
         file.write("lattice/nodes", NODES[own])
         file.write("lattice/mass", MASS[own])
         file.start_frames(count_of_frames, len(NODES[own]))

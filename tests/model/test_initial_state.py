@@ -10,7 +10,7 @@ from conftest import Run
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 
 T = 1 / 128

@@ -1,4 +1,4 @@
-"""msmpetsc compare: its errors are those of the formulas it states, and it names the first frame and node that differ."""
+"""msmpetsc compare: errors are those of the formulas it states; it names the first frame and node that differ."""
 
 import json
 import re
@@ -73,7 +73,11 @@ def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path,
         ("elastic", 6.0 + 8e-4, 1e-4),
         ("potential", -1.8, 0.1),
         ("momentum", np.array([1, 0.03, 3]), 0.03 / np.sqrt(2 * 12 * 0.25 * 4)),  # m = 12 * 0.25 kg, K = 4 J
-        ("surface", POINTS + [0.03, 0.004, 0], 0.004 / 0.04),  # moved by 0.01 m a frame; frame 4 is the farthest
+        (
+            "surface",
+            POINTS + np.array([0.03, 0.004, 0]),
+            0.004 / 0.04,
+        ),  # moved by 0.01 m a frame; frame 4 is the farthest
         ("iterations", 4, 1 / 4),
     ],
 )
@@ -143,7 +147,10 @@ OTHER_SPRINGS[4] = [0, 11]
     [
         (dict(nodes=np.vstack([NODES, [[9, 9, 9]]]), mass=np.ones(13)), "12 and 13 nodes"),
         (dict(nodes=2 * NODES), "cells of 0.5 m and 1 m"),
-        (dict(nodes=NODES + [1e-3, 0, 0]), r"node 0 rests at \(0, 0, 0\) m in one, at \(0.001, 0, 0\) m in the other"),
+        (
+            dict(nodes=NODES + np.array([1e-3, 0, 0])),
+            r"node 0 rests at \(0, 0, 0\) m in one, at \(0.001, 0, 0\) m in the other",
+        ),
         (dict(springs=OTHER_SPRINGS), "their springs join other nodes"),
         (dict(springs=OTHER_SPRINGS[:-1], rest_length=np.ones(19), stiffness=np.ones(19)), "20 and 19 springs"),
         (dict(cells=np.full((2, 8), 99)), "first cell has corner 99 of 12 nodes"),

@@ -1,4 +1,4 @@
-"""A disk that is full, or may not be written: one line, exit status 2, and what was written goes on when there is room."""
+"""A disk that is full, or may not be written: one line, exit status 2, and the run goes on when there is room."""
 
 import os
 import resource
@@ -11,7 +11,7 @@ import pytest
 from test_signals import assert_same, hanging
 
 from msmpetsc.cli.main import main
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 from msmpetsc.solve.simulate import Simulation
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room

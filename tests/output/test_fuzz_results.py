@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 import msmpetsc
 from msmpetsc.cli import compare
 from msmpetsc.errors import InputError
-from msmpetsc.output.reader import open_result, read_checkpoint, refuse_deadly
+from msmpetsc.output.reader import refuse_deadly
+from msmpetsc.output.restart import Earlier
 
 SECRET = 7.25
 
@@ -29,16 +30,11 @@ def read_all(path: Path) -> None:
         for arrays in (run.lattice, run.surface, run.frames):
             for name in arrays:
                 arrays[name][:]
-        run.embedding, run.checkpoint
+        _ = run.embedding, run.checkpoint
 
 
 def compared(one: Path, other: Path) -> None:
     compare.run(argparse.Namespace(one=one, other=other, rtol=1e-6, fields=None, shared=False))
-
-
-def checkpoint(path: Path) -> None:
-    with open_result(path) as file:
-        read_checkpoint(file)
 
 
 NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]
@@ -80,7 +76,7 @@ def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
             file.create_dataset(
                 name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None
             )
-    for call in (lambda: read_all(path), lambda: compared(whole, path), lambda: checkpoint(path)):
+    for call in (lambda: read_all(path), lambda: compared(whole, path), lambda: Earlier.read(path)):
         refusal(call)
 
 
@@ -129,7 +125,11 @@ def test_no_other_file_is_followed(whole, tmp_path, name, how):
     with h5py.File(tmp_path / "secret.h5", "w") as file:
         file["rows"] = np.full(shape, SECRET)
     (tmp_path / "secret.bin").write_bytes(np.full(shape, SECRET).tobytes())
-    for call in (msmpetsc.open, lambda path: compared(whole, path), *([checkpoint] if name == "checkpoint/q" else [])):
+    for call in (
+        msmpetsc.open,
+        lambda path: compared(whole, path),
+        *([Earlier.read] if name == "checkpoint/q" else []),
+    ):
         said = refusal(lambda call=call: call(path))
         assert "not followed" in said or "not opened" in said
 
@@ -161,7 +161,7 @@ def test_where_hdf5_itself_fails_a_child_fails(whole, monkeypatch, ending):
 
     code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]
     monkeypatch.setattr(reader, "PATIENCE", 1)
-    monkeypatch.setattr(reader, "_look_at_all", lambda path: exec(code, {"os": __import__("os")}))
+    monkeypatch.setattr(reader, "_read_tables", lambda path: exec(code, {"os": __import__("os")}))
     with pytest.raises(InputError, match=f"good.h5 is damaged: the HDF5 library {ending} on it"):
         refuse_deadly(whole)
 

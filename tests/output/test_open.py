@@ -1,4 +1,4 @@
-"""msmpetsc.open: what is in the file comes out, of running and of old files too; no bad file does more than one line."""
+"""msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in one line."""
 
 import json
 import subprocess
@@ -43,7 +43,7 @@ def test_what_was_written_is_read(whole: Path):
         assert run.checkpoint.step == FRAMES - 1
         assert np.array_equal(run.checkpoint.q_previous, position(FRAMES - 1) - 1)
         assert "5 frames of 12 nodes" in repr(run) and "elastic" in dir(run.frames)
-    with pytest.raises(InputError, match="x.h5 is closed"):
+    with pytest.raises(InputError, match=r"x\.h5 is closed"):
         run.frames.kinetic[0]
 
 
@@ -99,6 +99,29 @@ def test_nothing_heavy_is_imported(whole: Path):
     assert "h5py" in loaded and loaded.isdisjoint({"petsc4py", "mpi4py", "numba", "pyvista", "matplotlib", "trimesh"})
 
 
+def test_reading_needs_numpy_and_h5py_alone(whole: Path):
+    """Scipy is needed by the embedding alone, xarray by to_xarray."""
+    code = (
+        "import sys\n"
+        "for name in 'petsc4py mpi4py numba pydantic scipy xarray tqdm pyvista matplotlib tomli_w'.split():\n"
+        "    sys.modules[name] = None\n"
+        "import msmpetsc\n"
+        "from msmpetsc.output.compare import compare\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    run.frames.position[-1], run.lattice.nodes[:], run.surface.points[:]\n"
+        "    run.scene, run.checkpoint, repr(run)\n"
+        "    assert compare(run, run).left_out == []"
+    )
+    done = subprocess.run([sys.executable, "-c", code, whole], env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_itself_is_quick_to_import():
+    code = "import json, sys, msmpetsc\nprint(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout)).isdisjoint({"numpy", "h5py", "petsc4py", "mpi4py", "numba"})
+
+
 def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
     with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
         file.write("lattice/nodes", NODES)
@@ -151,7 +174,7 @@ def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
         assert "contact" not in run.frames and "points" not in run.surface
         assert run.embedding is None and run.checkpoint is None
         with pytest.raises(AttributeError, match="no frames/contact in this file, but time, position"):
-            run.frames.contact
+            _ = run.frames.contact
 
 
 def test_what_a_newer_version_adds_is_read_too(copy: Path):
@@ -233,7 +256,9 @@ BAD = {
     "10^12 times": (replaced("frames/time", **HUGE), "claims 1000000000000 numbers"),
     "10^12 energies": (replaced("frames/kinetic", **HUGE), "frames/kinetic claims"),
     "10^12 packed": (replaced("frames/kinetic", **HUGE, compression="gzip"), "frames/kinetic claims"),
-    "10^12 nodes": (replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))), "claims 1000000000000 x 3"),
+    "10^12 nodes": (
+        replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))), "claims 1000000000000 x 3"
+    ),
     "text for positions": (replaced("frames/position", ["a", "b"]), "frames/position has type"),
     "whole numbers for nodes": (replaced("lattice/nodes", np.ones((12, 3), int)), "lattice/nodes has type int64"),
     "one number for all": (replaced("frames/time", 1.0), "frames/time has type float64 and shape ()"),

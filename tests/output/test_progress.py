@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from msmpetsc.comm import log
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.output import progress
 from msmpetsc.output.progress import Progress
 from msmpetsc.study.progress import StudyProgress

@@ -16,10 +16,11 @@ from scipy.sparse import csr_array
 
 from msmpetsc.cli import render as command
 from msmpetsc.errors import InputError
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.output import overlays, render
-from msmpetsc.output.camera import YAW, place_camera
-from msmpetsc.output.writer import ResultFile, open_result
+from msmpetsc.output.camera import YAW, camera_facing
+from msmpetsc.output.reader import Result
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.schema import Region
 
 trimesh = pytest.importorskip("trimesh")
@@ -57,11 +58,11 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
     rows = len(ball.vertices)
     factor = 1 if surface else 2
     embedding = csr_array(np.eye(rows) / factor)
-    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, overwrite=True) as file:
+    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, Begin.OVERWRITE) as file:
         file.write("surface/triangles", np.array(ball.faces))
-        file.write("surface/points", ball.vertices + [0, 0, HEIGHTS[0]])
+        file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         file.write("lattice/cells", np.zeros((1, 8), int))
-        file.write("lattice/nodes", factor * (ball.vertices + [0, 0, HEIGHTS[0]]))
+        file.write("lattice/nodes", factor * (ball.vertices + np.array([0, 0, HEIGHTS[0]])))
         for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
         file.start_frames(len(HEIGHTS), rows, rows if surface else None)
@@ -76,19 +77,19 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
 
 
 def test_moments_tell_the_story(result):
-    with open_result(result) as file:
-        five = render.choose_moments(file, 5)
+    with Result(result) as run:
+        five = render.choose_moments(run, 5)
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
-        assert list(render.choose_moments(file, 3)) == [0, 5, 10]
-        assert list(render.choose_moments(file, 1)) == [0]
-        assert list(render.choose_moments(file, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
-        assert list(render.choose_moments(file, 99)) == list(range(11))
+        assert list(render.choose_moments(run, 3)) == [0, 5, 10]
+        assert list(render.choose_moments(run, 1)) == [0]
+        assert list(render.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(render.choose_moments(run, 99)) == list(range(11))
 
 
 def test_surface_that_was_not_stored_is_computed(result, tmp_path):
     bare = write_ball(tmp_path / "bare.h5", surface=False)
-    with open_result(result) as stored, open_result(bare) as file:
-        assert render.surface_points(file, 4) == pytest.approx(render.surface_points(stored, 4), abs=1e-7)
+    with Result(result) as stored, Result(bare) as run:
+        assert render.surface_points(run, 4) == pytest.approx(render.surface_points(stored, 4), abs=1e-7)
 
 
 @pytest.fixture
@@ -121,7 +122,7 @@ EYES = [None, (1, -2, 0.6), (-3, 0.5, -1), (0, 0, 1), (0, -1, 0), (3, 0, 4)]
 @pytest.mark.parametrize("gravity", [(0, 0, -9.81), (0, -9.81, 0), (3.0, 0, 4.0)])
 @pytest.mark.parametrize("eye", EYES)
 def test_camera_stands_upright_and_at_the_eye(gravity, eye):
-    camera = place_camera(POINTS, gravity, eye)
+    camera = camera_facing(POINTS, gravity, eye)
     axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
@@ -132,8 +133,8 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
 
 
 def test_the_longer_side_lies_across():
-    assert abs(place_camera(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
-    assert abs(place_camera(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
+    assert abs(camera_facing(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
+    assert abs(camera_facing(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
 
 
 def test_the_eye_chooses_the_side(tmp_path):
@@ -163,10 +164,10 @@ region.painted = "spots.txt"
 
 def test_held_parts(panels):
     east, prescribed = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
-    assert ((east.held == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.held.mean() < 0.5
-    assert ((prescribed[0].held == 1) == (prescribed[0].points[:, 2] <= 0.48)).all()
-    assert (prescribed[1].held == prescribed[0].held).all()
-    assert not prescribed[2].held.any()
+    assert ((east.fixed == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.fixed.mean() < 0.5
+    assert ((prescribed[0].fixed == 1) == (prescribed[0].points[:, 2] <= 0.48)).all()
+    assert (prescribed[1].fixed == prescribed[0].fixed).all()
+    assert not prescribed[2].fixed.any()
 
 
 def test_painted_points_mean_the_corners_of_their_cells():
@@ -193,10 +194,10 @@ total = [1, 0, 0]
 
 def test_an_arrow_for_each_force_while_it_acts(panels):
     before, first, last, after = panels(FORCE, frames=[1, 2, 7, 8])
-    assert before.marks.arrows == after.marks.arrows == []
+    assert before.overlays.arrows == after.overlays.arrows == []
     pulled = (first.points[:, 0] >= 0) & (first.points[:, 2] >= HEIGHTS[2])
     for panel in (first, last):
-        ((tail, tip),) = panel.marks.arrows
+        ((tail, tip),) = panel.overlays.arrows
         assert tail == pytest.approx(panel.points[pulled].mean(axis=0), abs=1e-6)
         assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
 
@@ -221,8 +222,8 @@ def test_obstacles_stand_where_they_are_at_the_time(panels):
     rest = np.array([(x, y, z) for x in (-0.125, 0.125) for y in (-0.1, 0.1) for z in (0.62, 0.64)])
     start, down, aside, gone = panels(PLATE, frames=[0, 1, 3, 8])
     for panel, by in (start, (0, 0, 0)), (down, (0, 0, -0.1)), (aside, (0.05, 0, -0.2)):
-        assert panel.marks.glass == [pytest.approx(rest + by)]
-    assert gone.marks.glass == []
+        assert panel.overlays.glass == [pytest.approx(rest + by)]
+    assert gone.overlays.glass == []
 
 
 def plane(height: float, normal: str) -> str:
@@ -230,23 +231,25 @@ def plane(height: float, normal: str) -> str:
 
 
 def test_what_would_hide_the_body_is_glass(panels):
-    above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].marks
+    above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
     assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
     assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
-    assert panels(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []  # nothing lies on it
+    assert (
+        panels(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
+    )  # nothing lies on it
     ground = plane(0.4, "[0, 0, 1]")
-    below = panels(ground, frames=[0])[0].marks
+    below = panels(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
-    assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].marks.grounds == []
-    assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].marks.corners) == 0  # over half a ball away
+    assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
+    assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.corners) == 0  # over half a ball away
 
 
 def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
     box = '[[obstacle]]\nshape = "box"\nbox = [[-50, -50, {}], [50, 50, {}]]\n'
-    (glass,) = panels(box.format(-50, 0.39), frames=[0])[0].marks.glass
+    (glass,) = panels(box.format(-50, 0.39), frames=[0])[0].overlays.glass
     assert np.ptp(glass, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
     assert glass[:, 2].max() == 0.39 and glass[:, 2].min() == pytest.approx(0.4 - 0.15 * 0.2)
-    assert panels(box.format(1.0, 1.01), frames=[0])[0].marks.glass == []
+    assert panels(box.format(1.0, 1.01), frames=[0])[0].overlays.glass == []
 
 
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
@@ -367,7 +370,7 @@ def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert drawn.shape[1] > 8192
     sheets = np.split(drawn, 26, axis=1)
-    for first, other in zip(sheets[:2] * 12, sheets[2:]):
+    for first, other in zip(sheets[:2] * 12, sheets[2:], strict=True):
         np.testing.assert_array_equal(other, first)
     assert body_rows(sheets[1])[0] > body_rows(sheets[0])[0] > 0
 
@@ -391,6 +394,6 @@ def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result,
 
 def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
     monkeypatch.setattr(render.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(InputError, match="y.png cannot be drawn: the graphics library gives a black picture"):
+    with pytest.raises(InputError, match=r"y\.png cannot be drawn: the graphics library gives a black picture"):
         render.draw(*drawing, tmp_path / "y.png")
     assert not (tmp_path / "y.png").exists()

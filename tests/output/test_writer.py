@@ -22,9 +22,11 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.output import continued, writer
+from msmpetsc.model.fields import FRAME_FIELDS
+from msmpetsc.output import writer
 from msmpetsc.output.compress import pack
-from msmpetsc.output.writer import SERIES, ResultFile, finished, open_result, read_checkpoint
+from msmpetsc.output.reader import finished, newest_slot, open_result
+from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
 
 WORKER = WORKERS / "frames_worker.py"
@@ -48,13 +50,20 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
 def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> None:
     """The first `count` frames are those of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
-    fields = {"position": "f8", **{name: kind for name, (kind, *_) in SERIES.items()}}
+    fields = {name: field.dtype for name, field in FRAME_FIELDS.items() if name != "surface"}
     if surface is not None:
         fields["surface"] = surface
     for name, kind in fields.items():
         stored = file["frames"][name][:count]
         wanted = np.array([getattr(one, name) for one in expected], kind).reshape(stored.shape)
         assert np.array_equal(stored, wanted, equal_nan=True), name
+
+
+def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """Step, q and q_previous, of a file that need not have a path."""
+    group = file["checkpoint"]
+    slot = newest_slot(group["step"][:])
+    return None if slot is None else (group["step"][slot], group["q"][slot], group["q_previous"][slot])
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -73,7 +82,7 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
         units = {name: file["frames"][name].attrs["unit"] for name in file["frames"]}
         assert units["momentum"] == "kg m/s" and units["elastic"] == "J" and units["position"] == "m"
         assert file["lattice/nodes"].attrs["unit"] == "m"
-        step, q, q_previous = read_checkpoint(file)
+        step, q, q_previous = newest_checkpoint(file)
         assert step == STEPS
         assert np.array_equal(q, positions(STEPS, NODES)) and np.array_equal(q_previous, positions(STEPS - 1, NODES))
 
@@ -153,7 +162,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         with h5py.File(io.BytesIO(image), "r") as killed:
             assert count <= finished(killed) <= count + 1 and finished(killed) <= 12
             assert_holds(killed, finished(killed))
-            kept = read_checkpoint(killed)
+            kept = newest_checkpoint(killed)
             if checkpoint >= 0:
                 assert kept[0] in (checkpoint, checkpoint + 1)
                 assert np.array_equal(kept[1], positions(kept[0], NODES))
@@ -171,8 +180,8 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
         file.close(trim=False)
     before = path.read_bytes()
     io.BytesIO.write(disk, before)
-    monkeypatch.setattr(continued, "open_again", lambda _: h5py.File(disk, "r+", libver="earliest", rdcc_nbytes=0))
-    file = continued.InPlace(path, MPI.COMM_SELF, {})
+    monkeypatch.setattr(writer, "open_again", lambda _: h5py.File(disk, "r+", libver="earliest", rdcc_nbytes=0))
+    file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
     file.start_frames(9, NODES, POINTS)
     assert file.finished == 3
     for index in range(3, 6):
@@ -189,7 +198,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     for _, image in disk.images(start=1, begin=before):
         with h5py.File(io.BytesIO(image), "r") as killed:
             assert_holds(killed, finished(killed))
-            step, q, _ = read_checkpoint(killed)
+            step, q, _ = newest_checkpoint(killed)
             assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(q, positions(step, NODES))
 
 
@@ -267,7 +276,7 @@ def assert_nothing_lost(path: Path, told: int) -> None:
         assert told <= finished(file) <= told + 1
         assert_holds(file, finished(file))
         if told > 1:
-            step, q, _ = read_checkpoint(file)
+            step, q, _ = newest_checkpoint(file)
             assert step >= told - 2 and np.array_equal(q, positions(step, NODES))
 
 
@@ -309,11 +318,11 @@ def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
     write_serial(path, 3)
     with pytest.raises(InputError, match=r"x\.h5 exists: --overwrite replaces it"):
         ResultFile(path, MPI.COMM_SELF, {})
-    with ResultFile(path, MPI.COMM_SELF, {}, overwrite=True):
+    with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE):
         pass  # never came to its first frame
     with open_result(path) as file:
         assert finished(file) == 3
-    with ResultFile(path, MPI.COMM_SELF, {}, overwrite=True) as file:
+    with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE) as file:
         file.start_frames(1, NODES)
     with open_result(path) as file:
         assert finished(file) == 0 and "surface" not in file["frames"]
@@ -337,9 +346,9 @@ def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, 
 
 
 def test_too_small_a_disk_is_told_before_the_first_frame(tmp_path):
-    with pytest.raises(InputError, match="will need .* GB, and only .* GB are free"):
-        with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-            file.start_frames(10**6, 10**7)
+    small = pytest.raises(InputError, match=r"will need .* GB, and only .* GB are free")
+    with small, ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(10**6, 10**7)
     assert os.listdir(tmp_path) == []
 
 
@@ -358,7 +367,7 @@ def test_what_is_no_result_is_told(tmp_path, content):
     path = tmp_path / "x.h5"
     if content:
         path.write_bytes(content)
-    with pytest.raises(InputError, match="no such file|not an HDF5 file"):
+    with pytest.raises(InputError, match=r"no such file|not an HDF5 file"):
         open_result(path)
     with h5py.File(tmp_path / "y.h5", "w"):
         pass
@@ -369,6 +378,7 @@ def test_what_is_no_result_is_told(tmp_path, content):
 def test_xdmf_refers_to_what_is_there(tmp_path):
     cells = np.arange(16).reshape(2, 8)
     with ResultFile(tmp_path / "a b.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", positions(0, NODES))
         file.write("lattice/cells", cells)
         file.write("lattice/cell_kind", np.array([1, 2], "u1"))
         file.write("surface/triangles", np.array([[0, 1, 2], [3, 4, 5]], "i4"))
@@ -380,7 +390,7 @@ def test_xdmf_refers_to_what_is_there(tmp_path):
     collections = ET.parse(path).getroot().findall("Domain/Grid")
     assert [grid.get("Name") for grid in collections] == ["surface", "lattice"]
     with h5py.File(tmp_path / "a b.h5") as file:
-        for collection, points in zip(collections, ("surface", "position")):
+        for collection, points in zip(collections, ("surface", "position"), strict=True):
             grids = collection.findall("Grid")
             assert [float(grid.find("Time").get("Value")) for grid in grids] == [0, 1 / 60, 2 / 60]
             for index, grid in enumerate(grids):
@@ -394,7 +404,7 @@ def read_item(item: ET.Element, file: h5py.File) -> np.ndarray:
     """What a reader of XDMF would take from the file, its declared shape and type checked."""
     if item.get("ItemType") == "HyperSlab":
         start, stride, count = np.array(item[0].text.split(), int).reshape(3, 3)
-        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count))
+        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count, strict=True))
         return read_item(item[1], file)[part].reshape([int(n) for n in item.get("Dimensions").split()])
     name, dataset = item.text.split(":")
     assert name == Path(file.filename).name
@@ -408,6 +418,7 @@ def test_xdmf_opens_in_vtk(tmp_path):
     pv = pytest.importorskip("pyvista")
     cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
     with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", cube)
         file.write("lattice/cells", np.arange(8)[None])
         file.write("lattice/cell_kind", np.array([1], "u1"))
         file.start_frames(2, 8)

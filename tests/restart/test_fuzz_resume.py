@@ -126,9 +126,11 @@ DAMAGE = [
     (a_group, "frames/iterations"), (dangling, "frames/substeps"), (a_loop, "frames/kinetic"), (text, "frames/ksp_its"),
     (short, "frames/momentum"), (without, "checkpoint/correction"), (a_group, "checkpoint/correction"),
     (short, "checkpoint/correction_before"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
-    (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"), (short, "lattice/springs"),
-    (without, "lattice/cells"), (dangling, "embedding/weights"), (text, "lattice/cell_kind"), (a_group, "frames/surface"),
-    (number(np.nan), "corrections"), (number(5), "corrections"), (number(np.inf), "iterations"), (number(np.nan), "put_in"), (number(-1), "frames_inverted"), (number(np.nan), "ratio"),
+    (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"),
+    (short, "lattice/springs"), (without, "lattice/cells"), (dangling, "embedding/weights"),
+    (text, "lattice/cell_kind"), (a_group, "frames/surface"), (number(np.nan), "corrections"),
+    (number(5), "corrections"), (number(np.inf), "iterations"), (number(np.nan), "put_in"),
+    (number(-1), "frames_inverted"), (number(np.nan), "ratio"),
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Runs killed by SIGKILL at random moments, resumed, killed again: no finished frame is lost, and the end is the same."""
+"""Runs killed by SIGKILL at random moments, resumed, killed again: no frame is lost, and the end is the same."""
 
 import json
 import os
@@ -13,7 +13,7 @@ import pytest
 from conftest import ENVIRONMENT, WORKERS, run
 from test_signals import assert_same, hanging, ranks_of
 
-from msmpetsc.output.writer import finished
+from msmpetsc.output.reader import finished
 
 ALONE, ON_TWO = 40, 10  # kills
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]

@@ -22,8 +22,8 @@ from msmpetsc.cli.main import main
 from msmpetsc.cli.resume import Resumed
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import build_model
+from msmpetsc.output.reader import finished
 from msmpetsc.output.restart import Earlier
-from msmpetsc.output.writer import finished
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.presets import PRESETS
@@ -220,7 +220,7 @@ def test_another_scene_is_refused_with_its_keys(stopped: Path, capsys):
 
 
 def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
-    earlier, scene = Earlier.look(whole), load_scene(whole.parent / "scene.toml")
+    earlier, scene = Earlier.read(whole), load_scene(whole.parent / "scene.toml")
     with pytest.raises(InputError, match=r"-ksp_rtol: none in .*whole\.h5, 1e-2 now"):
         Resumed(earlier, scene, {"ksp_rtol": "1e-2"}, force=False)
     silent = {"log_view": "", "snes_monitor": "", "use_gpu_aware_mpi": "0"}
@@ -324,7 +324,7 @@ def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, capsys, tmp_
 
 
 def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
-    from msmpetsc.output.writer import Lock
+    from msmpetsc.output.disk import Lock
 
     held, done = multiprocessing.Event(), multiprocessing.Event()
 
@@ -347,7 +347,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
 
 def take_and_free(path: Path, times: int, twice) -> None:
     """A lock again and again; a file that the holder alone should make tells of a second one."""
-    from msmpetsc.output.writer import Lock
+    from msmpetsc.output.disk import Lock
 
     for _ in range(times):
         try:

@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import build_model
-from msmpetsc.model.frame import Frame
+from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature

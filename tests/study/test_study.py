@@ -430,7 +430,7 @@ def result(path: Path, times: list[float], positions: list[np.ndarray], mass: li
     """A result file; positions (n, 3) of each time, the first at rest."""
     with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
         file.write("lattice/nodes", positions[0])
-        file.write("lattice/mass", np.array(mass))
+        file.write("lattice/mass", np.array(mass, float))
         file.start_frames(len(times), len(mass))
         for index, now in enumerate(times):
             values = {name: column[index] for name, column in series.items()}
@@ -458,6 +458,8 @@ def test_runs_without_common_times_or_nodes_have_no_trajectory_error(tmp_path: P
         trajectory_error(result(tmp_path / "a.h5", [0, 0.03], [rest, rest], [1]), reference)
     with pytest.raises(InputError, match="different lattices"):
         trajectory_error(result(tmp_path / "b.h5", [0, 0.1], [np.zeros((2, 3))] * 2, [1, 1]), reference)
+    with pytest.raises(InputError, match="different lattices"):
+        trajectory_error(result(tmp_path / "d.h5", [0, 0.1], [rest + 1, rest], [1]), reference)
     with pytest.raises(InputError, match="nothing moves"):
         trajectory_error(reference, result(tmp_path / "c.h5", [0, 0.1], [rest, rest], [1]))
 

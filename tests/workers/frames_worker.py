@@ -3,13 +3,14 @@
 import os
 import sys
 
+import h5py
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.frame import Frame
-from msmpetsc.output import writer
+from msmpetsc.model.fields import Frame
+from msmpetsc.output import layout, transfer
 from msmpetsc.output.writer import ResultFile
 
 NODES, POINTS, STEPS = 23, 17, 9
@@ -39,10 +40,9 @@ def share(rows: int) -> slice:
 
 
 def write_all(path: str, gathers: bool = False) -> None:
-    writer.PIECE_BYTES, writer.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
+    transfer.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
     nodes, points = share(NODES), share(POINTS)
-    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}) as file:
-        file.gathers = gathers
+    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers) as file:
         file.write("lattice/nodes", positions(0, NODES)[nodes])
         file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
         file.write("lattice/pinned", np.zeros(0, int))
@@ -80,9 +80,9 @@ def refuse(path: str) -> None:
 def fill_disk(path: str, gathers: bool = True) -> None:
     """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
     in the midst of its rows."""
-    writer.PIECE_BYTES = 100
+    transfer.PIECE_BYTES = 100
     nodes = share(NODES)
-    store = writer.h5py.Dataset.__setitem__
+    store = h5py.Dataset.__setitem__
 
     def half(file: int, data: memoryview, place: int) -> int:
         if MPI.COMM_WORLD.rank != 1:
@@ -97,12 +97,11 @@ def fill_disk(path: str, gathers: bool = True) -> None:
         store(dataset, key, value)
 
     try:
-        with ResultFile(path, MPI.COMM_WORLD, {}) as file:
-            file.gathers = gathers
+        with ResultFile(path, MPI.COMM_WORLD, {}, gathers=gathers) as file:
             file.start_frames(STEPS + 1, nodes.stop - nodes.start)
             for index in range(STEPS + 1):
                 if index == 2 and gathers:
-                    writer.h5py.Dataset.__setitem__ = full
+                    h5py.Dataset.__setitem__ = full
                 elif index == 2:
                     write, os.pwrite = os.pwrite, half
                 file.append(frame(index, nodes, None))

@@ -1,0 +1,144 @@
+"""Every dataset of a result file in one table: its type, shape, unit and meaning.
+
+`Frame`, the writer's datasets, the reader's checks, xarray's names, a study's columns and the table of the
+documentation (`markdown_table`) come from it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple, get_type_hints
+
+import numpy as np
+
+SIZES = {
+    "T": "frames, at least the finished ones",
+    "n": "nodes",
+    "c": "cells",
+    "s": "springs",
+    "p": "pinned nodes",
+    "v": "surface points",
+    "f": "triangles",
+    "r": "surface points + 1",
+    "e": "weights",
+    "k": "numbers",
+    "o": "obstacles",
+}
+
+
+class Field(NamedTuple):
+    """One dataset of a result file.
+
+    dtype     : numpy's name of the type written; a reader takes any size of its kind
+    shape     : numbers, and letters of `SIZES`, each of which is the same number throughout a file
+    unit      : "1" for what has none
+    long_name : meaning, in a few words
+    at_rest   : name of the dataset that holds the same of the body at rest, "" for none
+    """
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    unit: str
+    long_name: str
+    at_rest: str = ""
+
+
+def _number(dtype: str, unit: str, long_name: str) -> Field:
+    """Return the field of one number a frame."""
+    return Field(dtype, ("T",), unit, long_name)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One simulated time of a run: arrays hold this rank's rows, numbers are of the whole body.
+
+    The errors and counts are of the steps since the frame stored before: errors the greatest, counts the sum.
+
+    index      : number of the step that it shows, 0 for the start
+    position   : (n_local, 3) [m]
+    surface    : (v_local, 3) [m], or None where the scene does not ask for it
+    iterations : of the nonlinear solver (SNES), or explicit substeps
+    """
+
+    index: int
+    time: Annotated[float, _number("f8", "s", "simulated time")]
+    position: Annotated[np.ndarray, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")]
+    surface: Annotated[np.ndarray | None, Field("f4", ("T", "v", 3), "m", "surface points", "surface/points")]
+    step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")]
+    iterations: Annotated[int, _number("i8", "1", "outer iterations")]
+    ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")]
+    kinetic: Annotated[float, _number("f8", "J", "kinetic energy")]
+    elastic: Annotated[float, _number("f8", "J", "elastic energy")]
+    potential: Annotated[float, _number("f8", "J", "energy in gravity and forces")]
+    contact: Annotated[float, _number("f8", "J", "energy in the push of obstacles")]
+    momentum: Annotated[np.ndarray, Field("f8", ("T", 3), "kg m/s", "momentum")]
+    wall_time: Annotated[float, _number("f8", "s", "computing time")]
+    true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
+    energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
+    inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
+    substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
+    fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
+    energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
+
+
+FRAME_FIELDS: dict[str, Field] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(Frame, include_extras=True).items()
+    if hasattr(hint, "__metadata__")
+}
+LATTICE = {
+    "nodes": Field("f8", ("n", 3), "m", "node positions at rest"),
+    "cells": Field("i8", ("c", 8), "1", "corner nodes in VTK's order"),
+    "cell_kind": Field("u1", ("c",), "1", "1 boundary, 2 interior"),
+    "springs": Field("i8", ("s", 2), "1", "nodes that a spring joins"),
+    "rest_length": Field("f8", ("s",), "m", "rest length of a spring"),
+    "stiffness": Field("f8", ("s",), "N/m", "stiffness of a spring"),
+    "mass": Field("f8", ("n",), "kg", "mass of a node"),
+    "pinned": Field("i8", ("p",), "1", "pinned nodes, not those of anchors"),
+}
+SURFACE = {
+    "points": Field("f8", ("v", 3), "m", "surface points at rest"),
+    "triangles": Field("i8", ("f", 3), "1", "corner points of a triangle"),
+}
+EMBEDDING = {  # W (v, n) in CSR form: surface points = W @ node positions
+    "indptr": Field("i8", ("r",), "1", "where a point's weights begin"),
+    "indices": Field("i8", ("e",), "1", "node of a weight"),
+    "weights": Field("f8", ("e",), "1", "weight of a node for a surface point"),
+}
+CHECKPOINT = {  # two slots, of which the one with the greater step holds
+    "step": Field("i8", (2,), "1", "number of the step, -1 for none"),
+    "numbers": Field("f8", (2, "k"), "1", "what else a step depends on; names as an attribute"),
+    "q": Field("f8", (2, "n", 3), "m", "node positions"),
+    "q_previous": Field("f8", (2, "n", 3), "m", "node positions one step before"),
+    "correction": Field("f8", (2, "n", 3), "m", "correction x - y of the last step"),
+    "correction_before": Field("f8", (2, "n", 3), "m", "correction x - y of the step before that"),
+    "contact_bound": Field("f8", (2, "n"), "N/m", "contact stiffness that the preconditioner knows"),
+    "history_q": Field("f8", (2, "n", 3), "m", "positions that BDF2 looks back to"),
+    "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
+    "mode": Field("f8", (2, "n", 3), "1", "highest mode, which limits the explicit step"),
+    "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of the least curvature"),
+    "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
+}
+GROUPS = {
+    "lattice": LATTICE,
+    "surface": SURFACE,
+    "embedding": EMBEDDING,
+    "frames": FRAME_FIELDS,
+    "checkpoint": CHECKPOINT,
+}
+FIELDS = {f"{group}/{name}": field for group, fields in GROUPS.items() for name, field in fields.items()}
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of dataset `name`, such as "frames/time"; "1" where the table does not have it."""
+    return FIELDS[name].unit if name in FIELDS else "1"
+
+
+def markdown_table() -> str:
+    """Return the table of all datasets in Markdown, for the documentation."""
+    head = ["| dataset | type | shape | unit | meaning |", "|---|---|---|---|---|"]
+    rows = [
+        f"| /{name} | {field.dtype} | ({', '.join(map(str, field.shape))}{',' * (len(field.shape) == 1)}) "
+        f"| {field.unit} | {field.long_name} |"
+        for name, field in FIELDS.items()
+    ]
+    return "\n".join([*head, *rows])

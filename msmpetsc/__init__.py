@@ -3,7 +3,7 @@
 import hashlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from msmpetsc.output.reader import Result
@@ -12,15 +12,15 @@ __version__ = "0.1.0"
 
 
 def _kernel_folder() -> Path:
-    """Return a folder for the compiled kernels of just these sources.
+    """A folder for the compiled kernels of just these sources.
 
     numba looks for changes in a kernel's own file alone, not in those of the kernels it calls: after an update it
     would go on with parts of the old version.
     """
-    package = Path(__file__).parent
-    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
+    here = Path(__file__).parent
+    sources = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
     kernels = b"".join(source for source in sources if b"njit" in source or b"@kernel" in source)
-    return package / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
+    return here / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported
@@ -37,3 +37,15 @@ def open(path: str | Path) -> "Result":
     from msmpetsc.output.reader import Result  # late: the package itself stays quick to import
 
     return Result(path)
+
+
+def run(scene: str | Path | None = None, output: str | Path | None = None, **options: Any) -> Path:
+    """Simulate a scene as ``msmpetsc run`` does, on all ranks, and return the path of the result (cli.main.simulate).
+
+        path = msmpetsc.run("scenes/bunny_fall.toml", "out/b.h5", frames=10, petsc_options={"ksp_rtol": 1e-5})
+
+    Raises InputError, one line, for what cannot be used, and StepFailed for a step that did not converge.
+    """
+    from msmpetsc.cli.main import simulate
+
+    return simulate(scene, output, **options)

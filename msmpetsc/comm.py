@@ -1,4 +1,4 @@
-"""Ranks: what one rank reads all know, what fails on one fails on all, rows travel to their owners."""
+"""Ranks together: what rank 0 reads all know, what fails on any fails on all, rows travel to their owners."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -26,10 +26,10 @@ def together(comm: MPI.Comm) -> Iterator[None]:
         yield
     except (MsmpetscError, MemoryError) as raised:
         error = as_expected(raised)
-    for found in comm.allgather(error):
-        if found is not None:
-            found.on_all_ranks = True
-            raise found
+    for first in comm.allgather(error):
+        if first is not None:
+            first.on_all_ranks = True
+            raise first
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
@@ -42,7 +42,7 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
 
 
 class Route:
-    """Rows go to the ranks named for them (Alltoallv), and answers come back in the rows' own order.
+    """A way of rows to the ranks named for them (Alltoallv), and of answers back in the rows' own order.
 
     destination : (n,) rank of each row
     """
@@ -55,11 +55,11 @@ class Route:
         comm.Alltoall(self.sent, self.received)
 
     def send(self, rows: np.ndarray) -> np.ndarray:
-        """The rows that all ranks sent here, by sending rank and then in their order there."""
+        """Send rows; return those that all ranks sent to this one, by sending rank and then in its order."""
         return self._alltoall(np.asarray(rows)[self.order], self.sent, self.received)
 
     def answer(self, rows: np.ndarray) -> np.ndarray:
-        """``rows`` belong to what ``send`` returned; gives each sender the ones for its own rows."""
+        """Send answers to the rows that ``send`` returned; return those to this rank's own rows, in their order."""
         back = self._alltoall(np.asarray(rows), self.received, self.sent)
         answers = np.empty_like(back)
         answers[self.order] = back
@@ -79,33 +79,33 @@ class Route:
 
 
 def starts(counts: np.ndarray) -> np.ndarray:
-    """Where each part begins when parts of these sizes follow each other."""
+    """Return where each part begins when parts of these sizes follow each other."""
     return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int64)
 
 
-SAMPLES = 128  # a rank: keeps the shares within some percent of each other
+SAMPLES = 128  # a rank: keeps the ranks' parts within some percent of each other
 
 
 def sample_of(keys: np.ndarray, total: int, size: int) -> np.ndarray:
-    """A regular sample of one rank's ascending keys, of ``total`` that ``size`` ranks have together."""
+    """Return a regular sample of a rank's ascending keys, of ``total`` that ``size`` ranks have together."""
     step = max(1, total // (size * SAMPLES))
     return keys[step // 2 :: step]
 
 
 def splitters_of(sample: np.ndarray, size: int) -> np.ndarray:
-    """The keys at which the next rank's share begins, (size - 1,): at equal steps of all ranks' samples."""
+    """Return the keys (size - 1,) at which the next rank's part begins: at equal steps of all ranks' samples."""
     if size == 1 or len(sample) == 0:
         return np.zeros(size - 1, np.int64)
     return np.sort(sample)[np.arange(1, size) * len(sample) // size]
 
 
 class SortedKeys:
-    """Distinct int64 keys in ascending order over all ranks; a key's place is its global index.
+    """Distinct int64 keys in ascending order over all ranks; a key's position is its global index.
 
     So the numbering does not depend on the number of ranks, and each rank owns one contiguous
     range of it. Collective to build and to ask.
 
-    keys  : (n_local,) this rank's share, ascending
+    keys  : (n_local,) those of this rank, ascending
     first : global index of ``keys[0]``
     total : number of keys on all ranks
     """
@@ -122,29 +122,29 @@ class SortedKeys:
         self.total = int(counts.sum())
 
     def _split(self, keys: np.ndarray) -> np.ndarray:
-        """Sample sort, (size - 1,)."""
+        """Return the splitters (size - 1,) of a sample sort."""
         size = self.comm.size
         sample = sample_of(keys, self.comm.allreduce(len(keys)), size)
         return splitters_of(np.concatenate(self.comm.allgather(sample)), size)
 
     def owner(self, keys: np.ndarray) -> np.ndarray:
-        """Rank that holds each key, or would hold it."""
+        """Return the rank that holds each key, or would hold it."""
         return np.searchsorted(self.splitters, keys, side="right")
 
     def owner_of_index(self, index: np.ndarray) -> np.ndarray:
-        """Rank that holds each global index."""
+        """Return the rank that holds each global index."""
         last_start = np.append(self.first_of_rank[1:], self.total)
         return np.searchsorted(last_start, index, side="right")
 
     def find(self, keys: np.ndarray) -> np.ndarray:
-        """Global index of each key, -1 where there is none (any shape; collective)."""
+        """Return the global index of each key, -1 where there is none (any shape; collective)."""
         wanted, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
         route = Route(self.comm, self.owner(wanted))
-        place = route.answer(self._place(route.send(wanted)))
-        return place[inverse].reshape(np.shape(keys))
+        index = route.answer(self._index(route.send(wanted)))
+        return index[inverse].reshape(np.shape(keys))
 
-    def _place(self, keys: np.ndarray) -> np.ndarray:
+    def _index(self, keys: np.ndarray) -> np.ndarray:
         if len(self.keys) == 0:
             return np.full(len(keys), -1, np.int64)
-        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
-        return np.where(self.keys[at] == keys, self.first + at, -1)
+        slot = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[slot] == keys, self.first + slot, -1)

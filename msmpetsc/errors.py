@@ -33,32 +33,49 @@ class StepFailed(MsmpetscError):
 
 
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
+EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
+    "run": ("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch", "psutil", "tqdm"),
+    "mesh": ("meshio", "manifold3d", "fast_simplification"),
+    "render": ("pyvista",),
+    "study": ("pandas", "matplotlib", "jinja2", "tomlkit"),
+    "repair": ("pymeshfix",),
+    "xarray": ("xarray",),
+    "cuda": ("cupy",),
+}
 
 
 def as_expected(error: Exception) -> MsmpetscError | None:
-    """The error as one of ours, if it is one that a user can meet: memory that is not enough is."""
+    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is."""
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
+    if isinstance(error, ModuleNotFoundError) and (extra := extra_of(error.name or "")):
+        return InputError(f"{error.name} is not installed: pip install 'msmpetsc[{extra}]' brings it")
     return error if isinstance(error, MsmpetscError) else None
 
 
+def extra_of(module: str) -> str | None:
+    """Return the extra of pyproject.toml that brings a module; None for any other module."""
+    package = module.partition(".")[0]
+    return next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+
+
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name nearest to a wrong one; None where none is near."""
+    """Return the valid name nearest to a wrong one; None where none is near."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """ ", did you mean 'x'?" with the nearest valid name; empty where none is near."""
+    """Return ", did you mean 'x'?" with the nearest valid name; nothing where none is near."""
     near = nearest(name, valid)
     return f", did you mean {near!r}?" if near else ""
 
 
 def one_line(error: Exception, length: int = 160) -> str:
-    """The first line of what a library says went wrong, of printable characters: files speak through it, too."""
+    """Return the first line of what a library says went wrong, in printable characters: files speak through it, too."""
     return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)
 
 
 def printable(text: str, length: int = 160) -> str:
-    """The text, cut, without what would act on a terminal."""
+    """Return the text, cut, without what would act on a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:length])

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Times cages and embeddings of real scans and prints a Markdown table. Needs msmpetsc importable, and the meshes.
+"""Times cages and embeddings of real scans and prints a Markdown table. Needs the meshes.
 
 Warm: the best of three runs after one that compiles. `mpiexec -n 2 scripts/bench_cages.py` times ranks together.
 The 457,000 triangles of the Welsh dragon need a minute of repair: `dragon`, each triangle cut into 16, stands in.
@@ -7,6 +7,9 @@ The 457,000 triangles of the Welsh dragon need a minute of repair: `dragon`, eac
 
 import time
 from collections.abc import Callable
+from functools import partial
+
+from clone import parser
 
 import numpy as np
 import trimesh
@@ -72,11 +75,12 @@ def row(name: str, body: Body, count: int) -> list[str]:
         chosen = np.random.default_rng(0).choice(len(body.surface.points), min(POINTS, len(body.surface.points)), False)
         points, triangles = body.surface.points[chosen], len(body.surface.triangles)
     times = [seconds(lambda: fill(body, cell_size)), seconds(lambda: fill(body, choose_cell_size(body, count)))]
-    times += [seconds(lambda kind=kind: embed(points, cages, nodes, kind)) for kind in KINDS]
+    times += [seconds(partial(embed, points, cages, nodes, kind)) for kind in KINDS]
     return [name, f"{triangles:,}", f"{cages.table.total:,}", *(f"{time:.3f}" for time in times)]
 
 
 def main() -> None:
+    parser(__doc__).parse_args()
     rows = [row("bunny scan", body_of(bunny), 10_000), row("dragon", body_of(dragon), 1_000_000)]
     if comm.rank == 0:
         print(f"{comm.size} rank(s), {POINTS:,} points embedded\n")

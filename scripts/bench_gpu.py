@@ -4,9 +4,9 @@ GPU yet.
 
     scripts/bench_gpu.py [--cells N ...] [--scenes NAME ...] [--frames N] [--error E]
 
-Runs: every scene of the paper and bunny_fall at each number of cells, by `msmpetsc run` on one core, on all cores and on
-the GPU; frames a second are those of the steps alone, the median of all frames but the first two, in which kernels are
-compiled, beside the largest step error reported and how far the GPU's last frame is from the CPU's.
+Runs: every scene of the paper and bunny_fall at each number of cells, by `msmpetsc run` on one core, on all cores and
+on the GPU; frames a second are those of the steps alone, the median of all frames but the first two, in which kernels
+are compiled, beside the largest step error reported and how far the GPU's last frame is from the CPU's.
 Parts: for bunny_fall at each number of cells, in this process, what an iteration of CG consists of, beside what the
 memory allows: the bytes that cannot be spared over the bandwidth that a copy reaches. Then how many launches a frame
 takes and what a launch costs, alone and in a CUDA graph, and what is carried between CPU and GPU. Where memory allows,
@@ -23,6 +23,8 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
+
+from clone import ROOT, parser
 
 import numpy as np
 from mpi4py import MPI
@@ -41,10 +43,8 @@ from msmpetsc.solve.petsc import device
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation
 
-ROOT = Path(__file__).parents[1]
-SCENES = (
-    "armadillo_leg", "armadillo_palm", "armadillo_forehead", "dragon_raise_push", "lung_press", "heart_pull", "brain_fall",
-)  # fmt: skip
+ARMADILLOS = ("armadillo_leg", "armadillo_palm", "armadillo_forehead")
+SCENES = (*ARMADILLOS, "dragon_raise_push", "lung_press", "heart_pull", "brain_fall")
 SIZES = 10_000, 100_000, 1_000_000
 COMPILING = 2  # frames
 REPEATS = 30
@@ -99,7 +99,9 @@ def figures(path: Path) -> dict:
 
 def compared(args: argparse.Namespace, folder: Path) -> Iterator[dict]:
     """One row for each scene and size."""
-    cases = [(scene, []) for scene in args.scenes] + [("bunny_fall", [f"cages.count={n}"]) for n in args.cells]
+    cases: list[tuple[str, list[str]]] = [(scene, []) for scene in args.scenes] + [
+        ("bunny_fall", [f"cages.count={n}"]) for n in args.cells
+    ]
     for scene, overrides in cases:
         found = {}
         for where in ("one core", "all cores", "GPU"):
@@ -357,28 +359,28 @@ def print_parts(found: dict) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="*", default=SCENES, metavar="NAME", help="scenes to run")
-    parser.add_argument("--cells", nargs="*", type=int, default=SIZES, metavar="N", help="sizes of bunny_fall")
-    parser.add_argument(
+    options = parser(__doc__)
+    options.add_argument("--scenes", nargs="*", default=SCENES, metavar="NAME", help="scenes to run")
+    options.add_argument("--cells", nargs="*", type=int, default=SIZES, metavar="N", help="sizes of bunny_fall")
+    options.add_argument(
         "--frames", type=int, default=20, metavar="N", help="of each run, and of the frames looked into"
     )
-    parser.add_argument("--error", type=float, default=1e-3, metavar="E", help="of each step, relative")
-    parser.add_argument("--cores", type=int, default=os.cpu_count(), metavar="N", help="of 'all cores'")
-    args = parser.parse_args()
+    options.add_argument("--error", type=float, default=1e-3, metavar="E", help="of each step, relative")
+    options.add_argument("--cores", type=int, default=os.cpu_count(), metavar="N", help="of 'all cores'")
+    args = options.parse_args()
     lacking = device.what_is_missing()
     if lacking:
         print(f"bench_gpu: {lacking}", file=sys.stderr)
         return 2
     folder = ROOT / "out" / "bench_gpu"
     folder.mkdir(parents=True, exist_ok=True)
-    told = {"machine": machine() | {"gpu": cuda.name()}, "versions": versions(), "options": vars(args), "parts": []}
-    print(
-        f"{told['machine']['gpu']} beside {told['machine']['cpu']}, {args.cores} cores; PETSc {told['versions']['petsc']}"
-    )
+    host = machine() | {"gpu": cuda.name()}
+    parts: list[dict] = []
+    told: dict = {"machine": host, "versions": versions(), "options": vars(args), "parts": parts}
+    print(f"{host['gpu']} beside {host['cpu']}, {args.cores} cores; PETSc {versions()['petsc']}")
     for cells in args.cells:
-        told["parts"].append(dissected(cells, args))
-        print_parts(told["parts"][-1])
+        parts.append(dissected(cells, args))
+        print_parts(parts[-1])
         (folder / "figures.json").write_text(json.dumps(told, indent=1))
     told["runs"] = list(compared(args, folder))
     print_table(told["runs"])

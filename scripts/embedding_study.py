@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compares the embeddings and prints a Markdown table: accuracy, smoothness, speed. Needs msmpetsc importable.
+"""Compares the embeddings and prints a Markdown table: accuracy, smoothness, speed.
 
 rms: distance between a bar bent to an arc and its embedding, over points in the cells at the bar's surface.
 kink: jump of the normal derivative across shared faces, rms, nodes moved at random by 0.1 cells (an axis).
@@ -7,6 +7,8 @@ jump: greatest distance between two cells' answers for a point they share, same 
 """
 
 import time
+
+from clone import parser
 
 import numpy as np
 
@@ -124,7 +126,8 @@ def seconds(kind, points=50_000):
     return min(times)
 
 
-def main():
+def main() -> None:
+    parser(__doc__).parse_args()
     columns = [f"rms h={size:g} m" for size in SIZES]
     columns += ["slope", "kink", "kink, any cells", "jump, any cells", "50,000 points [s]"]
     print("| embedding |", " | ".join(columns), "|")
@@ -139,7 +142,7 @@ def main():
         print(f"| {kind} |", " | ".join(row), "|")
         if max(kink, kink_any) < 1e-3:
             smooth[kind] = rms[-1]
-    print(f"\nBest, of those without kink by accuracy: {min(smooth, key=smooth.get)}.")
+    print(f"\nBest, of those without kink by accuracy: {min(smooth, key=lambda kind: smooth[kind])}.")
 
 
 if __name__ == "__main__":

@@ -3,18 +3,18 @@
 
     scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT.json] [--at-once 2]
 
-Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft or
-stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with friction, in
-parts of up to 1e8 to 1, pinned, led or free, in short and long steps, by any preset. Every step is solved a second time to
-rounding from where it ended: what it says of its error over that distance is the ratio.
+Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
+or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
+friction, in parts of up to 1e8 to 1, pinned, led or free, in short and long steps, by any preset. Every step is solved
+a second time to rounding from where it ended: what it says of its error over that distance is the ratio.
 
-Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a fault.
+Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a
+fault.
 
     --only K        run scene K alone, and print each step
     --write FOLDER  leave scene K there, with its mesh, for `msmpetsc run`
 """
 
-import argparse
 import json
 import os
 import signal
@@ -26,13 +26,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
 
+from clone import parser
+
 import numpy as np
 
-LEAST, SECONDS, NOTHING = (
-    1 / 3,
-    300,
-    1e-9,
-)  # ratio that is too small; a scene may take; true errors not to be told from 0
+LEAST = 1 / 3  # a smaller ratio is bad
+SECONDS = 300  # a scene may take so long
+NOTHING = 1e-9  # true errors below it cannot be told from 0
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
 Draw = np.random.Generator
 
@@ -43,7 +43,7 @@ def draw_scene(seed: int, number: int, folder: Path) -> Path:
 
     draw = np.random.default_rng([seed, number])
     sides = np.array(SIDES[draw.integers(len(SIDES))])
-    scene = {
+    scene: dict = {
         "mesh": {"source": mesh_of(draw, sides, folder / f"hard_{number}.obj")},
         "cages": {"count": int(draw.integers(40, 151))},
         "material": material_of(draw),
@@ -128,7 +128,12 @@ def add_plates(draw: Draw, scene: dict, sides: np.ndarray) -> None:
     """The ground, and for one in two a plate that comes down."""
     half = 0.5 * sides[2] if sides[0] != 0.6 else 0.3
     response = "reflect" if draw.random() < 0.15 else "penalty"
-    ground = {"shape": "plane", "point": [0.0, 0.0, -half - 0.01], "normal": [0.0, 0.0, 1.0], "response": response}
+    ground: dict = {
+        "shape": "plane",
+        "point": [0.0, 0.0, -half - 0.01],
+        "normal": [0.0, 0.0, 1.0],
+        "response": response,
+    }
     if response == "penalty" and draw.random() < 0.6:
         ground["friction"] = float(draw.uniform(0, 1))
     scene["obstacle"] = [ground]
@@ -187,7 +192,7 @@ def measured_in(path: Path, number: int) -> dict:
         row |= {"status": 2, "said": str(error)}
     except TimeoutError as late:
         row |= {"status": 4, "said": str(late)}
-    except Exception as fault:  # noqa: BLE001 (whatever it is, it is a finding)
+    except Exception as fault:  # whatever it is, it is a finding
         row |= {"status": 1, "said": f"{type(fault).__name__}: {fault}"}
     signal.alarm(0)
     return row | {"steps": steps}
@@ -259,14 +264,14 @@ def tell(row: dict) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", type=int)
-    parser.add_argument("--write", type=Path)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--at-once", type=int, default=2)
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--scenes", type=int, default=500)
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--only", type=int)
+    options.add_argument("--write", type=Path)
+    options.add_argument("--json", type=Path)
+    options.add_argument("--at-once", type=int, default=2)
+    args = options.parse_args()
     if args.write:
         args.write.mkdir(parents=True, exist_ok=True)
         print(draw_scene(args.seed, args.only or 0, args.write))

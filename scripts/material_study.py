@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
-"""Checks the calibrated lattice against elasticity and prints Markdown tables. Needs msmpetsc and scikit-fem.
+"""Checks the calibrated lattice against elasticity and prints Markdown tables. Needs scikit-fem.
 
 Static problems and eigenfrequencies use the Hessian of E at rest, assembled here on its own from the list of
 springs; the wave and the free flight use the product's own steps. All errors are relative.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+from clone import parser
 
 import numpy as np
 import skfem
@@ -299,7 +301,7 @@ def free_flight(
     start, spin_start = momenta(q, before)
     *_, last = steps(lattice, time_step, q, before, count * [np.zeros_like(q)], error, preset)
     end, spin_end = momenta(*last)
-    drift = np.linalg.norm(end - start) / np.linalg.norm(start)
+    drift = float(np.linalg.norm(end - start) / np.linalg.norm(start))
     return drift, 1 - spin_end / spin_start, rigid_loss(spin * time_step, count)
 
 
@@ -329,9 +331,9 @@ def percent(share: float, digits: int = 2) -> str:
     return f"{100 * share:+.{digits}f}%"
 
 
-def slope(sizes: Iterable[float], errors: Iterable[float]) -> float:
-    """Of log |error| against log size, fitted."""
-    return np.polyfit(np.log(np.array(sizes)), np.log(np.abs(errors)), 1)[0]
+def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
+    """Return the slope of a line fitted to log |error| over log size."""
+    return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
 
 
 def strain_table() -> None:
@@ -383,6 +385,11 @@ def flight_table() -> None:
     table(["t [s]", *momenta, "angular momentum in 1 s", "rigid body under implicit Euler"], rows)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    parser(__doc__).parse_args()
     for show in (strain_table, beam_table, wave_table, flight_table):
         show()
+
+
+if __name__ == "__main__":
+    main()

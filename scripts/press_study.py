@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Presses the lung ever lower with both laws of the springs and prints a Markdown table. Needs msmpetsc and the mesh.
+"""Presses the lung ever lower with both laws of the springs and prints a Markdown table. Needs the mesh.
 
     scripts/press_study.py [CELLS]     1000 if not given
 
@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from clone import ROOT, parser
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +21,6 @@ from msmpetsc.model.loads import Motion
 from msmpetsc.output.reader import Result
 from msmpetsc.output.render import read_scene
 
-ROOT = Path(__file__).parents[1]
 SCENE, OUT = ROOT / "scenes" / "lung_press.toml", ROOT / "out" / "press_study"
 HEIGHT, START = 0.37, 0.38  # of the lung and of the plate's lower face at the start [m]
 SHARES, LAWS = (0.6, 0.45, 0.3), ("linear", "stiffening")
@@ -30,7 +31,7 @@ def press(law: str, share: float, cells: str) -> Path:
     path, by = OUT / f"{law}_{share}.h5", f"[0, 0, {share * HEIGHT - START:.4f}]"
     options = [f"cages.count={cells}", f"material.law={law}", *(f"obstacle.1.path.{k}.by={by}" for k in (0, 1))]
     changes = [word for option in options for word in ("--set", option)]
-    command = [sys.executable, "-m", "msmpetsc.cli.main", "run", SCENE, "-o", path, "--overwrite", *changes]
+    command = [sys.executable, "-m", "msmpetsc", "run", SCENE, "-o", path, "--overwrite", *changes]
     subprocess.run([str(word) for word in command], check=False)  # a run that fails leaves its frames: they count
     return path
 
@@ -48,6 +49,7 @@ def row(law: str, share: float, path: Path) -> list[str]:
         nodes, mass, times = result.lattice.nodes[:], result.lattice.mass[:], result.frames.time[:]
         q, iterations = result.frames.position[:], result.frames.iterations[1:]
     plate = scene.obstacle[1]
+    assert plate.box is not None and plate.stop is not None
     low = np.array([plate.box[0][2] + Motion.through(plate.path).at(time)[2] for time in times])
     above = (q[:, :, 2].max(axis=1) - low)[times < plate.stop - 1e-9].max()
     inverted = [int((least_volumes(x, cells) <= 0).sum()) for x in q]
@@ -65,7 +67,9 @@ def row(law: str, share: float, path: Path) -> list[str]:
 
 
 def main() -> None:
-    cells = sys.argv[1] if len(sys.argv) > 1 else "1000"
+    options = parser(__doc__)
+    options.add_argument("cells", nargs="?", default="1000", metavar="CELLS", help="cells of the lung (1000)")
+    cells = options.parse_args().cells
     rows = [row(law, share, press(law, share, cells)) for share in SHARES for law in LAWS]
     columns = ("plate at", "law", "most inverted", "inverted at the end", "shape error", "through", "iterations a step")
     for cells_of_row in (columns, ["---"] * len(columns), *rows):

@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
-"""Runs the scenes small and holds their numbers against those of tests/regression. Needs msmpetsc and the meshes.
+"""Runs the scenes small and holds their numbers against those of tests/regression. Needs the meshes.
 
     scripts/regression.py [SCENE...] [--ranks N] [--update]
 
-Every scene of scenes/, or those named, at 400 cells, for a few steps, each solved to 1e-9, so that neither the number of
-ranks nor the way in which a step is solved shows. Counts must be equal, the numbers of the last frame within the tolerance.
+Every scene of scenes/, or those named, at 400 cells, for a few steps, each solved to 1e-9, so that neither the number
+of ranks nor the way in which a step is solved shows. Counts must be equal, the numbers of the last frame within the
+tolerance.
 Exit status 0: all are; 1: something differs, or nothing was compared. --update stores the numbers found.
 
 Tolerance. A step solved to the relative error e leaves e |x* - y| in x, |x* - y| being at most about the largest
-displacement D. What goes on from there carries it along in y = 2 q_n - q_(n-1): after N steps it is e D N (N + 1) / 2. Ten
-times as much is allowed, for contact and buckling make differences grow; twice that in energies and momentum, in which
-errors of x count double. Places are relative to D, energies to the largest of the run (the potential one counted from the
-start), momentum to that of the whole mass at the largest kinetic energy.
+displacement D. What goes on from there carries it along in y = 2 q_n - q_(n-1): after N steps it is e D N (N + 1) / 2.
+Ten times as much is allowed, for contact and buckling make differences grow; twice that in energies and momentum, in
+which errors of x count double. Positions are relative to D, energies to the largest of the run (the potential one
+counted from the start), momentum to that of the whole mass at the largest kinetic energy.
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -24,6 +24,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
 
+from clone import ROOT, parser
+
 import numpy as np
 
 import msmpetsc
@@ -31,7 +33,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
 from msmpetsc.study.process import environment, last_error
 
-ROOT = Path(__file__).parents[1]
 SCENES, STORED = ROOT / "scenes", ROOT / "tests" / "regression"
 CELLS, ERROR = 400, 1e-9
 GROWTH = 10  # of an error, by contact and buckling
@@ -60,7 +61,7 @@ def run(scene: str, path: Path, ranks: int) -> None:
     steps, changes = SETTINGS[scene]
     launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
     options = [f"cages.count={CELLS}", "output.surface=false", *changes]
-    command = [sys.executable, "-m", "msmpetsc.cli.main", "run", file, "-o", path, "--overwrite", "--frames", steps]
+    command = [sys.executable, "-m", "msmpetsc", "run", file, "-o", path, "--overwrite", "--frames", steps]
     command += ["--error", ERROR, *(word for option in options for word in ("--set", option))]
     done = subprocess.run(
         [*launcher, *map(str, command)], env=environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True
@@ -183,14 +184,14 @@ def check(scene: str, ranks: int, update: bool) -> list[str] | None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(SETTINGS)}; all if none is named")
-    parser.add_argument("--ranks", type=int, default=1, metavar="N", help="MPI ranks of the runs (1)")
-    parser.add_argument("--update", action="store_true", help="store the numbers found in place of those there")
-    args = parser.parse_args(arguments)
+    options = parser(__doc__)
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(SETTINGS)}; all if none is named")
+    options.add_argument("--ranks", type=int, default=1, metavar="N", help="MPI ranks of the runs (1)")
+    options.add_argument("--update", action="store_true", help="store the numbers found in place of those there")
+    args = options.parse_args(arguments)
     unknown = [scene for scene in args.scenes if scene not in SETTINGS]
     if unknown or args.ranks < 1:
-        parser.error(f"no scene {unknown[0]!r}: {', '.join(SETTINGS)}" if unknown else "--ranks must be at least 1")
+        options.error(f"no scene {unknown[0]!r}: {', '.join(SETTINGS)}" if unknown else "--ranks must be at least 1")
     print(HEAD)
     outcomes = [check(scene, args.ranks, args.update) for scene in args.scenes or SETTINGS]
     for line in (line for wrong in outcomes if wrong for line in wrong):

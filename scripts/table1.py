@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The paper's Table 1 beside ours: prints Markdown and leaves out/table1.csv. Needs msmpetsc and its meshes.
+"""The paper's Table 1 beside ours: prints Markdown and leaves out/table1.csv. Needs the meshes.
 
     scripts/table1.py [--frames N] [--results FOLDER]
 
@@ -8,18 +8,18 @@ second are those of the steps alone, as each frame's wall_time has them: the mea
 of the frames. The error is the largest relative error of a step that the run reports.
 """
 
-import argparse
 import csv
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from clone import ROOT, parser
+
 import numpy as np
 
 from msmpetsc.output.reader import Result
 
-ROOT = Path(__file__).parents[1]
 # vertices, facets, valid cells, springs, frames a second on the CPU and on the GPU
 PAPER = {
     "armadillo": (12602, 25200, 8338, 164343, 8.1, 30.0),
@@ -47,7 +47,7 @@ def run(scene: str, folder: Path, frames: int | None) -> Path:
     """Simulate a scene; the path of its result."""
     path = folder / f"{scene}.h5"
     steps = [] if frames is None else ["--frames", str(frames)]
-    command = [sys.executable, "-m", "msmpetsc.cli.main", "run", str(ROOT / "scenes" / f"{scene}.toml")]
+    command = [sys.executable, "-m", "msmpetsc", "run", str(ROOT / "scenes" / f"{scene}.toml")]
     subprocess.run([*command, "-o", str(path), "--overwrite", *steps], check=True)
     return path
 
@@ -95,10 +95,10 @@ def print_markdown(table: list[dict]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, metavar="N", help="steps of each scene; all of them if absent")
-    parser.add_argument("--results", type=Path, metavar="FOLDER", help="take the results NAME.h5 of this folder")
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--frames", type=int, metavar="N", help="steps of each scene; all of them if absent")
+    options.add_argument("--results", type=Path, metavar="FOLDER", help="take the results NAME.h5 of this folder")
+    args = options.parse_args()
     folder = ROOT / "out"
     if args.results:
         results = {scene: args.results / f"{scene}.h5" for scene in SCENES}

@@ -56,3 +56,20 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("meshes") / "ball.ply"
     trimesh.creation.icosphere(subdivisions=2, radius=1).export(path)
     return path
+
+
+@pytest.fixture
+def petsc_options():
+    """Set options as the user would, and take them out again."""
+    from petsc4py import PETSc
+
+    database, names = PETSc.Options(), []
+
+    def set_options(**options: str) -> None:
+        for name, value in options.items():
+            database.setValue(name, value)
+            names.append(name)
+
+    yield set_options
+    for name in names:
+        database.delValue(name)

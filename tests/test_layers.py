@@ -53,7 +53,7 @@ def test_every_file_keeps_to_its_layer():
     files = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
     assert len(files) > 30
     layers = {path: path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files}
-    assert set(layers.values()) <= set(HEIGHT), "a file or folder that design.md does not know"
+    assert set(layers.values()) <= set(HEIGHT), "a file or folder that LAYERS does not know"
     found = {str(path.relative_to(PACKAGE)): violations(layers[path], path.read_text()) for path in files}
     assert {path: wrong for path, wrong in found.items() if wrong} == {}
 

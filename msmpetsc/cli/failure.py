@@ -1,4 +1,4 @@
-"""What becomes of all ranks when some fail: they end together, with one line and one exit status."""
+"""The end of all ranks when some fail: together, with one line and one exit status."""
 
 import sys
 import time
@@ -16,9 +16,11 @@ PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the oth
 
 @contextmanager
 def ending_together(comm: MPI.Comm) -> Iterator[None]:
-    """A failure of all ranks in the block passes; one of some ranks, for which the others would wait for ever, ends all
-    of them (collective to enter). To stand within whatever does collective work on leaving."""
-    meeting = comm.Dup() if comm.size > 1 else comm  # whose messages meet no others
+    """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
+
+    The others would wait for ever. It stands within whatever does collective work on leaving.
+    """
+    meeting = comm.Dup() if comm.size > 1 else comm  # its messages meet no others
     try:
         yield
     except KeyboardInterrupt:
@@ -30,7 +32,7 @@ def ending_together(comm: MPI.Comm) -> Iterator[None]:
             _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG)
             raise
         if not error.on_all_ranks:
-            failed = _those_who_fail(meeting)
+            failed = _failing_ranks(meeting)
             if len(failed) < comm.size:
                 if comm.rank > min(failed):
                     time.sleep(PATIENCE)  # the lowest of them tells, and ends this one, too
@@ -41,8 +43,8 @@ def ending_together(comm: MPI.Comm) -> Iterator[None]:
         meeting.Free()
 
 
-def _those_who_fail(meeting: MPI.Comm) -> set[int]:
-    """The ranks that come here, this one among them; as soon as all have."""
+def _failing_ranks(meeting: MPI.Comm) -> set[int]:
+    """Return the ranks that fail, this one among them: as soon as all do, or when patience ends."""
     failed, until = {meeting.rank}, time.monotonic() + PATIENCE
     sent = [meeting.isend(None, rank) for rank in range(meeting.size) if rank != meeting.rank]
     while len(failed) < meeting.size and time.monotonic() < until:
@@ -58,7 +60,7 @@ def _those_who_fail(meeting: MPI.Comm) -> set[int]:
 
 
 def _end_all(comm: MPI.Comm, line: str, status: int) -> None:
-    """No other rank can be asked any more. One rank alone is left to its own end."""
+    """Say the line and end all ranks, for none can be asked any more. One rank alone is left to its own end."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)
         comm.Abort(status)

@@ -1,4 +1,4 @@
-"""`msmpetsc fetch`: download named meshes, or list them."""
+"""``msmpetsc fetch``: download named meshes, or list them."""
 
 import argparse
 import sys
@@ -6,14 +6,6 @@ import sys
 from msmpetsc.cli.arguments import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, fetch, find
-
-
-def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    """Add the command to the parser."""
-    parser = subparsers.add_parser("fetch", help="download named meshes, or list them")
-    parser.add_argument("names", nargs="*", metavar="NAME", help="a model, see --list")
-    parser.add_argument("--list", action="store_true", help="list the models and where they lie")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,16 +22,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _table() -> list[str]:
-    """One line a model: name, size [MB] of the file found, where it was found, licence."""
+    """Return one line a model: name, size [MB] of its file, where that lies, licence."""
     rows = [("name", "MB", "found", "licence")]
     for name, model in MODELS.items():
         try:
-            found = find(name)
+            file = find(name)
         except InputError:
-            found, where = None, "another file of its name"
+            file, where = None, "another file of its name"
         else:
-            where = found.where if found else "not here"
-        size = f"{found.path.stat().st_size / 1e6:.1f}" if found else "-"
+            where = file.where if file else "not here"
+        size = f"{file.path.stat().st_size / 1e6:.1f}" if file else "-"
         rows.append((name, size, where, model.licence))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [

@@ -10,9 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_ranks
+from msmpetsc.cli.arguments import interrupt, option_names, refuse_below_one, refuse_ranks
 from msmpetsc.cli.profile import peak_memory
-from msmpetsc.cli.study import stop
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
@@ -31,55 +30,37 @@ SPRINGS = "springs; of a rank, shared ones too"
 WIDTH = 36  # of the first column
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "inspect",
-        help="say what a scene would need on so many ranks",
-        description="Count cells, nodes, springs, ghosts and messages of each rank, and expect memory and time of a "
-        "frame from two short runs here, on coarser lattices. PETSc options (one dash) may follow.",
-    )
-    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
-    parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks (1)")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
-    )
-    parser.add_argument("--frames", type=int, default=10, metavar="N", help="steps of the short runs (10)")
-    parser.add_argument("--measure-here", action="store_true", help="make the short runs again")
-    parser.add_argument("--no-times", action="store_true", help="make none: counts and limits only")
-    parser.add_argument("--latency", type=float, default=2e-6, metavar="S", help="of a message [s] (2e-6)")
-    parser.add_argument("--bandwidth", type=float, default=1e10, metavar="B", help="of a rank [byte/s] (1e10)")
-
-
 def run(args: argparse.Namespace) -> int:
-    """Inspect; returns the exit status."""
+    """Inspect a scene; return the exit status."""
     refuse_ranks("inspect", "it counts for --ranks R on one process")
     refuse_bad_numbers(args)
-    initialise(MPI.COMM_WORLD, args.petsc_options)
+    initialise(MPI.COMM_WORLD, list(args.petsc_options))
     from msmpetsc.model.build import read_body
     from msmpetsc.model.partition import partition_of
     from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.presets import PRESETS
 
-    refuse_early(MPI.COMM_WORLD, args.parser._option_string_actions)
-    signal.signal(signal.SIGTERM, stop)
+    refuse_early(MPI.COMM_WORLD, option_names("inspect"))
+    signal.signal(signal.SIGTERM, interrupt)
     scene = load_scene(args.scene, args.set, PRESETS)
     before = peak_memory()
     body = read_body(MPI.COMM_WORLD, scene)
+    assert body.surface is not None  # which rank 0 has
     mesh = peak_memory() - before
     shares, counted = partition_of(body, scene.cages, args.ranks, MOST_BUILT)
     cells = shares.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
-    tell_counts(args, scene, shares, counted)
+    print_counts(args, scene, shares, counted)
     if not args.no_times:
-        tell_needs(args, scene, body.surface, shares, mesh)
-    tell_limits(shares)
+        print_needs(args, scene, body.surface, shares, mesh)
+    print_limits(shares)
     return 0
 
 
 def refuse_bad_numbers(args: argparse.Namespace) -> None:
-    refuse_below_one(args, "ranks", "frames")
+    """Raise InputError for numbers that are out of range."""
+    refuse_below_one(ranks=args.ranks, frames=args.frames)
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     if not (args.latency >= 0 and np.isfinite(args.latency)):
@@ -88,8 +69,8 @@ def refuse_bad_numbers(args: argparse.Namespace) -> None:
         raise InputError(f"--bandwidth must be more than 0, not {args.bandwidth:g}")
 
 
-def tell_counts(args: argparse.Namespace, scene: Scene, shares: "Partition", counted: int) -> None:
-    """A table: what there is, and what a rank has of it."""
+def print_counts(args: argparse.Namespace, scene: Scene, shares: "Partition", counted: int) -> None:
+    """Print a table of what there is, and what a rank has of it."""
     how = "counted" if counted == shares.cells.sum() else f"scaled from a lattice of {counted} cells"
     print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
     print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
@@ -108,24 +89,24 @@ def tell_counts(args: argparse.Namespace, scene: Scene, shares: "Partition", cou
     print(f"{positions:{WIDTH}}{24 * scene.stored * shares.nodes.sum() / GB:15.3g}")
 
 
-def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Partition", mesh: float) -> None:
-    """Memory and time, and what they rest on; ``mesh``: bytes that preparing the surface took."""
+def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Partition", mesh: float) -> None:
+    """Print memory and time, and what they rest on; ``mesh``: bytes that preparing the surface took."""
     from msmpetsc.study.forecast import Network, forecast
 
     options, cells = shlex.join(args.petsc_options), shares.cells.sum()
     try:
-        found = forecast(args.scene, args.set, options, scene, surface, cells, args.frames, args.measure_here)
+        expected = forecast(args.scene, args.set, options, scene, surface, cells, args.frames, args.measure_here)
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
-    memory = found.memory(shares, len(surface.points) if scene.output.surface else 0, mesh)
+    memory = expected.memory(shares, len(surface.points) if scene.output.surface else 0, mesh)
     print(f"{'memory [GB]':{WIDTH}}{memory.sum() / GB:15.3g}{memory.mean() / GB:15.3g}{memory.max() / GB:15.3g}")
     every, network = scene.output.every, Network(args.latency, args.bandwidth)
-    computing, messages = every * found.computing(shares), every * found.messages(shares, network)
-    trials = found.coarse, found.fine
+    computing, messages = every * expected.computing(shares), every * expected.messages(shares, network)
+    trials = expected.coarse, expected.fine
     explicit = scene.time.integrator == "verlet"
     first, second = (f"{t.iterations if explicit else t.its:.1f} on {t.cells:.0f}" for t in trials)
-    work = f"{found.iterations(cells):.1f} {'substeps' if explicit else 'outer ones'} a step"
-    work = work if explicit else f"{found.its(cells):.1f} KSP iterations and {work}"
+    work = f"{expected.iterations(cells):.1f} {'substeps' if explicit else 'outer ones'} a step"
+    work = work if explicit else f"{expected.its(cells):.1f} KSP iterations and {work}"
     print(
         f"\ntime of a frame {computing + messages:.3g} s: computing {computing:.3g} s, messages {messages:.3g} s; "
         "without writing it\n"
@@ -135,8 +116,8 @@ def tell_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", share
     )
 
 
-def tell_limits(shares: "Partition") -> None:
-    """At how many cells of this body, on as many ranks, integers end."""
+def print_limits(shares: "Partition") -> None:
+    """Print at how many cells of this body, on as many ranks, integers end."""
     from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
 
     petsc = f"{BITS}-bit PetscInt"
@@ -148,11 +129,11 @@ def tell_limits(shares: "Partition") -> None:
     print()
     for name, (count, limit, integer) in ends.items():
         cells = largest(shares, count, limit)
-        here = "" if cells >= shares.cells.sum() else ", fewer than here: run refuses or fails"
-        print(f"{name} end at {limit} ({integer}): {cells:.3g} cells{here}")
+        too_few = "" if cells >= shares.cells.sum() else ", fewer than here: run refuses or fails"
+        print(f"{name} end at {limit} ({integer}): {cells:.3g} cells{too_few}")
 
 
 def largest(shares: "Partition", count: Callable[["Partition"], float], limit: int) -> float:
-    """The cells with which this body's ``count`` comes to its limit, on as many ranks."""
-    found = brentq(lambda x: np.log(count(shares.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
-    return float(np.exp(found))
+    """Return the number of cells with which this body's ``count`` comes to its limit, on as many ranks."""
+    log_cells = brentq(lambda x: np.log(count(shares.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
+    return float(np.exp(log_cells))

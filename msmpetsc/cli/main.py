@@ -1,127 +1,141 @@
-"""The command line: finds the command, and turns every failure into one line and an exit status."""
+"""The front doors: the command line, whose failures are one line and an exit status, and the same from Python."""
 
-import argparse
+import dataclasses
+import json
 import logging
+import os
 import signal
 import sys
 import traceback
-from itertools import pairwise
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from mpi4py import MPI
-
-from msmpetsc import __version__
-from msmpetsc.cli import compare, fetch, inspect, plan, render, run, study
-from msmpetsc.cli.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
-from msmpetsc.comm import log
+from msmpetsc.cli.arguments import parsed, parsed_apart
 from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
 
-COMMANDS = (run, inspect, study, plan, compare, render, fetch)
-OUR_SHORT = ("-o", "-h")
+if TYPE_CHECKING:  # MPI takes 0.3 s to start, which --help need not wait for
+    from mpi4py import MPI
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns 0, 2 for bad input, 3 for a step that failed (collective)."""
-    comm = MPI.COMM_WORLD
-    _speak_on_root(comm)
+    """Run one command; return 0, 2 for bad input, 3 for a step that failed (collective)."""
+    words = sys.argv[1:] if arguments is None else arguments
+    refused = None
     try:
-        with ending_together(comm):
-            args = parsed(sys.argv[1:] if arguments is None else arguments)
-            return args.run(args)
-    except MsmpetscError as error:
-        if comm.rank == 0:
-            print(f"msmpetsc: error: {error}", file=sys.stderr)
-        return error.exit_status
-    except KeyboardInterrupt:
-        print("msmpetsc: rank 0: interrupted", file=sys.stderr, flush=True)
-        return STATUS_INTERRUPTED
-    except Exception:
-        print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
-        return STATUS_BUG
+        args = parsed(words)  # --help and --version leave from here
+    except InputError as error:
+        refused = error
+    from mpi4py import MPI
+
+    from msmpetsc.cli.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
+
+    comm = MPI.COMM_WORLD
+    with logged_on_root(comm):
+        try:
+            with ending_together(comm):
+                if refused:
+                    raise refused
+                return import_module(f"msmpetsc.cli.{args.command}").run(args)
+        except MsmpetscError as error:
+            if comm.rank == 0:
+                print(f"msmpetsc: error: {error}", file=sys.stderr)
+            return error.exit_status
+        except KeyboardInterrupt:
+            print("msmpetsc: rank 0: interrupted", file=sys.stderr, flush=True)
+            return STATUS_INTERRUPTED
+        except Exception:
+            print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
+            return STATUS_BUG
 
 
 def entry_point() -> None:
-    """Entry point of the installed ``msmpetsc``."""
+    """Be the installed ``msmpetsc``."""
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: one more could only spoil the status
     sys.exit(status)
 
 
-def parsed(arguments: list[str]) -> argparse.Namespace:
-    """All that the command is told. Raises InputError."""
-    ours, petsc = split_petsc_options(arguments)
-    parser = _parser()
-    _refuse_one_dash(parser, ours, petsc)
-    args = parser.parse_args(ours)
-    if petsc and not args.takes_petsc_options:
-        raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
-    args.petsc_options = petsc
-    return args
+def simulate(
+    scene: str | os.PathLike[str] | None = None,
+    output: str | os.PathLike[str] | None = None,
+    *,
+    petsc_options: str | Mapping[str, Any] = "",
+    quiet: bool = False,
+    **options: Any,
+) -> Path:
+    """Run a scene as ``msmpetsc run`` does, and return the path of its result (collective).
+
+    petsc_options : "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3, "ksp_view": None}; for this run alone
+    quiet         : print no notes and no progress; warnings stay
+    options       : those of the command by their names: frames=10, checkpoint_every="5min", set={"cages.count": 3000}
+
+    Raises InputError and StepFailed on all ranks. Stopped by a signal, the run leaves a file that resume="OUT.h5"
+    takes up, and raises what Python raises there: KeyboardInterrupt for SIGINT, SystemExit for SIGTERM.
+    """
+    from mpi4py import MPI
+
+    from msmpetsc.cli.failure import STATUS_INTERRUPTED, ending_together
+    from msmpetsc.cli.run import RunRequest, run
+    from msmpetsc.solve.petsc.words import start_for_runs, words_of
+
+    comm = MPI.COMM_WORLD
+    with logged_on_root(comm, logging.WARNING if quiet else logging.INFO), ending_together(comm):
+        valid = {field.name for field in dataclasses.fields(RunRequest)} - {"petsc_options", "command"}
+        for name in options.keys() - valid:
+            raise InputError(f"run has no option {name!r}{did_you_mean(name, valid)}")
+        positional = [] if scene is None else [os.fspath(scene)]
+        named = {"output": output, **options}
+        ours = ["run", *positional, *(word for item in named.items() for word in command_words(*item))]
+        petsc = words_of(petsc_options)
+        args = parsed_apart(ours, petsc, [*ours, *petsc])
+        start_for_runs(comm, petsc)
+        status = run(args)
+    if status:
+        raise KeyboardInterrupt if status == STATUS_INTERRUPTED else SystemExit(status)
+    return RunRequest.from_args(args).path
 
 
-def split_petsc_options(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Ours, and PETSc's: those of one dash, each with the value that follows it, as PETSc itself reads them."""
-    ours, petsc = [], []
-    for before, word in pairwise(["", *arguments]):
-        ends_it = word.startswith("--") or word in OUR_SHORT or word.endswith(".toml")
-        value = _is_petsc_option(before) and not ends_it
-        (petsc if value or _is_petsc_option(word) else ours).append(word)
-    return ours, petsc
+def command_words(name: str, value: Any) -> list[str]:
+    """Return the words of the command line that say the same as a keyword argument."""
+    option = f"--{name.replace('_', '-')}"
+    if value is None or value is False:
+        return []
+    if value is True:
+        return [option]
+    if isinstance(value, Mapping):
+        value = [f"{key}={toml_value(changed)}" for key, changed in value.items()]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [f"{option}={one_value}" for one_value in values]
 
 
-def _is_petsc_option(word: str) -> bool:
-    return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
+def toml_value(value: Any) -> str:
+    """Return a value as it stands in a line of TOML."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {toml_value(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return json.dumps(value, default=str)
 
 
-def _refuse_one_dash(parser: argparse.ArgumentParser, ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for options of ours that have lost a dash, and for any of PETSc's where there is no use for them."""
-    command = parser.get_default("commands").choices.get(ours[0] if ours else "")
-    if command is None:  # argparse says so
-        return
-    takes_them, known = command.get_default("takes_petsc_options"), command._option_string_actions
-    for word in petsc:
-        name = f"-{word.partition('=')[0]}"
-        if name in known and not (takes_them and name == "--help"):  # PETSc has a -help, too
-            raise InputError(f"{word}: options of one dash are PETSc's, did you mean {name!r}?")
-    if petsc and not takes_them:
-        raise InputError(f"{petsc[0]}: {ours[0]} takes no PETSc options{did_you_mean(f'-{petsc[0]}', known)}")
-
-
-class _Parser(argparse.ArgumentParser):
-    """Speaks on rank 0 only, and names the nearest option for one it does not know."""
-
-    def error(self, message: str) -> None:
-        raise InputError(message)
-
-    def _print_message(self, message: str, file=None) -> None:  # where argparse prints help and version
-        if MPI.COMM_WORLD.rank == 0:
-            super()._print_message(message, file)
-
-    def parse_args(self, arguments: list[str]) -> argparse.Namespace:
-        args, unknown = self.parse_known_args(arguments)
-        if unknown:
-            valid = list(args.parser._option_string_actions)
-            raise InputError(f"{args.command}: unknown argument {unknown[0]}{did_you_mean(unknown[0], valid)}")
-        return args
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="msmpetsc", description=__import__("msmpetsc").__doc__)
-    parser.add_argument("--version", action="version", version=f"msmpetsc {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    parser.set_defaults(commands=commands)
-    for command in COMMANDS:
-        command.add_parser(commands)
-        sub = commands.choices[command.__name__.rpartition(".")[2]]
-        sub.set_defaults(run=command.run, parser=sub, takes_petsc_options=command in (run, inspect))
-    return parser
-
-
-def _speak_on_root(comm: MPI.Comm) -> None:
-    log.handlers = [logging.StreamHandler(sys.stderr)]
-    log.handlers[0].setFormatter(logging.Formatter("msmpetsc: %(levelname)s: %(message)s"))
+@contextmanager
+def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO) -> Iterator[None]:
+    """Let rank 0 alone write the log to stderr, from this level on."""
+    log = logging.getLogger("msmpetsc")
+    before = log.handlers, log.level
     logging.addLevelName(logging.WARNING, "warning")
     logging.addLevelName(logging.INFO, "note")
-    log.setLevel(logging.INFO if comm.rank == 0 else logging.CRITICAL)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("msmpetsc: %(levelname)s: %(message)s"))
+    log.handlers = [handler]
+    log.setLevel(level if comm.rank == 0 else logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log.handlers = before[0]
+        log.setLevel(before[1])
 
 
 if __name__ == "__main__":

@@ -7,8 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_ranks
-from msmpetsc.cli.study import RUNS_ITSELF, stop
+from msmpetsc.cli.arguments import RUNS_ITSELF, interrupt, refuse_below_one, refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 
@@ -16,30 +15,13 @@ NOTHING_MEETS = 3
 HEAD = f"{'method':34} {'time step [s]':>13} {'step error':>10} {'cost [s/s]':>10} {'error':>9}"
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "plan",
-        help="find the cheapest options that meet an error",
-        description="Try integrators, time steps and presets on the first frames of a scene, and say which is the "
-        "cheapest that meets the error. Exit status 3: none does.",
-    )
-    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
-    goal = parser.add_mutually_exclusive_group(required=True)
-    goal.add_argument("--error", type=float, metavar="E", help="relative error of the trajectory")
-    goal.add_argument("--step-error", type=float, metavar="E", help="true relative error of a step")
-    parser.add_argument("--frames", type=int, default=20, metavar="N", help="of the scene's steps, the first N (20)")
-    parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks of the trials")
-    parser.add_argument("--write", action="store_true", help="put the answer into the scene file")
-
-
 def run(args: argparse.Namespace) -> int:
-    """Plan; returns the exit status."""
+    """Plan a scene; return the exit status."""
     refuse_ranks("plan", RUNS_ITSELF)
     target = args.error if args.step_error is None else args.step_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    refuse_below_one(args, "frames", "ranks")
+    refuse_below_one(frames=args.frames, ranks=args.ranks)
     from msmpetsc.study.plan import cheapest
 
     try:
@@ -48,23 +30,23 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{error.filename}: {error.strerror}") from None
     best = cheapest(trials, target)
     if best is None:
-        tell_what_was_reached(trials, target)
+        print_nearest(trials, target)
         return NOTHING_MEETS
-    tell_answer(args, best)
+    print_answer(args, best)
     return 0
 
 
 def try_all(args: argparse.Namespace, target: float) -> list:
-    """The trials, each told of when it is done."""
+    """Make the trials, and print each when it is done."""
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.measure import Bench
     from msmpetsc.study.plan import Planner
     from msmpetsc.study.process import Processes
 
-    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGTERM, interrupt)
     processes = Processes()
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
-        planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, tell)
+        planner = Planner(args.scene, Bench(Path(folder), processes), PRESETS, args.frames, args.ranks, print_trial)
         print(HEAD, flush=True)
         try:
             trials = planner.for_step(target) if args.error is None else planner.for_trajectory(target)
@@ -75,8 +57,8 @@ def try_all(args: argparse.Namespace, target: float) -> list:
             processes.stop()
 
 
-def tell(trial) -> None:
-    """One line of the table of what was tried."""
+def print_trial(trial) -> None:
+    """Print one line of the table of what was tried."""
     method = trial.method
     name = f"{method.preset or method.integrator} {method.options}".strip()
     goal = "" if method.step_error is None else f"{method.step_error:.1e}"
@@ -86,17 +68,18 @@ def tell(trial) -> None:
     print(line.rstrip(), flush=True)
 
 
-def tell_what_was_reached(trials: Sequence, target: float) -> None:
+def print_nearest(trials: Sequence, target: float) -> None:
+    """Print the trial that came nearest to the error."""
     from msmpetsc.study.plan import nearest_miss
 
     best = nearest_miss(trials)
     print(f"\nnothing tried meets {target:g}; the smallest error reached:" if best else "\nnothing tried gave an error")
     if best:
-        tell(best)
+        print_trial(best)
 
 
-def tell_answer(args: argparse.Namespace, best) -> None:
-    """Lines to paste and a command that says the same, or the file changed."""
+def print_answer(args: argparse.Namespace, best) -> None:
+    """Print lines to paste and a command that says the same, or change the file."""
     from msmpetsc.study.case import launcher
     from msmpetsc.study.scene_lines import lines, overrides, put_into
 

@@ -1,62 +1,77 @@
 """What a run cost, as `--measure` writes it: where the time went, memory, and on what machine."""
 
 import json
-import os
 import platform
-import resource
-import shlex
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import psutil
 from mpi4py import MPI
 
 from msmpetsc import __version__
 from msmpetsc.backend.arrays import on_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.fields import Frame
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation
 
 
 class Cost:
-    """Of one run: ``setup`` [s] until its first step, then summed as frames come."""
+    """What a run costs, summed as an observer of its steps.
+
+    setup    : seconds until the first step
+    output   : seconds that observers take: frames and checkpoints are written in them
+    stepping : seconds of the steps
+    """
 
     def __init__(self, comm: MPI.Comm, simulation: "Simulation", setup: float):
         self.comm, self.simulation, self.setup = comm, simulation, setup
-        self.output = self.stepping = 0.0  # [s]
+        self.output = self.stepping = 0.0
         model = simulation.model
         own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, simulation.integrator.unknowns
         self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
 
-    def add(self, stepping: float, begun: float) -> None:
-        """A frame that took ``stepping`` [s] is written, which was ``begun`` at that count of perf_counter."""
-        self.stepping += stepping
-        self.output += perf_counter() - begun
+    @contextmanager
+    def of_output(self) -> Iterator[None]:
+        """Count the time of the block as that of output."""
+        began = perf_counter()
+        yield
+        self.output += perf_counter() - began
 
-    def write(self, path: Path, failure: StepFailed | None = None) -> None:
+    def after_step(self, frame: Frame | None) -> bool:
+        """Count the steps since the frame before."""
+        self.stepping += frame.wall_time if frame else 0.0
+        return False
+
+    def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
         from msmpetsc.solve.instrumentation import times
         from msmpetsc.solve.integrators.stability_limit import explicit_limit
 
         comm, simulation = self.comm, self.simulation
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"
-        told = {"machine": machine(), "device": device, "versions": versions(), "ranks": comm.size}
-        told |= {"command": shlex.join(["msmpetsc", *sys.argv[1:]]), **self.counts}
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
-        told["time"] = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
-        told["time"]["setup"] -= min(told["time"]["factor"], told["time"]["setup"])
-        told["memory"] = comm.allreduce(peak_memory())
-        told["trace"] = simulation.trace
-        told["explicit_limit"] = explicit_limit(comm, simulation.model.lattice, simulation.elasticity)
-        told["failure"] = failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)}
-        on_root(comm, lambda: _write(path, json.dumps(told, indent=1)))
+        time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
+        time["setup"] -= min(time["factor"], time["setup"])
+        record = {
+            "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
+            **self.counts,
+            "time": time,
+            "memory": comm.allreduce(peak_memory()),
+            "trace": simulation.trace,
+            "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
+            "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
+        }  # fmt: skip
+        on_root(comm, lambda: _write(path, json.dumps(record, indent=1)))
 
 
 def refuse_unwritable(path: Path | None) -> None:
-    """Raises InputError before the run rather than after it."""
+    """Raise InputError for a file that cannot be written, before the run rather than after it."""
     if path:
         was_there = path.exists()
         _write(path, "", "a")
@@ -74,24 +89,34 @@ def _write(path: Path, text: str, mode: str = "w") -> None:
 
 
 def peak_memory() -> int:
-    """The most of this process that ever was resident [byte]; getrusage would count that of its parent, too, as it
-    was when this process was started."""
-    status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    found = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
-    return 1024 * (found[0] if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    """Return the most memory of this process that ever was resident [byte].
+
+    getrusage counts that of its parent, too, as it was when this process was started; the kernel's own count does not.
+    """
+    lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
+    peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]
+    return 1024 * peaks[0] if peaks else psutil.Process().memory_info().rss
 
 
-def machine() -> dict:
-    """Processor, cores, memory [bytes], system."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+def machine() -> dict[str, Any]:
+    """Return processor, cores, memory [byte] and system."""
+    return {
+        "cpu": processor(),
+        "cores": psutil.cpu_count(),
+        "memory": psutil.virtual_memory().total,
+        "system": platform.platform(terse=True),
+    }
+
+
+def processor() -> str:
+    """Return the name of the processor, which psutil does not know."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if psutil.LINUX else []
     names = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    cpu = names[0] if names else platform.processor() or platform.machine()
-    return {"cpu": cpu, "cores": os.cpu_count(), "memory": memory, "system": platform.platform(terse=True)}
+    return names[0] if names else platform.processor() or platform.machine()
 
 
-def versions() -> dict:
+def versions() -> dict[str, str]:
+    """Return the versions of this package, PETSc and Python."""
     from petsc4py import PETSc
 
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))

@@ -4,52 +4,32 @@ import argparse
 import signal
 from pathlib import Path
 
-from msmpetsc.cli.arguments import path_argument, refuse_below_one, refuse_name_of_a_file, refuse_ranks
+from msmpetsc.cli.arguments import RUNS_ITSELF, interrupt, refuse_below_one, refuse_name_of_a_file, refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 
-RUNS_ITSELF = "it starts its runs on as many ranks as they need"
-
-
-def add_parser(commands: argparse._SubParsersAction) -> None:
-    """Add the command to the parser."""
-    parser = commands.add_parser(
-        "study",
-        help="sweep methods over scenes",
-        description="Run the cases of a study, each in its own process, into a table and a report. "
-        "Stopped, the same command goes on.",
-    )
-    parser.add_argument("study", type=path_argument, metavar="FILE.toml", help="study file")
-    parser.add_argument("-o", "--output", type=path_argument, metavar="FOLDER", help="default: out/FILE")
-    parser.add_argument("--full", action="store_true", help="also what is marked full = true: the long cases")
-    parser.add_argument("--jobs", type=int, metavar="N", help="cases at a time (they slow each other)")
-    parser.add_argument("--restart", action="store_true", help="forget the cases that are done")
-    only = parser.add_mutually_exclusive_group()
-    only.add_argument("--part", metavar="I/N", help="only the I-th of N parts, for another machine or array task")
-    only.add_argument("--list", action="store_true", help="only say which cases there are, and which are done")
-
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study and write its report; returns the exit status."""
+    """Run the study and write its report; return the exit status."""
     refuse_ranks("study", RUNS_ITSELF)
-    refuse_below_one(args, "jobs")
+    refuse_below_one(jobs=args.jobs)
     refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.runner import run_study
 
-    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGTERM, interrupt)
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
-        tell_cases(args, folder)
+        print_cases(args, folder)
         return 0
     try:
         rows = run_study(args.study, folder, PRESETS, args.full, args.jobs, args.restart, part)
     except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename or folder}: {error.strerror}") from None
-    tell_of(rows)
+    log_failures(rows)
     if part:
         print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report
         return 0
@@ -60,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def part_of(text: str | None):
-    """ "3/16" as the third of 16 parts. Raises InputError."""
+    """Return "3/16" as the third of 16 parts. Raises InputError."""
     from msmpetsc.study.runner import Part
 
     if text is None:
@@ -72,8 +52,8 @@ def part_of(text: str | None):
     return Part(int(index), int(count))
 
 
-def tell_cases(args: argparse.Namespace, folder: Path) -> None:
-    """A line a case; its number is the I of --part I/N, where N is the number of cases."""
+def print_cases(args: argparse.Namespace, folder: Path) -> None:
+    """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
     from msmpetsc.solve.presets import PRESETS
     from msmpetsc.study.case import shown_command
     from msmpetsc.study.runner import list_study
@@ -84,8 +64,8 @@ def tell_cases(args: argparse.Namespace, folder: Path) -> None:
     print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
 
 
-def tell_of(rows: list[dict]) -> None:
-    """What to look at: cases that failed; and of each map how it went, for there failing is an answer."""
+def log_failures(rows: list[dict]) -> None:
+    """Log what deserves a look: cases that failed; and of each map how it went, for there failing is an answer."""
     from msmpetsc.study.outcome import counted
     from msmpetsc.study.rows import mapped, swept, timed
 
@@ -98,8 +78,3 @@ def tell_of(rows: list[dict]) -> None:
         log.info("%s run once: how much their times vary is not known", count)
     for name, group in mapped(rows).items():
         log.info("map %s: %s", name, counted(group))
-
-
-def stop(*_) -> None:
-    """A signal to end is Ctrl-C: the runs under way end with this process."""
-    raise KeyboardInterrupt

@@ -1,15 +1,18 @@
 """Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
 
 from collections.abc import Callable, Sequence
-from importlib import import_module
-from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
+
+if TYPE_CHECKING:
+    import manifold3d
 
 # A repair that keeps less than this of the area did not mend the body but lost it: of
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
@@ -61,12 +64,12 @@ def largest_part(surface: Surface) -> Surface:
 
 def union(surface: Surface) -> Surface:
     """Join the closed parts into one solid. Each counts as solid, so a cavity is filled."""
-    manifold3d = _library("manifold3d", "mesh", "union")
+    import manifold3d  # of the extra "mesh"
+
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
-        _solid(manifold3d, Surface(surface.points, surface.triangles[labels == part]), part)
-        for part in range(labels.max() + 1)
+        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
     ]
     mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
@@ -74,11 +77,14 @@ def union(surface: Surface) -> Surface:
 
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
-    pymeshfix = _library("pymeshfix", "repair", "repair")
+    try:
+        from pymeshfix import MeshFix
+    except ImportError:
+        raise InputError("repair needs pymeshfix: pip install msmpetsc[repair]") from None
     surface = merge(surface)
     if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
         raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
-    fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:
@@ -99,8 +105,9 @@ def simplify(surface: Surface, faces: int) -> Surface:
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
-    library = _library("fast_simplification", "mesh", "simplify")
-    points, triangles = library.simplify(surface.points, surface.triangles, target_count=int(faces))
+    import fast_simplification  # of the extra "mesh"
+
+    points, triangles = fast_simplification.simplify(surface.points, surface.triangles, target_count=int(faces))
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
         return repair(reduced)  # collapsing edges can pinch thin places
@@ -149,7 +156,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
     if (value is not None) != (name in TAKES_VALUE):
         raise InputError(f"prepare: '{name}' takes {'a' if name in TAKES_VALUE else 'no'} value")
     try:
-        result = STEPS[name](surface, *([] if value is None else [value]))
+        result = cached(STEPS[name], surface, *([] if value is None else [value]))
     except InputError as error:
         raise InputError(f"prepare: '{name}': {error}") from error
     except Exception as error:  # what the libraries below raise on odd meshes is not documented
@@ -181,16 +188,10 @@ def _part_labels(surface: Surface) -> np.ndarray:
     return np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
 
 
-def _library(name: str, extra: str, step: str) -> ModuleType:
-    """Return a library that one step alone needs, or raise InputError saying which extra of this package has it."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise InputError(f"{step} needs {name}: pip install msmpetsc[{extra}]") from None
+def _solid(part: Surface, number: int) -> "manifold3d.Manifold":
+    """A part as a solid, turned outwards; InputError if it does not bound one."""
+    import manifold3d
 
-
-def _solid(manifold3d: ModuleType, part: Surface, number: int) -> object:
-    """Return a part as a solid, turned outwards; InputError if it does not bound one."""
     report = examine(part)
     part = compact(part.points, part.triangles)
     triangles = part.triangles if report.volume > 0 else part.triangles[:, ::-1]

@@ -48,6 +48,8 @@ def read_surface(path: str | Path) -> Surface:
             points, faces = _READERS[kind](path, data)
             if faces.ndim != 2 or faces.shape[1] != 3:
                 faces = trimesh.geometry.triangulate_quads(faces)
+    except ModuleNotFoundError:  # a reader's package: says which extra brings it
+        raise
     except Exception as error:  # on garbage the readers raise whatever comes
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error

@@ -1,6 +1,5 @@
 """The schema of a study file: which scenes are run, and with what. Lists are multiplied with each other."""
 
-import re
 import shlex
 from typing import Annotated, ClassVar
 
@@ -9,12 +8,10 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 from msmpetsc.errors import did_you_mean
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.schema import Count, FileName, Integrator, ListOf, Positive, Preset, Table
+from msmpetsc.solve.petsc.words import unsafe_word
 
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]
-SOLVER_OPTION = re.compile(r"-(npc_|inner_|sub_|mg_\w*|esteig_)?(snes|ksp|pc|mat|mg|sub)_\w+")
-PLAIN_VALUE = re.compile(r"([-+]?\.?\d|[^\W\d])[\w.,+-]*")  # no path, no file:name, no module:class
-BESIDE_SOLVING = re.compile(r"^-\w*_(python|view|monitor|dump|load|file|filename|reason|plot|tmpdir|prefix)(_|$)")
 
 
 def _not_empty(values: tuple) -> tuple:
@@ -23,19 +20,9 @@ def _not_empty(values: tuple) -> tuple:
     return values
 
 
-def beside_solving(words: list[str]) -> str | None:
-    """The first of PETSc's options and their values that a file may not hold, if any: it may choose solvers; it may not
-    make PETSc, or us, run code, read files or write them."""
-    for word in words:
-        known = SOLVER_OPTION.fullmatch(word) or PLAIN_VALUE.fullmatch(word)
-        if not known or word == "python" or BESIDE_SOLVING.search(word):
-            return word
-    return None
-
-
 def _words(options: str) -> str:
     try:
-        refused = beside_solving(shlex.split(options))
+        refused = unsafe_word(shlex.split(options))
     except ValueError as error:
         raise rule(f"cannot be taken apart: {str(error).lower()}") from None
     if refused is not None:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ENVIRONMENT, run
+from one_process import IN_ONE_PROCESS, errors
 
-from msmpetsc.cli.main import split_petsc_options
+from msmpetsc.cli.arguments import split_petsc_options
 from msmpetsc.output.reader import finished
 
 SCENE = """
@@ -81,10 +82,6 @@ def alone(*arguments: object, timeout: float = 60) -> subprocess.CompletedProces
 
 def on(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
     return alone(*arguments) if ranks == 1 else run(ranks, *COMMAND, *arguments, timeout=60)
-
-
-def errors(told: str) -> list[str]:
-    return [line for line in told.splitlines() if line.startswith("msmpetsc: error:")]
 
 
 def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
@@ -258,18 +255,6 @@ BAD = {  # what is wrong: arguments after the scene, and what the one line must 
     "two scenes": (["another.toml"], ["unknown argument another.toml"]),
 }
 REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2])]
-IN_ONE_PROCESS = """
-import contextlib, io, json, sys
-from mpi4py import MPI
-from msmpetsc.cli.main import main
-for arguments in json.loads(sys.argv[1]):
-    told = io.StringIO()
-    with contextlib.redirect_stderr(told):
-        status = main(arguments)
-    answers = MPI.COMM_WORLD.gather((status, told.getvalue()))
-    if answers:
-        print(json.dumps(answers), flush=True)
-"""
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import small_result
 from block_scene import block_scene
 from conftest import run
-from test_cli import IN_ONE_PROCESS, errors
+from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.cli.main import main
 

@@ -16,6 +16,7 @@ import pytest
 import trimesh
 
 from msmpetsc.cli import fetch as command
+from msmpetsc.cli.arguments import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import registry
 from msmpetsc.geometry.prepare import STEPS
@@ -216,28 +217,26 @@ def test_the_table_is_sound():
 
 
 def parse(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers())
-    return parser.parse_args(["fetch", *words])
+    return parsed(["fetch", *words])
 
 
 def test_the_command_fetches_and_lists(toy, capsys):
     args = parse("--list")
-    assert args.run(args) == 0
+    assert command.run(args) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     assert set(MODELS) <= set(rows) and "not here" in rows["toybox"] and "free" in rows["toybox"]
 
     args = parse("toybox")
-    assert args.run(args) == 0
+    assert command.run(args) == 0
     output = capsys.readouterr().out
     path = output.splitlines()[0].removeprefix("toybox: ")
     assert len(read_surface(path).triangles) == 12 and "nobody (free)" in output
 
     (toy / "meshes/bunny.ply").write_bytes(b"not the bunny")
     args = parse("--list")
-    assert args.run(args) == 0
+    assert command.run(args) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     assert "fetched" in rows["toybox"] and "another file" in rows["bunny"]
     with pytest.raises(InputError, match="fetch which mesh"):
         args = parse()
-        args.run(args)
+        command.run(args)

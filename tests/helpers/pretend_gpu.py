@@ -18,7 +18,10 @@ from petsc4py import PETSc
 from msmpetsc.solve.petsc import device, memory
 
 # what CuPy 13 has of NumPy's functions, of those that the steps call
-KNOWN = ["array_equal", "asarray", "concatenate", "copyto", "einsum", "empty", "empty_like", "flatnonzero", "linalg.norm", "tile", "vdot", "where", "zeros", "zeros_like"]  # fmt: skip
+KNOWN = [
+    "array_equal", "asarray", "concatenate", "copyto", "einsum", "empty", "empty_like", "flatnonzero", "linalg.norm",
+    "tile", "vdot", "where", "zeros", "zeros_like",
+]  # fmt: skip
 FEW = 9  # numbers are no array that grows with a body
 counted = Counter()
 

@@ -11,14 +11,15 @@ from msmpetsc.output.writer import ResultFile
 
 H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
-NODES = H * np.unique(np.concatenate([CORNERS, CORNERS + [1, 0, 0]]), axis=0)  # (12, 3)
+X = np.array([1, 0, 0])
+NODES = H * np.unique(np.concatenate([CORNERS, CORNERS + X]), axis=0)  # (12, 3)
 POINTS = np.array([[0.1, 0.2, 0.3], [0.6, 0.2, 0.1], [0.9, 0.4, 0.4], [0.5, 0.5, 0.5]])
 SCENE = "[material]\ndensity = 1000\n\n[time]\nstep = 0.01\n"
 
 
 def cells() -> np.ndarray:
     """(2, 8)."""
-    return np.array([[number(H * (corner + [x, 0, 0])) for corner in CORNERS] for x in (0, 1)])
+    return np.array([[number(H * (corner + x * X)) for corner in CORNERS] for x in (0, 1)])
 
 
 def number(place: np.ndarray) -> int:
@@ -41,7 +42,7 @@ def frame(index: int, **other) -> Frame:
     """Frame `index`, with `other` values in place of its own."""
     energies = dict(kinetic=1.0 * index, elastic=2.0 * index, potential=-1.0, contact=0.0)
     numbers = dict(step_error=1e-6, iterations=3, ksp_its=9, wall_time=0.1 * index)
-    arrays = dict(position=position(index), surface=POINTS + [0.01 * index, 0, 0], momentum=np.array([1.0, 0, index]))
+    arrays = dict(position=position(index), surface=POINTS + 0.01 * index * X, momentum=np.array([1.0, 0, index]))
     return Frame(**{"index": index, "time": DT * index, **energies, **numbers, **arrays, **other})
 
 

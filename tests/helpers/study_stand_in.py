@@ -2,8 +2,9 @@
 
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
-What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it, -ksp_children starts another
-process before that, -ksp_exit N ends it with that status, -ksp_kind K tells of a failed step of that kind. Its wall time counts up with the runs of the folder, its motion is off by the time step.
+What it does is ruled by the options: -ksp_fail ends it with an error, -ksp_hang never ends it, -ksp_children starts
+another process before that, -ksp_exit N ends it with that status, -ksp_kind K tells of a failed step of that kind. Its
+wall time counts up with the runs of the folder, its motion is off by the time step.
 """
 
 import json

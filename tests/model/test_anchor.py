@@ -10,7 +10,7 @@ import trimesh
 from block_scene import CELL, SIDES, G, block_scene, play
 from conftest import run
 from mpi4py import MPI
-from test_cli import IN_ONE_PROCESS, errors
+from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import build_model, fill_cages, read_body

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from block_scene import DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
+from obstacles import box, plane
 
-from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.loads import Motion
@@ -18,18 +18,7 @@ from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 T = 0.1
-STILL = Motion.through(())
 SIDEWAYS = Motion.through([Keyframe(time=1.0, by=(0.5, 0.2, 0.0))])
-
-
-def plane(point: list[float], normal: list[float], path: Motion = STILL, **times: float) -> Obstacle:
-    normal = np.array(normal) / np.linalg.norm(normal)
-    return Obstacle(np.array([point], float), normal[None], path, **times)
-
-
-def box(low: list[float], high: list[float], path: Motion = STILL, **times: float) -> Obstacle:
-    points = np.repeat(np.array([low, high], float), 3, axis=0)
-    return Obstacle(points, np.concatenate([-np.eye(3), np.eye(3)]), path, **times)
 
 
 # ---- derivatives

@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import CELL, YOUNG, block_scene, play
+from lattices import block, cages_of
 from mpi4py import MPI
-from test_lattice import block, cages_of
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.elasticity import ONSET, RESISTANCE, Elasticity

@@ -1,32 +1,16 @@
 """The lattice: against its definition by brute force, and the material against elasticity."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lattices import DENSITY, E, H, block, cages_of
 from mpi4py import MPI
 
-from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import Grid, encode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import CORNERS, Lattice, build_lattice
 from msmpetsc.model.material import EDGE, FACE_DIAGONAL, SPACE_DIAGONAL, calibrated_stiffness
-
-E, H, DENSITY = 3e4, 0.2, 800.0
-
-
-def cages_of(cells: np.ndarray, cell_size: float = H) -> Cages:
-    """Cages made of exactly these cells (c, 3)."""
-    grid = Grid(np.array([1.0, -2.0, 3.0]), cell_size, cells.max(axis=0) + 1)
-    table = SortedKeys(MPI.COMM_SELF, encode_morton(cells))
-    return Cages(grid, table, np.ones(len(table.keys), np.uint8))
-
-
-def block(*sides: int) -> np.ndarray:
-    return np.array(list(product(*(range(n) for n in sides))))
 
 
 def springs_by_definition(cells: np.ndarray) -> dict[frozenset, int]:
@@ -102,7 +86,7 @@ def test_a_strained_block_stores_the_energy_of_an_isotropic_solid(name: str, rot
 
 
 def test_the_three_stiffnesses_of_a_bulk_lattice():
-    """E = 7/4 k1 / h and isotropy k1 = k2 + 8/3 k3 (design: lattice elasticity)."""
+    """E = 7/4 k1 / h and isotropy k1 = k2 + 8/3 k3 (msmpetsc/README.md: lattice elasticity)."""
     kinds = np.array([EDGE, FACE_DIAGONAL, SPACE_DIAGONAL])
     k1, k2, k3 = calibrated_stiffness(E, H, kinds, np.array([4, 2, 1]))
     assert 7 / 4 * k1 / H == pytest.approx(E) and k1 == pytest.approx(k2 + 8 / 3 * k3)

@@ -11,10 +11,10 @@ import trimesh
 from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
-from test_cli import IN_ONE_PROCESS
+from one_process import IN_ONE_PROCESS
 
-from msmpetsc.cli.describe import log_model, taken
 from msmpetsc.cli.main import main
+from msmpetsc.cli.march import log_model, taken
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body
 from msmpetsc.model.reach import Reach

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
-from test_contact import box
+from obstacles import box
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model

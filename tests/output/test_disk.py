@@ -8,7 +8,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from test_signals import assert_same, hanging
+from stopped_runs import assert_same, hanging
 
 from msmpetsc.cli.main import main
 from msmpetsc.output.reader import finished

@@ -1,6 +1,5 @@
 """Contact sheets: the moments, the axes, and a picture that shows what it should (never compared as an image)."""
 
-import argparse
 import os
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from PIL import Image
 from scipy.sparse import csr_array
 
 from msmpetsc.cli import render as command
+from msmpetsc.cli.arguments import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import Frame
 from msmpetsc.output import overlays, render
@@ -304,10 +304,8 @@ def test_no_ground_where_the_scene_has_none(tmp_path):
 
 
 def test_command_draws_beside_the_result(result, capsys):
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["render", str(result), "--frames", "2,0,4", "--eye=-1,2,0"])
-    assert args.run(args) == 0
+    args = parsed(["render", str(result), "--frames", "2,0,4", "--eye=-1,2,0"])
+    assert command.run(args) == 0
     assert capsys.readouterr().out.strip() == str(result.with_suffix(".png"))
     assert Image.open(result.with_suffix(".png")).size[0] % 3 == 0
 
@@ -325,11 +323,8 @@ def test_command_draws_beside_the_result(result, capsys):
     ],
 )
 def test_what_cannot_be_drawn_is_told(result, options, told):
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["render", str(result), *options])
     with pytest.raises(InputError, match=told):
-        args.run(args)
+        command.run(parsed(["render", str(result), *options]))
 
 
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):

@@ -13,7 +13,7 @@ from bad_input import TRIALS, damage, damaged, limits
 from conftest import ENVIRONMENT, WORKERS
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_signals import hanging, signal_after
+from stopped_runs import hanging, signal_after
 
 from msmpetsc.cli.main import main
 

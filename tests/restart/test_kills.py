@@ -11,7 +11,7 @@ import time
 import h5py
 import pytest
 from conftest import ENVIRONMENT, WORKERS, run
-from test_signals import assert_same, hanging, ranks_of
+from stopped_runs import assert_same, hanging, ranks_of
 
 from msmpetsc.output.reader import finished
 

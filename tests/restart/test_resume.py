@@ -16,7 +16,7 @@ import tomli_w
 from block_scene import block_scene
 from conftest import WORKERS
 from mpi4py import MPI
-from test_signals import STEPS, assert_same, hanging, signal_after
+from stopped_runs import STEPS, assert_same, hanging, signal_after
 
 from msmpetsc.cli.main import main
 from msmpetsc.cli.resume import Resumed

@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
+from lattices import COMM, T, beam, one_spring, swing, weight
 from mpi4py import MPI
-from test_step import COMM, T, beam, swing, weight
 
 from msmpetsc.model.build import build_model
 from msmpetsc.scene.reading import load_scene
@@ -84,8 +84,6 @@ def test_g_falls_at_every_iteration_of_plain_and_line_searched_methods(preset: s
 
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the other's square."""
-    from test_step import one_spring
-
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     reference = Reference(COMM, lattice, T, touches=False)
@@ -158,7 +156,9 @@ def test_two_solvers_do_not_take_each_others_options():
         first = Stepper(COMM, lattice, T, find_preset("lbfgs"))
         second = Stepper(COMM, lattice, T, find_preset("newton"), prefix="reference_")
         assert first.snes.getType() == "qn" and second.snes.getType() == "newtonls"
-        assert first.control.tightest == 1e-9 and second.control.tightest == float(PRESETS["newton"].options["ksp_rtol"])
+        assert first.control.tightest == 1e-9 and second.control.tightest == float(
+            PRESETS["newton"].options["ksp_rtol"]
+        )
         second.destroy()
         first.destroy()
     finally:

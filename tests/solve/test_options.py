@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from block_scene import block_scene
 from conftest import run
+from lattices import beam, swing, weight
 from mpi4py import MPI
-from test_step import beam, petsc_options, swing, weight  # noqa: F401 (petsc_options is a fixture)
 
-from msmpetsc.cli import compare, fetch, inspect, plan, render, study
+from msmpetsc.cli.arguments import COMMANDS, option_names
 from msmpetsc.cli.main import main
-from msmpetsc.cli.run import add_parser
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -72,7 +71,7 @@ NO_USE = {
 
 
 @pytest.mark.parametrize("name", NO_USE)
-def test_what_cannot_be_of_use_is_one_line_that_says_what_is(petsc_options, name: str):  # noqa: F811
+def test_what_cannot_be_of_use_is_one_line_that_says_what_is(petsc_options, name: str):
     value, word = NO_USE[name]
     petsc_options(**{name: value})
     with pytest.raises(InputError) as refused:
@@ -93,13 +92,13 @@ def test_what_petsc_knows_is_let_through(name: str):
     assert _is_in_library(name)
 
 
-def test_a_size_of_0_below_which_no_step_ends_is_what_presets_say(petsc_options):  # noqa: F811
+def test_a_size_of_0_below_which_no_step_ends_is_what_presets_say(petsc_options):
     petsc_options(snes_stol="0")
     refuse_early(COMM, [])
 
 
 @pytest.mark.parametrize("name", ["ksp_rtol", "pc_type", "mat_type", "snes_type", "snes_max_it", "fallback_ksp_type"])
-def test_values_are_tried_before_there_is_anything_to_solve(petsc_options, name: str):  # noqa: F811
+def test_values_are_tried_before_there_is_anything_to_solve(petsc_options, name: str):
     petsc_options(**{name: "nonsense"})
     solvers = {"": (find_preset("newton"), 0), "fallback_": (find_preset("newton-projected"), 0)}
     with pytest.raises(InputError, match="nonsense"):
@@ -171,14 +170,9 @@ def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options:
 
 
 def test_an_option_of_ours_with_one_dash_is_told_its_name(capsys):
-    import argparse
-
     found = 0
-    for module in (compare, fetch, inspect, plan, render, study, None):
-        name = module.__name__.rpartition(".")[2] if module else "run"
-        commands = argparse.ArgumentParser().add_subparsers()
-        (module.add_parser if module else add_parser)(commands)
-        for option in commands.choices[name]._option_string_actions:
+    for name in COMMANDS:
+        for option in option_names(name):
             if option.startswith("--") and (name, option) not in {("run", "--help"), ("inspect", "--help")}:
                 assert main([name, option[1:], "3"]) == 2
                 assert f"did you mean '{option}'?" in capsys.readouterr().err
@@ -226,7 +220,7 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
     assert seen >= {reasons.CONVERGED_SNORM_RELATIVE, reasons.CONVERGED_ITS}
 
 
-def test_newton_starts_its_solves_where_the_user_says(petsc_options):  # noqa: F811
+def test_newton_starts_its_solves_where_the_user_says(petsc_options):
     petsc_options(ksp_initial_guess_nonzero="1")
     lattice = beam()
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-6)
@@ -235,12 +229,12 @@ def test_newton_starts_its_solves_where_the_user_says(petsc_options):  # noqa: F
     stepper.destroy()
 
 
-def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):  # noqa: F811
+def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):
     petsc_options(ksp_type="chebyshev")
     assert all(result.error <= 1e-3 for result in swing("newton", 2, error=1e-3))
 
 
-def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):  # noqa: F811
+def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):
     petsc_options(snes_monitor_python="gone.monitor")
     with pytest.raises(InputError, match="gone"):
         refuse_bad_values({"": (find_preset("newton"), 0)})
@@ -268,7 +262,7 @@ def PETSC_SELF():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_matrices_are_written_whole(petsc_options, tmp_path: Path, preset: str):  # noqa: F811
+def test_matrices_are_written_whole(petsc_options, tmp_path: Path, preset: str):
     """A alone by -mat_view, whatever solvers assemble beside it; what is preconditioned with, and the operator."""
     names = ("mat_view", "ksp_view_pmat", "ksp_view_mat")
     petsc_options(**{name: f"binary:{tmp_path / name}" for name in names})
@@ -333,7 +327,7 @@ def test_matrices_of_two_ranks_are_those_of_one(tmp_path: Path):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_shown_options_given_back_change_nothing(petsc_options, preset: str):  # noqa: F811
+def test_shown_options_given_back_change_nothing(petsc_options, preset: str):
     before = swing(preset, 2)
     lines = shown_options({"": (find_preset(preset), 0)})
     given = dict(line[1:].split() if " " in line else (line[1:], "") for line in lines if line.startswith("-"))

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lattices import COMM, GRAVITY, T, beam, block, cages_of, one_spring, swing, weight
 from mpi4py import MPI
-from test_lattice import block, cages_of
 
-from msmpetsc.comm import SortedKeys
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
@@ -15,36 +14,6 @@ from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset
-
-T = 1 / 60
-GRAVITY = np.array([0, 0, -9.81])
-COMM = MPI.COMM_SELF
-
-
-def beam(young_modulus: float = 2e5) -> Lattice:
-    """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
-    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), 1000.0, young_modulus=young_modulus)
-    return lattice.pin(lattice.nodes[:, 0] < 1.01)
-
-
-def weight(lattice: Lattice) -> np.ndarray:
-    return lattice.mass[:, None] * GRAVITY
-
-
-def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -> list:
-    """The steps of a beam let go under its weight."""
-    lattice = lattice or beam()
-    stepper = Stepper(COMM, lattice, T, find_preset(preset), **settings)
-    stepper.set_up()
-    q, before, results = lattice.nodes.copy(), lattice.nodes.copy(), []
-    try:
-        for _ in range(steps):
-            result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
-            q, before = result.position, q
-            results.append(result)
-    finally:
-        stepper.destroy()
-    return results
 
 
 def residual(lattice: Lattice, x: np.ndarray, q: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -90,24 +59,6 @@ def test_newton_solves_the_step_to_rounding(reference: list):
     scale = np.linalg.norm(T**2 * weight(lattice))
     for before, q, x in zip(path, path[1:], path[2:], strict=False):
         assert np.linalg.norm(residual(lattice, x, q, before)) < 1e-10 * scale
-
-
-def one_spring(m: float, k: float, r: float) -> Lattice:
-    """A mass on a spring along z from a pinned end."""
-    return Lattice(
-        table=SortedKeys(COMM, np.arange(2)),
-        cell_size=r,
-        nodes=np.array([[0.0, 0, 0], [0, 0, r]]),
-        ghosts=np.empty(0, np.int64),
-        mass=np.full(2, m),
-        cells=np.empty((0, 8), np.int64),
-        cell_kind=np.empty(0, np.uint8),
-        springs=np.array([[0, 1]]),
-        springs_owned=1,
-        rest_length=np.array([r]),
-        stiffness=np.array([k]),
-        pinned=np.array([True, False]),
-    )
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -184,23 +135,6 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
     direct = swing("fast-msm", 4, error=1e-10)[-1].position
     petsc_options(ksp_type="cg", pc_type="icc", ksp_rtol="1e-12")
     np.testing.assert_allclose(swing("fast-msm", 4, error=1e-10)[-1].position, direct, atol=1e-11)
-
-
-@pytest.fixture
-def petsc_options():
-    """Set options as the user would, and take them out again."""
-    from petsc4py import PETSc
-
-    database, names = PETSc.Options(), []
-
-    def set_options(**options: str) -> None:
-        for name, value in options.items():
-            database.setValue(name, value)
-            names.append(name)
-
-    yield set_options
-    for name in names:
-        database.delValue(name)
 
 
 @pytest.mark.parametrize(

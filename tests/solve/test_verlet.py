@@ -6,9 +6,8 @@ import h5py
 import numpy as np
 import pytest
 from block_scene import CELL, G, block_scene, play
+from lattices import block, cages_of, one_spring
 from mpi4py import MPI
-from test_lattice import block, cages_of
-from test_step import one_spring
 
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model

@@ -18,7 +18,7 @@ from test_report import case as row_of
 from test_report import write_table as write_rows
 from test_study import carry_out, stand_in, study_file  # noqa: F401 (stand_in is a fixture)
 
-from msmpetsc.cli.study import tell_of
+from msmpetsc.cli.study import log_failures
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.writer import ResultFile
@@ -220,7 +220,7 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):  # noq
     assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
     assert counted(rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
     with caplog.at_level(INFO, log.name):
-        tell_of(rows)
+        log_failures(rows)
     assert [record.levelno for record in caplog.records if "map n: 1 ok" in record.message] == [INFO]
     assert not any("without figures" in record.message for record in caplog.records)
     page = write_report(tmp_path / "out").read_text()

@@ -1,7 +1,7 @@
 """Runs that are killed at random moments, each in a fork of this process, which has loaded all that they need.
 
-kill_worker.py SCENE FOLDER KILLS SEED prints what was seen as JSON. A chain is the same command again and again, killed,
-until a run comes to its end; then it is made longer by half, and killed on; then comes another chain.
+kill_worker.py SCENE FOLDER KILLS SEED prints what was seen as JSON. A chain is the same command again and again,
+killed, until a run comes to its end; then it is made longer by half, and killed on; then comes another chain.
 """
 
 import json

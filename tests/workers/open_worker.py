@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 
 import msmpetsc
-import msmpetsc.output.reader  # noqa: F401: before the children, or each would import it
+import msmpetsc.output.reader  # before the children, or each would import it
 from msmpetsc.errors import InputError
 
 
@@ -26,7 +26,8 @@ def read_all(path: Path) -> None:
         for group in (run.lattice, run.surface, run.frames):
             for array in group.values():
                 array[:]
-        run.embedding, run.checkpoint, run.scene
+        for name in ("embedding", "checkpoint", "scene"):
+            getattr(run, name)
 
 
 def outcome(path: Path) -> int:

@@ -1,0 +1,348 @@
+"""A run, once PETSc has its options: prepared, its output opened, its steps taken and observed, its files finished."""
+
+import json
+import shlex
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from signal import Signals as Signal
+from time import perf_counter
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from tqdm import tqdm
+
+from msmpetsc import __version__
+from msmpetsc.backend.compiling import compilation_logged
+from msmpetsc.cli.arguments import option_names
+from msmpetsc.cli.failure import ending_together
+from msmpetsc.cli.observers import STATUS, Checkpoints, FrameWriter, Interval, Observer, ProgressLine, Signals
+from msmpetsc.cli.profile import Cost, refuse_unwritable, versions
+from msmpetsc.cli.request import RunRequest
+from msmpetsc.cli.resume import Resumed, stored_scene
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.reach import Reach
+from msmpetsc.output.progress import duration
+from msmpetsc.output.restart import Earlier
+from msmpetsc.output.writer import Begin, ResultFile
+from msmpetsc.output.xdmf import write_xdmf
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Scene
+from msmpetsc.solve.instrumentation import Probes, begin_timing
+from msmpetsc.solve.options import refuse_early
+from msmpetsc.solve.petsc.device import choose
+from msmpetsc.solve.presets import PRESETS
+from msmpetsc.solve.simulate import Simulation, refuse_bad_options
+
+MOST_NAMED = 12  # tables whose nodes are counted one by one
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What a run does, once its request is understood.
+
+    began           : count of perf_counter when that began [s]
+    attributes      : what the file says of the run that made it
+    kernels_are_new : whether numba's cache was empty
+    """
+
+    request: RunRequest
+    scene: Scene
+    probes: Probes
+    interval: Interval
+    resumed: Resumed | None
+    attributes: dict[str, str | int]
+    began: float
+    kernels_are_new: bool
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the file has all frames already."""
+        return self.resumed is not None and self.resumed.is_done
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a march ended: at its last step, by a signal, or by a step that failed."""
+
+    simulation: Simulation
+    file: ResultFile
+    cost: Cost
+    signal: int
+    failure: StepFailed | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all steps were taken."""
+        return not self.signal and self.failure is None
+
+
+def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, kernels_are_new: bool) -> RunPlan:
+    """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
+    refuse_early(comm, option_names("run"))
+    choose(comm, request.device)
+    began = perf_counter()
+    if request.measure:
+        begin_timing()
+    probes, interval = Probes(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
+    scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
+    refuse_bad_options(comm, scene, probes)
+    refuse_steps_beyond(scene.time.steps, request, earlier.step if earlier else 0)
+    on_root(comm, lambda: refuse_unwritable(request.measure))
+    attributes = attributes_of(comm, scene, request)
+    resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
+    return RunPlan(request, scene, probes, interval, resumed, attributes, began, kernels_are_new)
+
+
+def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
+    """Build the model and take its steps; after each, call the observers (collective)."""
+    failure = None
+    with (
+        compilation_logged(plan.kernels_are_new),
+        Signals(comm) as signals,
+        open_output(comm, plan) as file,
+        Simulation(comm, plan.scene, described_model(comm, plan), plan.probes) as simulation,
+    ):
+        try:
+            with ending_together(comm):
+                simulation.refuse_unused_options()
+                cost = Cost(comm, simulation, perf_counter() - plan.began)
+                frames = start_output(comm, plan, file, simulation)
+                checkpoints = Checkpoints(file, simulation, plan.interval, signals)
+                with ProgressLine.shown(comm, simulation.steps) as progress:
+                    observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
+                    signals.begin()
+                    for frame in simulation.advance():
+                        with cost.of_output():
+                            stops = [observer.after_step(frame) for observer in observers]
+                        if any(stops):
+                            break
+        except StepFailed as error:
+            failure = error  # the frames before it are worth a look
+        file.close(trim=not checkpoints.signal)
+    return Outcome(simulation, file, cost, checkpoints.signal, failure)
+
+
+def finish(comm: MPI.Intracomm, plan: RunPlan, outcome: Outcome, started: float) -> int:
+    """Write what stands beside the result and say how the run ended; return the exit status (collective).
+
+    started : count of perf_counter at the start of the command [s]
+
+    Raises the StepFailed that ended the run.
+    """
+    request, simulation = plan.request, outcome.simulation
+    if request.measure:
+        outcome.cost.write(request.measure, request.command, outcome.failure)
+    on_root(comm, lambda: write_companions(request, outcome.is_whole))
+    left = files_of(request, outcome.is_whole)
+    on_root(comm, lambda: log_end(outcome.file.finished, perf_counter() - started, outcome.cost.setup, left))
+    if outcome.failure:
+        raise outcome.failure
+    if outcome.signal:
+        return tell_stop(outcome.signal, request.path, simulation)
+    simulation.refuse_unused_options(at_end=True)
+    return 0
+
+
+def tell_done(comm: MPI.Intracomm, plan: RunPlan) -> int:
+    """Finish the files of a run that has all its frames; return the exit status (collective)."""
+    on_root(comm, lambda: write_companions(plan.request, whole=True))
+    log.info("%s has all its %d frames: nothing left to do", plan.request.path, plan.scene.stored)
+    return 0
+
+
+# Before the steps
+
+
+def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
+    """Read the scene with what the request changes; --set comes last and wins."""
+
+    def changed(changes: list[str]) -> Scene:
+        if request.scene is not None:
+            return load_scene(request.scene, changes, PRESETS)
+        assert earlier is not None  # as earlier_run sees to
+        return stored_scene(earlier, changes, PRESETS)
+
+    changes = [] if request.preset is None else [f"solver.preset={json.dumps(request.preset)}"]
+    changes += [] if request.error is None else [f"solver.error={request.error}"]
+    changes += request.set
+    scene = changed(changes)
+    if request.frames is None:
+        return scene
+    return changed([*changes, f"time.duration={request.frames * scene.time.step!r}"])
+
+
+def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
+    """Raise InputError for steps to be measured that the run does not come to, or that it took before."""
+    if request.trace is not None and request.trace <= taken:
+        raise InputError(f"--trace {request.trace}: the run goes on after step {taken}")
+    for option, number in {"--true-error": request.true_error, "--trace": request.trace}.items():
+        if number is not None and number > steps:
+            raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
+
+
+def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
+    """Return what the file says of the run that made it; PETSc's options are the user's, before ours are among them."""
+    options = PETSc.Options().getAll().items()
+    return {
+        "msmpetsc_version": __version__,
+        "petsc_version": versions()["petsc"],
+        "petsc_options": " ".join(f"-{name} {shlex.quote(value)}" if value else f"-{name}" for name, value in options),
+        "ranks": comm.size,
+        "command": request.command,
+        "scene": scene.text,
+        "scene_file": str(request.scene.resolve()) if request.scene else "",
+        "true_error": request.true_error or 0,
+    }
+
+
+def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
+    """Open the file to write into: a new one, or that of the run that goes on (collective)."""
+    request = plan.request
+    if plan.resumed:
+        return plan.resumed.file(comm, plan.attributes, request.gather)
+    begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
+    return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
+
+
+def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
+    """Build the model and say what it is made of (collective)."""
+    model = build_model(comm, plan.scene)
+    log_model(comm, model)
+    if plan.resumed:
+        plan.resumed.refuse_other_lattice(comm, model)
+    return model
+
+
+def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, simulation: Simulation) -> int:
+    """Write the model, go on where an earlier run stopped, and make room for frames (collective).
+
+    Returns the number of frames of the steps taken so far.
+    """
+    write_model(comm, file, simulation.model)
+    if plan.resumed:
+        plan.resumed.restore(comm, file, simulation)
+    lattice, embedding = simulation.model.lattice, simulation.model.embedding
+    points = embedding.points if embedding else None
+    file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
+    return simulation.stored_until(simulation.step) if simulation.step else 0
+
+
+def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
+    """Write the parts of the file that do not change with time (collective)."""
+    lattice, owned = model.lattice, model.lattice.owned
+    springs = slice(lattice.springs_owned)
+    numbers = lattice.global_numbers
+    file.write("lattice/nodes", lattice.nodes[:owned])
+    file.write("lattice/cells", lattice.cells)
+    file.write("lattice/cell_kind", lattice.cell_kind)
+    file.write("lattice/springs", numbers[lattice.springs[springs]])
+    file.write("lattice/rest_length", lattice.rest_length[springs])
+    file.write("lattice/stiffness", lattice.stiffness[springs])
+    file.write("lattice/mass", lattice.mass)
+    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
+    surface, embedding = model.surface, model.embedding
+    if embedding is None:
+        return
+    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
+    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
+    offset = comm.exscan(len(embedding.indices)) or 0
+    indptr = embedding.indptr[1:] + offset
+    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
+    file.write("embedding/indices", embedding.indices)
+    file.write("embedding/weights", embedding.weights)
+
+
+# After the steps
+
+
+def write_companions(request: RunRequest, whole: bool) -> None:
+    """Write the XDMF file, and for a whole run pack the result and draw it where asked. Raises InputError."""
+    path = request.path
+    if whole and request.compress:
+        from msmpetsc.output.compress import pack
+
+        pack(path)
+    try:
+        write_xdmf(path)
+    except OSError as error:
+        raise InputError(f"{path.with_suffix('.xdmf')} cannot be written: {error.strerror}") from None
+    if whole and request.picture:
+        from msmpetsc.output.render import contact_sheet  # loads VTK: a second that other runs need not wait
+
+        contact_sheet(path, path.with_suffix(".png"))
+
+
+def files_of(request: RunRequest, whole: bool) -> list[Path]:
+    """List the files that a run leaves, the result first; a picture is drawn of a whole one."""
+    path = request.path
+    picture = [path.with_suffix(".png")] if request.picture and whole else []
+    return [path, path.with_suffix(".xdmf"), *picture, *([request.measure] if request.measure else [])]
+
+
+def tell_stop(number: int, path: Path, simulation: Simulation) -> int:
+    """Say in one line how to go on after a signal; return the exit status of that signal."""
+    log.warning(
+        "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",
+        Signal(number).name, simulation.step, simulation.steps, simulation.step * simulation.time_step,
+        shlex.quote(str(path)),
+    )  # fmt: skip
+    return STATUS[number]
+
+
+# What a run says of itself
+
+
+def log_model(comm: MPI.Intracomm, model: Model) -> None:
+    """Log size, volume and mass of body and lattice, counts, and nodes that the scene's tables take (collective)."""
+    lattice, body = model.lattice, model.body
+    assert body is not None  # as in every model that build_model makes
+    held = int(lattice.pinned[: lattice.owned].sum())
+    own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum())
+    cells, springs, pinned, mass = (comm.allreduce(number) for number in own)
+    volume, enclosed = cells * lattice.cell_size**3, abs(body.report.volume)
+    mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
+    if body.report.closed:
+        mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
+    size = sides(body.bounds[1] - body.bounds[0])
+    log.info("body of %s m; %s; lattice of %.4g m^3, %.4g kg", size, mesh, volume, mass)
+    log.info(
+        "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
+        cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
+    )  # fmt: skip
+    if named := taken(model.reaches):
+        log.info("%s", ", ".join(named))
+
+
+def sides(lengths: Iterable[float]) -> str:
+    """Return "0.3 x 0.2325 x 0.2974" of three lengths."""
+    return " x ".join(f"{length:.4g}" for length in lengths)
+
+
+def taken(reaches: Iterable[Reach]) -> list[str]:
+    """Name what each anchor and force takes; of a force's nodes some may be held, which take their part of it, too."""
+    named = []
+    for reach in reaches:
+        if reach.key.startswith("anchor"):
+            named.append(f"{reach.key} leads {reach.nodes - reach.held} nodes")
+        elif reach.key.startswith("force"):
+            held = f" ({reach.held} of them held)" if reach.held else ""
+            named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
+    more = len(named) - MOST_NAMED
+    return named if more <= 1 else [*named[:MOST_NAMED], f"and {more} more"]
+
+
+def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
+    """Log how long it took [s], and which files there are; the first of them holds the frames."""
+    sizes = {path: tqdm.format_sizeof(path.stat().st_size, "B") for path in files if path.is_file()}
+    result, *others = (f"{path} ({size})" for path, size in sizes.items())
+    log.info("took %s, %s of it before the first step", spoken(seconds), spoken(setup))
+    log.info("left %d frame%s in %s", frames, "s" * (frames != 1), ", ".join([result, *others]))
+
+
+def spoken(seconds: float) -> str:
+    """Return a time as a person would say it; short ones with a digit more."""
+    return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)

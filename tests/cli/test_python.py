@@ -1,0 +1,135 @@
+"""Runs from Python: msmpetsc.run says and writes what the command does, and raises where that returns a status."""
+
+import signal
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import block_scene
+from conftest import run
+
+import msmpetsc
+from msmpetsc.cli.main import command_words, main
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.output.reader import finished
+from msmpetsc.solve.petsc.words import options_of, words_of
+
+FALL = {"gravity": {"acceleration": [0, 0, -9.81]}, "time": {"step": 0.01, "duration": 0.05}}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    return block_scene(tmp_path, **FALL)
+
+
+def positions(path: Path) -> np.ndarray:
+    with h5py.File(path) as file:
+        return file["frames/position"][...]
+
+
+def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
+    path = msmpetsc.run(scene, tmp_path / "python.h5", frames=2, set={"material.density": 900.0}, preset="newton")
+    assert path == tmp_path / "python.h5" and path.with_suffix(".xdmf").is_file()
+    assert "frame 2/2" in capsys.readouterr().err
+    words = ["--frames", "2", "--set", "material.density=900.0", "--preset", "newton"]
+    assert main(["run", str(scene), "-o", str(tmp_path / "command.h5"), *words]) == 0
+    assert np.array_equal(positions(path), positions(tmp_path / "command.h5"))
+    with msmpetsc.open(path) as result:  # what it was is a command that can be pasted
+        assert result.attributes["command"].startswith(f"msmpetsc run {scene} --output={path} --frames=2 --set=")
+
+
+def test_quietly(scene: Path, tmp_path: Path, capsys):
+    msmpetsc.run(scene, tmp_path / "x.h5", frames=1, quiet=True)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):
+    from petsc4py import PETSc
+
+    msmpetsc.run(scene, tmp_path / "first.h5", frames=1, quiet=True, preset="newton")
+    before = PETSc.Options().getAll()
+    for options in ("-ksp_rtol 1e-3 -ksp_max_it 77", {"ksp_rtol": 1e-3, "-ksp_max_it": 77}):
+        path = msmpetsc.run(
+            scene, tmp_path / "x.h5", frames=1, overwrite=True, quiet=True, preset="newton", petsc_options=options
+        )
+        with msmpetsc.open(path) as result:
+            assert options_of(result.attributes["petsc_options"].split()) | before == {
+                "ksp_rtol": "0.001" if isinstance(options, dict) else "1e-3", "ksp_max_it": "77", **before,
+            }  # fmt: skip
+        assert PETSc.Options().getAll() == before
+    with pytest.raises(InputError, match="-ksp_tpye: no part of this run"):
+        msmpetsc.run(scene, tmp_path / "y.h5", quiet=True, petsc_options={"ksp_tpye": "cg"})
+    assert PETSc.Options().getAll() == before
+    with pytest.raises(InputError, match="-malloc_debug: PETSc runs already"):
+        msmpetsc.run(scene, tmp_path / "y.h5", quiet=True, petsc_options="-malloc_debug")
+    assert not (tmp_path / "y.h5").exists()
+
+
+WRONG = {
+    "run has no option 'frame', did you mean 'frames'": {"frame": 3},
+    "--frames: invalid int value": {"frames": 2.5},
+    "--frames must be at least 1": {"frames": 0},
+    "material.dens": {"set": {"material.dens": 1}},
+    "PETSc options begin with a dash": {"petsc_options": "ksp_rtol 1e-3"},
+    "is no name of an option": {"petsc_options": {"ksp rtol": 1e-3}},
+    "--trace needs --measure": {"trace": 1},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_cannot_be_meant_raises(scene: Path, tmp_path: Path, words: str):
+    with pytest.raises(InputError) as raised:
+        msmpetsc.run(scene, tmp_path / "x.h5", quiet=True, **WRONG[words])
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_a_step_that_fails_raises_and_leaves_the_frames_before_it(scene: Path, tmp_path: Path):
+    pull = [{"region": {"box": [[-1, -1, -1], [0.1, 2, 2]]}, "total": [1e4, 0, 0], "start": 0.025}]
+    scene = block_scene(tmp_path, **FALL | {"gravity": {"acceleration": [0, 0, 0]}, "force": pull})
+    with pytest.raises(StepFailed, match="frame 3 "):
+        msmpetsc.run(scene, tmp_path / "x.h5", quiet=True, preset="newton", error=1e-12, petsc_options="-snes_max_it 1")
+    with h5py.File(tmp_path / "x.h5") as file:
+        assert finished(file) == 3
+
+
+def test_an_interrupt_raises_and_the_run_goes_on(scene: Path, tmp_path: Path, monkeypatch):
+    from test_signals import signal_after
+
+    with monkeypatch.context() as patch:
+        signal_after(patch, 2, signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            msmpetsc.run(scene, tmp_path / "x.h5", quiet=True)
+    path = msmpetsc.run(resume=tmp_path / "x.h5", quiet=True)
+    assert len(positions(path)) == 6
+
+
+def test_keywords_are_said_as_words():
+    assert command_words("true_error", 3) == ["--true-error=3"]
+    assert command_words("picture", True) == ["--picture"] and command_words("picture", False) == []
+    changes = {"pin": [{"region": {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}}], "title": "a b"}
+    assert command_words("set", changes) == [
+        "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
+        '--set=title="a b"',
+    ]
+    assert words_of({"ksp_view": None, "options_left": False}) == ["-ksp_view", "-options_left", "false"]
+
+
+ON_RANKS = """
+import sys, msmpetsc
+from msmpetsc.errors import InputError
+path = msmpetsc.run(sys.argv[1], sys.argv[2], frames=1, petsc_options={"info": ":/dev/null", "ksp_rtol": 1e-3})
+msmpetsc.run(sys.argv[1], sys.argv[2], frames=1, overwrite=True, quiet=True)
+try:
+    msmpetsc.run(sys.argv[1], sys.argv[2], quiet=True)
+except InputError as error:
+    print("refused:", str(error).partition(" exists")[1])
+"""
+
+
+def test_on_all_ranks(scene: Path, tmp_path: Path):
+    done = run(2, "-c", ON_RANKS, scene, tmp_path / "x.h5", timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("refused:") == done.stdout.count(" exists") == 2  # raised on both
+    assert done.stderr.count("frame 1/1") == 1

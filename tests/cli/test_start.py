@@ -1,0 +1,54 @@
+"""How a command starts: help and refusals import little, and a command imports what it needs itself."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from conftest import ENVIRONMENT, run
+
+SLOW = {"numba", "numpy", "scipy", "h5py", "mpi4py", "petsc4py", "pydantic", "trimesh", "meshio", "pyvista"}
+IMPORTS = """
+import json, sys
+from msmpetsc.cli.main import main
+try:
+    main(sys.argv[1:])
+except SystemExit:
+    pass
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+"""
+ALONE = {name: value for name, value in ENVIRONMENT.items() if not name.startswith(("OMPI_COMM", "PMI", "SLURM"))}
+
+
+def imports(code: str, *arguments: str) -> set[str]:
+    """Packages that Python has imported after the code."""
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, env=ALONE, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "run --help", "study --help", "fetch -h"])
+def test_help_starts_neither_mpi_nor_petsc_nor_a_compiler(words: str):
+    assert imports(IMPORTS, *words.split()) & SLOW == set()
+
+
+def test_the_package_itself_imports_nothing_slow():
+    code = "import json, sys, msmpetsc\nprint(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    assert imports(code) & SLOW == set()
+
+
+def test_a_run_imports_neither_charts_nor_other_commands(tmp_path):
+    assert imports(IMPORTS, "run", str(tmp_path / "gone.toml")) & {"matplotlib", "pyvista", "pandas", "jinja2"} == set()
+
+
+def test_help_is_printed_once_whatever_the_number_of_ranks():
+    done = run(3, "-m", "msmpetsc", "--help", timeout=60)
+    assert done.returncode == 0 and done.stderr == ""
+    assert done.stdout.count("usage: msmpetsc") == 1
+
+
+def test_a_bad_argument_is_refused_once_on_all_ranks():
+    done = run(2, "-m", "msmpetsc", "run", "--presett", "newton", timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.count("unknown argument --presett, did you mean '--preset'?") == 1

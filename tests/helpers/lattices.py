@@ -1,0 +1,74 @@
+"""Lattices of a few cells, a mass on a spring, and a beam that swings."""
+
+from itertools import product
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.grid import Grid, encode_morton
+from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
+
+E, H, DENSITY = 3e4, 0.2, 800.0
+T = 1 / 60
+GRAVITY = np.array([0, 0, -9.81])
+COMM = MPI.COMM_SELF
+
+
+def cages_of(cells: np.ndarray, cell_size: float = H) -> Cages:
+    """Cages made of exactly these cells (c, 3)."""
+    grid = Grid(np.array([1.0, -2.0, 3.0]), cell_size, cells.max(axis=0) + 1)
+    table = SortedKeys(MPI.COMM_SELF, encode_morton(cells))
+    return Cages(grid, table, np.ones(len(table.keys), np.uint8))
+
+
+def block(*sides: int) -> np.ndarray:
+    return np.array(list(product(*(range(n) for n in sides))))
+
+
+def beam(young_modulus: float = 2e5) -> Lattice:
+    """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
+    lattice = build_lattice(cages_of(block(8, 2, 2), 0.1), 1000.0, young_modulus=young_modulus)
+    return lattice.pin(lattice.nodes[:, 0] < 1.01)
+
+
+def weight(lattice: Lattice) -> np.ndarray:
+    return lattice.mass[:, None] * GRAVITY
+
+
+def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -> list:
+    """The steps of a beam let go under its weight."""
+    lattice = lattice or beam()
+    stepper = Stepper(COMM, lattice, T, find_preset(preset), **settings)
+    stepper.set_up()
+    q, before, results = lattice.nodes.copy(), lattice.nodes.copy(), []
+    try:
+        for _ in range(steps):
+            result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
+            q, before = result.position, q
+            results.append(result)
+    finally:
+        stepper.destroy()
+    return results
+
+
+def one_spring(m: float, k: float, r: float) -> Lattice:
+    """A mass on a spring along z from a pinned end."""
+    return Lattice(
+        table=SortedKeys(COMM, np.arange(2)),
+        cell_size=r,
+        nodes=np.array([[0.0, 0, 0], [0, 0, r]]),
+        ghosts=np.empty(0, np.int64),
+        mass=np.full(2, m),
+        cells=np.empty((0, 8), np.int64),
+        cell_kind=np.empty(0, np.uint8),
+        springs=np.array([[0, 1]]),
+        springs_owned=1,
+        rest_length=np.array([r]),
+        stiffness=np.array([k]),
+        pinned=np.array([True, False]),
+    )

@@ -1,0 +1,18 @@
+"""Planes and boxes as obstacles."""
+
+import numpy as np
+
+from msmpetsc.model.contact.obstacle import Obstacle
+from msmpetsc.model.loads import Motion
+
+STILL = Motion.through(())
+
+
+def plane(point: list[float], normal: list[float], path: Motion = STILL, **times: float) -> Obstacle:
+    normal = np.array(normal) / np.linalg.norm(normal)
+    return Obstacle(np.array([point], float), normal[None], path, **times)
+
+
+def box(low: list[float], high: list[float], path: Motion = STILL, **times: float) -> Obstacle:
+    points = np.repeat(np.array([low, high], float), 3, axis=0)
+    return Obstacle(points, np.concatenate([-np.eye(3), np.eye(3)]), path, **times)

@@ -1,0 +1,62 @@
+"""Runs to be stopped: a hanging block, signals at a step, the ranks of an mpiexec; whether two results are the same."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import block_scene
+
+from msmpetsc.output.reader import finished
+
+EVERY, STEPS = 3, 40
+
+
+def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
+    """A soft block that hangs by one side and swings, a frame every third step."""
+    side = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
+    material = {"young_modulus": 1e5, "density": 1000.0}
+    output = {"surface": True, "every": EVERY}
+    gravity = {"acceleration": [0.0, 1.0, -9.81]}
+    scene = dict(
+        gravity=gravity, pin=side, time={"step": 0.01, "duration": 0.01 * steps}, material=material, output=output
+    )
+    return block_scene(folder, **scene | {"solver": {"preset": "newton", "error": 1e-3}} | tables)
+
+
+def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
+    """All frames of two files, bit by bit unless they may differ, but for how long they took."""
+    with h5py.File(path) as one, h5py.File(whole) as other:
+        assert one["frames"].keys() == other["frames"].keys() and finished(one) == finished(other)
+        names = ["frames/position"] if rtol else [f"frames/{name}" for name in one["frames"] if name != "wall_time"]
+        for name in names:
+            found, expected = one[name][...], other[name][...]
+            assert found.shape == expected.shape, name
+            if rtol:
+                np.testing.assert_allclose(found, expected, rtol=0, atol=rtol * np.abs(expected).max())
+            else:
+                assert np.array_equal(found, expected, equal_nan=True), name
+
+
+def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
+    """This process gets the signal when the run has taken that step."""
+    from msmpetsc.solve.simulate import Simulation
+
+    advance = Simulation.advance
+
+    def watched(simulation):
+        for frame in advance(simulation):
+            if simulation.step == step:
+                os.kill(os.getpid(), number)
+            yield frame
+
+    monkeypatch.setattr(Simulation, "advance", watched)
+
+
+def ranks_of(mpiexec: subprocess.Popen) -> list[int]:
+    """Process numbers of its ranks."""
+    children = Path(f"/proc/{mpiexec.pid}/task/{mpiexec.pid}/children").read_text().split()
+    return sorted(int(child) for child in children if b"python" in Path(f"/proc/{child}/cmdline").read_bytes())

@@ -159,10 +159,8 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
     """
-    try:
-        import igl
-    except ImportError:
-        raise InputError("an open mesh needs libigl: pip install msmpetsc[mesh]; or close its holes") from None
+    import igl  # for open surfaces alone
+
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = boundary @ PACK

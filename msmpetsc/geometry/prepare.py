@@ -69,8 +69,7 @@ def union(surface: Surface) -> Surface:
     surface = merge(surface)
     labels = _part_labels(surface)
     parts = [
-        _solid(Surface(surface.points, surface.triangles[labels == part]), part)
-        for part in range(labels.max() + 1)
+        _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
     ]
     mesh = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add).to_mesh64()
     return Surface(mesh.vert_properties[:, :3].copy(), mesh.tri_verts.astype(np.int64))
@@ -78,12 +77,11 @@ def union(surface: Surface) -> Surface:
 
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
-    import pymeshfix  # of the extra "repair"
 
     surface = merge(surface)
     if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
         raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
-    fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:

@@ -7,7 +7,6 @@ Enclosed cells: scipy.ndimage.label on the dense grid.
 """
 
 import os
-import sys
 import tracemalloc
 from pathlib import Path
 
@@ -293,12 +292,6 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     cages = fill(body, 0.1)
     assert len(cages.kind) == 150
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
-
-
-def test_an_open_box_without_libigl_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "igl", None)
-    with pytest.raises(InputError, match=r"pip install msmpetsc\[mesh\]"):
-        fill(aligned_box(lid=False), 0.1)
 
 
 def test_the_longest_side_may_be_any():

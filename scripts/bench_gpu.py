@@ -34,6 +34,7 @@ from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.profile import machine, versions
 from msmpetsc.model.build import Model, build_model, to_device
+from msmpetsc.model.springs import SpringGather
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns
@@ -188,6 +189,7 @@ def parts(model: Model, time_step: float) -> dict[str, float]:
     }
     if not arrays.on_host(q):
         around = elasticity.springs
+        assert isinstance(around, SpringGather)  # as on every GPU
         tables = around.neighbour, around.stiffness
         found["A, by a kernel"] = seconds_of(lambda: laplacian_around(len(q), q, *tables, gradient))
         product = stepper.jacobian.hessian.mult

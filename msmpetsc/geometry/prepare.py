@@ -77,11 +77,12 @@ def union(surface: Surface) -> Surface:
 
 def repair(surface: Surface) -> Surface:
     """Close holes and remove self-intersections (pymeshfix, GPL-3, optional)."""
+    import pymeshfix  # of the extra "repair"
 
     surface = merge(surface)
     if np.abs(surface.points).max() > FARTHEST:  # numbers much larger crash it
         raise InputError(f"coordinates beyond {FARTHEST:g} cannot be repaired")
-    fix = MeshFix(surface.points, surface.triangles.astype(np.int32))
+    fix = pymeshfix.MeshFix(surface.points, surface.triangles.astype(np.int32))
     fix.repair(joincomp=False, remove_smallest_components=False)
     repaired = Surface(np.asarray(fix.points, np.float64), np.asarray(fix.faces, np.int64))
     if len(repaired.triangles) == 0:

@@ -166,8 +166,8 @@ class Environment:
 
     def friction_work_bound(
         self,
-        before: tuple[np.ndarray, np.ndarray],
-        after: tuple[np.ndarray, np.ndarray],
+        before: tuple[np.ndarray, np.ndarray | None],
+        after: tuple[np.ndarray, np.ndarray | None],
         time: float,
         time_step: float,
     ) -> float:
@@ -175,7 +175,7 @@ class Environment:
 
         It is mu N times how far they go.
 
-        before, after : positions (owned, 3) [m] and sides (o, owned or more)
+        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
@@ -184,7 +184,8 @@ class Environment:
             way = float(np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step)))
             if p.friction > 0 and way > 0:
                 for (q, sides), when in ((before, time - time_step), (after, time)):
-                    inside, _ = p.at(when, sides[row, : len(q)]).depths(q)
+                    side = (self.no_sides if sides is None else sides)[row, : len(q)]
+                    inside, _ = p.at(when, side).depths(q)
                     work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 

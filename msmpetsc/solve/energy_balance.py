@@ -194,7 +194,6 @@ class EnergyBalance:
         free = ~environment.fixed_at(time)[owned]
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.push(when, sides)
-        sides = environment.no_sides if sides is None else sides
         known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),

@@ -16,7 +16,9 @@ from pathlib import Path
 PROGRAM = "msmpetsc.cli.main"
 COLD = [sys.executable, "-m", "msmpetsc"]  # a command that starts it begins with this
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(["msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.run", "msmpetsc.model.build"])  # all but PETSc
+SERVER.set_forkserver_preload(
+    ["msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.run", "msmpetsc.model.build"]
+)  # all but PETSc
 
 
 class Forked:

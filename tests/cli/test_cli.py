@@ -41,7 +41,8 @@ ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
 
 def write_ply(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
     """In text, so that NaN and infinity get through."""
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty double x\nproperty double y\nproperty double z\n"
+    coordinates = "".join(f"property double {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{coordinates}"
     head += f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = [*points.tolist(), *([3, *corners] for corners in triangles.tolist())]
     path.write_text(head + "".join(" ".join(map(str, row)) + "\n" for row in rows))

@@ -208,7 +208,7 @@ def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log, 
 def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, own_log, monkeypatch):
     monkeypatch.setattr("msmpetsc.cli.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
-    with pytest.raises(InputError, match="more than cages.max_cells"):
+    with pytest.raises(InputError, match=r"more than cages\.max_cells"):
         fill_cages(read_body(SELF, load_scene(scene)), load_scene(scene, [many]))
     assert main(["inspect", str(scene), "--ranks", "8", "--no-times", "--set", many]) == 0
     told = capsys.readouterr()

@@ -23,13 +23,15 @@ def folder(tmp_path_factory) -> Path:
 
 RESULT, PICTURE, JSON = "is named *.h5 or *.hdf5", "is named *.png", "is named *.json"
 WRONG = [
-    *[(["run", "scene.toml", "-o", name], RESULT) for name in ("x.vtk", "x.gif", "x.png", "x.xdmf", "x.h5.gz", "x", "scene.toml", "x.7")],
+    *[(["run", "scene.toml", "-o", name], RESULT)
+      for name in ("x.vtk", "x.gif", "x.png", "x.xdmf", "x.h5.gz", "x", "scene.toml", "x.7")],
     (["run", "scene.toml", "-o", "scene.toml", "--overwrite"], RESULT),
     (["run", "scene.toml", "--resume", "x.vtk"], RESULT),
     (["run", "scene.toml", "--measure", "x.csv"], JSON),
     (["run", "scene.toml", "--measure", "scene.toml"], JSON),
     *[(["render", "bar.h5", "-o", name], PICTURE) for name in ("x.vtk", "x.gif", "x.jpg", "x", "bar.h5")],
-    *[(["study", "study.toml", "-o", name], "what is written there is a folder") for name in ("x.csv", "x.vtk", "x.gif", "x.HTML")],
+    *[(["study", "study.toml", "-o", name], "what is written there is a folder")
+      for name in ("x.csv", "x.vtk", "x.gif", "x.HTML")],
     (["compare", "bar.h5", "bar.h5", "-o", "x.vtk"], "compare: unknown argument -o"),
 ]  # fmt: skip
 

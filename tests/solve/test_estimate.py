@@ -173,7 +173,7 @@ def test_linear_solves_are_no_tighter_than_the_step_needs():
         lattice, seen = beam(), []
         stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=error)
         stepper.observer = lambda _: seen.append(stepper.ksp.getTolerances()[0])
-        stepper.step(StepProblem(lattice.nodes, lattice.nodes + [0, 0, 1e-3], weight(lattice)))
+        stepper.step(StepProblem(lattice.nodes, lattice.nodes + np.array([0, 0, 1e-3]), weight(lattice)))
         stepper.destroy()
         return seen[1:]
 

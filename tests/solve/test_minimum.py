@@ -1,4 +1,5 @@
-"""Where a step ends: at a minimum, no saddle, and as near to it as it says; what rounding leaves is an error like any other.
+"""Where a step ends: at a minimum, no saddle, and as near to it as it says; what rounding leaves is an error like any
+other.
 
 Cases in which a run once said of a step an error of 1e-3 or less that was 0.4 to 1, and a random sample of hard scenes.
 """
@@ -6,6 +7,7 @@ Cases in which a run once said of a step an error of 1e-3 or less that was 0.4 t
 import json
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -40,7 +42,8 @@ CASES = {
         sides=BEAM, cells=80, young=174399181.2, step=0.003704954, frames=4, gravity=GRAVITY,
         obstacle=[PLATES[0], PLATES[1] | {"path": [{"time": 0.0222297, "by": [0, 0, -0.1]}]}],
     ),
-    "collapsed": dict(sides=CUBE, cells=64, young=1e5, step=0.02, frames=2, gravity=GRAVITY, start={"scale": [1, 1, 0.05]}),
+    "collapsed": dict(sides=CUBE, cells=64, young=1e5, step=0.02, frames=2, gravity=GRAVITY,
+                      start={"scale": [1, 1, 0.05]}),
 }  # fmt: skip
 
 
@@ -64,10 +67,8 @@ def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
     scene, frames = load_scene(path, overrides), []
     with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), Probes(true_error=1)) as simulation:
-        try:
+        with suppress(StepFailed):
             frames.extend(simulation.frames())
-        except StepFailed:
-            pass
     return frames[1:]
 
 

@@ -1,4 +1,5 @@
-"""PETSc's options are obeyed, or refused in one line before anything is built; the matrices they ask for are written."""
+"""PETSc's options are obeyed, or refused in one line before anything is built; the matrices they ask for are
+written."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -132,7 +133,7 @@ def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
     if LINES[line]:
         _check_files(words)
         return
-    with pytest.raises(InputError, match="line 2|gone: cannot be read"):
+    with pytest.raises(InputError, match=r"line 2|gone: cannot be read"):
         _check_files(words)
 
 

@@ -101,7 +101,7 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
 
 
 def test_too_loose_a_solve_is_told():
-    with pytest.raises(StepFailed, match="relative error .* try"):
+    with pytest.raises(StepFailed, match=r"relative error .* try"):
         swing("paper", 3, error=1e-9)
 
 

@@ -191,7 +191,7 @@ def test_it_fails_above_the_limit_and_not_below(monkeypatch, share: float, retri
     if stable:
         assert np.abs(fly(lattice, q, np.zeros_like(q), 20)[-1].q - lattice.nodes).max() < 1e-3
     else:
-        with pytest.raises(StepFailed, match="became unstable: elastic energy .* try a smaller time.step"):
+        with pytest.raises(StepFailed, match=r"became unstable: elastic energy .* try a smaller time.step"):
             fly(lattice, q, np.zeros_like(q), 20)
 
 

@@ -86,7 +86,7 @@ class Minimum:
         if not np.isfinite(second):
             return (first + bound) / distance if lowest > CONVEX else np.inf
         if first > 0 and second > SMALL * first:
-            return DOUBTFUL * max(first, second) / distance
+            return DOUBTFUL * float(max(first, second)) / distance
         self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
         return functional.norm(self.first) / functional.distance(nearer.q, correction)
 

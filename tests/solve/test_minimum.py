@@ -66,9 +66,9 @@ def write_case(folder: Path, name: str, **solver) -> Path:
 def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
     scene, frames = load_scene(path, overrides), []
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), Probes(true_error=1)) as simulation:
-        with suppress(StepFailed):
-            frames.extend(simulation.frames())
+    model, probes = build_model(MPI.COMM_SELF, scene), Probes(true_error=1)
+    with Simulation(MPI.COMM_SELF, scene, model, probes) as simulation, suppress(StepFailed):
+        frames.extend(simulation.frames())
     return frames[1:]
 
 

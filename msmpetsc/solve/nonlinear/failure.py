@@ -1,17 +1,13 @@
 """Messages of steps that could not be solved, one line each: the reason, the residual, where it is worst, what to
 try."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.locate import describe_inverted, node_of_greatest
+from msmpetsc.solve.nonlinear.error_control import StepError
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
-
-if TYPE_CHECKING:
-    from msmpetsc.solve.nonlinear.step import Stepper
 
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
@@ -23,36 +19,39 @@ REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items(
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
-def not_converged(stepper: "Stepper", iterate: Iterate, iterations: int) -> StepFailed:
-    """SNES gave up at ``iterate`` (collective)."""
-    snes, ksp, now = stepper.snes, stepper.ksp, stepper.control.now
+def not_converged(
+    snes: PETSc.SNES, ksp: PETSc.KSP, now: StepError, iterations: int, worst: str, true_hessian: bool
+) -> StepFailed:
+    """SNES gave up after ``iterations``.
+
+    worst        : words of where_worst
+    true_hessian : newton's presets, which another one would not help
+    """
     reason, kind = REASON.get(snes.reason, str(snes.reason)), KINDS.get(snes.reason, "iterations")
-    preset = "" if stepper.preset.true_hessian else "another preset (newton), "
+    preset = "" if true_hessian else "another preset (newton), "
     advice = f'a smaller time.step, {preset}a looser solver.error, or safety.on_failure = "substep"'
     if kind == "linear solve":
         reason += f" (KSP {KSP_REASON.get(ksp.reason, str(ksp.reason))} after {ksp.its} its)"
         advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
     return StepFailed(
         f"did not converge: {reason} after {iterations} iterations, residual |F| = {now.residual:.2e}, "
-        f"relative error {now.error:.2e}{_worst(stepper.functional, iterate)}; try {advice}",
+        f"relative error {now.error:.2e}{worst}; try {advice}",
         kind,
     )
 
 
-def no_minimum(stepper: "Stepper", iterate: Iterate) -> StepFailed:
-    """All that the step came to was no minimum, or farther from one than it seemed; ``iterate`` is the last
-    (collective)."""
-    now = stepper.control.now
+def no_minimum(now: StepError, worst: str) -> StepFailed:
+    """All that the step came to was no minimum, or farther from one than it seemed."""
     seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
     return StepFailed(
-        f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}"
-        f"{_worst(stepper.functional, iterate)}; try a smaller time.step, or another preset (newton)",
+        f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}{worst}; "
+        "try a smaller time.step, or another preset (newton)",
         "no minimum",
     )
 
 
-def _worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Words on where F pulls farthest, and what is inside out (collective)."""
+def where_worst(functional: StepFunctional, iterate: Iterate) -> str:
+    """Words on where F pulls farthest, and on what is inside out (collective)."""
     comm, lattice = functional.comm, functional.lattice
-    worst = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
-    return f", worst at {worst}{describe_inverted(comm, lattice, iterate.q)}"
+    node = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
+    return f", worst at {node}{describe_inverted(comm, lattice, iterate.q)}"

@@ -5,6 +5,7 @@ The estimate of a step's error is the Newton correction e at x. Where a body is 
 between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
 """
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +87,8 @@ class Minimum:
         if not np.isfinite(second):
             return (first + bound) / distance if lowest > CONVEX else np.inf
         if first > 0 and second > SMALL * first:
-            return DOUBTFUL * float(max(first, second)) / distance
-        self.first.axpy(second / max(functional.norm(correction), np.finfo(float).tiny), correction)
+            return DOUBTFUL * max(first, second) / distance
+        self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)
         return functional.norm(self.first) / functional.distance(nearer.q, correction)
 
     def go_on(self, x: PETSc.Vec, examination: Examination) -> bool:

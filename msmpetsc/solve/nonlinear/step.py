@@ -19,7 +19,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged
+from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.minimum import Minimum
@@ -213,7 +213,7 @@ class Stepper:
         if not control.doubt(self.minimum.go_on(self.x, examination)):
             return True  # g has no digits left to tell the two points apart: the step is as good as it says
         if now.doubts > DOUBTS:
-            raise no_minimum(self, functional.evaluate(self.x, self.work))
+            raise no_minimum(now, where_worst(functional, functional.evaluate(self.x, self.work)))
         return False
 
     def _is_solved(self) -> bool:
@@ -250,7 +250,9 @@ class Stepper:
                 break
         self.projected = False
         if self.snes.reason < 0:
-            raise not_converged(self, self._evaluate(self.snes.getSolution()), iterations)
+            worst = where_worst(self.functional, self._evaluate(self.snes.getSolution()))
+            now, true_hessian = self.control.now, self.preset.true_hessian
+            raise not_converged(self.snes, self.ksp, now, iterations, worst, true_hessian)
 
     def _forget_pairs(self) -> None:
         """SNESQN alone keeps what it has learnt, its pairs of the last step; a type set anew has none."""

@@ -120,6 +120,12 @@ def carry_out(path: Path, folder: Path) -> None:
         assert done.returncode in status, f"{command}\n{done.stdout}{done.stderr}"
 
 
+def write_own_scene(folder: Path) -> None:
+    """Write the front door's scene of one's own, and its body."""
+    (folder / "scene.toml").write_text(blocks(ROOT / "README.md", "toml")[0])
+    trimesh.creation.box(extents=[1, 0.5, 0.5]).export(folder / "body.obj")
+
+
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the clone's scenes, a scene of one's own and its body, and what the front door's commands leave."""
@@ -129,8 +135,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("clone")
     (folder / "scenes").symlink_to(ROOT / "scenes")
-    (folder / "scene.toml").write_text(blocks(ROOT / "README.md", "toml")[0])
-    trimesh.creation.box(extents=[1, 0.5, 0.5]).export(folder / "body.obj")
+    write_own_scene(folder)
     carry_out(ROOT / "README.md", folder)
     return folder
 
@@ -152,6 +157,7 @@ def test_commands_run(name: str, clone: Path):
 def test_python_runs(path: Path, tmp_path: Path):
     (tmp_path / "out").mkdir()
     small_result.write(tmp_path / "out" / "bunny_fall.h5")
+    write_own_scene(tmp_path)
     for block in blocks(path, "python"):
         done = subprocess.run(
             [sys.executable, "-c", block], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60

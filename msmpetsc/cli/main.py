@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msmpetsc.cli.arguments import parsed, parsed_apart
-from msmpetsc.errors import InputError, MsmpetscError, did_you_mean
+from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
 
 if TYPE_CHECKING:  # MPI takes 0.3 s to start, which --help need not wait for
     from mpi4py import MPI
@@ -52,8 +52,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def entry_point() -> None:
-    """Be the installed ``msmpetsc``."""
-    status = main()
+    """Be the installed ``msmpetsc``; where only results can be read, one line says what a run needs."""
+    try:
+        status = main()
+    except ModuleNotFoundError as error:
+        expected = as_expected(error)
+        if expected is None:
+            raise
+        print(f"msmpetsc: error: {expected}", file=sys.stderr)
+        status = expected.exit_status
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: one more could only spoil the status
     sys.exit(status)
 

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import EXTRAS, InputError
 from msmpetsc.model.fields import FRAME_FIELDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 Row = dict[str, Any]  # one case, by column; None where nothing was measured
-EXTRA = ("pandas", "jinja2", "matplotlib")  # packages of msmpetsc[study]
 
 
 class Column(NamedTuple):
@@ -105,7 +104,7 @@ ONCE_NOTE = (
 
 def require_extra() -> None:
     """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
-    for name in EXTRA:
+    for name in EXTRAS["study"]:
         if find_spec(name) is None:
             raise InputError(f"{name} is not installed: pip install 'msmpetsc[study]' brings it")
 

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity import Elasticity, Hessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.memory import Memory
@@ -96,6 +96,7 @@ class TrueHessian(Viewable):
         lattice = unknowns.lattice
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
+        self.elastic: Hessian | None = None  # until it is linearised
 
     def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool = False) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs)."""
@@ -104,6 +105,7 @@ class TrueHessian(Viewable):
             self.contact.linearise(contact, q, True)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        assert self.elastic is not None, "the Hessian was not linearised"
         self.unknowns.to_nodes(x, self.v)
         self.product[:] = 0
         self.elastic.add_product(self.v, self.product)

@@ -45,22 +45,22 @@ class Unknowns:
         self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
         self.indices = np.concatenate([index, to_owner.answer(index[asked])])
-        self._scatter_ghosts(comm)
-
-    def _scatter_ghosts(self, comm: MPI.Comm) -> None:
-        owned = self.lattice.owned
-        free_ghosts = owned + np.flatnonzero(self.numbers[owned:] >= 0)
-        sources = self.indices[free_ghosts].ravel().astype(PETSc.IntType)
+        free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        self.ghost_values = PETSc.Vec().create(PETSc.COMM_SELF)
-        self.ghost_values.setSizes(len(sources))
-        self.ghost_values.setType(self.memory.vec_type)
+        self.ghost_values, self.scatter = self._scatter_to(comm, self.indices[free_ghosts].ravel())
+
+    def _scatter_to(self, comm: MPI.Comm, sources: np.ndarray) -> tuple[PETSc.Vec, PETSc.Scatter]:
+        """Vector of this rank's ghosts, and the scatter that fills it from the ``sources`` in a vector of unknowns."""
+        values = PETSc.Vec().create(PETSc.COMM_SELF)
+        values.setSizes(len(sources))
+        values.setType(self.memory.vec_type)
         vector = self.create_vector(comm)
-        index = PETSc.IS().createGeneral(sources, comm=comm)
-        self.scatter = PETSc.Scatter().create(vector, index, self.ghost_values, None)
+        index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
+        scatter = PETSc.Scatter().create(vector, index, values, None)
         index.destroy()
         vector.destroy()
+        return values, scatter
 
     def create_vector(self, comm: MPI.Comm) -> PETSc.Vec:
         """A new vector of unknowns (collective)."""

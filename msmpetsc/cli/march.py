@@ -104,13 +104,13 @@ def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
         compilation_logged(plan.kernels_are_new),
         Signals(comm) as signals,
         open_output(comm, plan) as file,
-        Simulation(comm, plan.scene, described_model(comm, plan), plan.probes) as simulation,
+        Simulation(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
     ):
         try:
             with ending_together(comm):
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
-                frames = start_output(comm, plan, file, simulation)
+                frames = start_output(comm, plan, file, model, simulation)
                 checkpoints = Checkpoints(file, simulation, plan.interval, signals)
                 with ProgressLine.shown(comm, simulation.steps) as progress:
                     observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
@@ -217,15 +217,17 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     return model
 
 
-def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, simulation: Simulation) -> int:
+def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: Simulation) -> int:
     """Write the model, go on where an earlier run stopped, and make room for frames (collective).
+
+    model : as it was built; the simulation's own may be on a GPU
 
     Returns the number of frames of the steps taken so far.
     """
-    write_model(comm, file, simulation.model)
+    write_model(comm, file, model)
     if plan.resumed:
         plan.resumed.restore(comm, file, simulation)
-    lattice, embedding = simulation.model.lattice, simulation.model.embedding
+    lattice, embedding = model.lattice, model.embedding
     points = embedding.points if embedding else None
     file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
     return simulation.stored_until(simulation.step) if simulation.step else 0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import h5py
 import small_result
+from conftest import ROOT
 
 from msmpetsc.model.fields import FIELDS, FRAME_FIELDS, SIZES, Frame, markdown_table
 
@@ -29,3 +30,7 @@ def test_what_is_written_is_what_the_table_says(tmp_path: Path):
 def test_the_table_for_people_has_each_field_once():
     rows = [line.split(" | ")[0].removeprefix("| /") for line in markdown_table().splitlines()[2:]]
     assert rows == list(FIELDS)
+
+
+def test_the_documentation_has_this_very_table():
+    assert markdown_table() in (ROOT / "msmpetsc" / "output" / "README.md").read_text()

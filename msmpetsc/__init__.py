@@ -17,10 +17,10 @@ def _kernel_folder() -> Path:
     numba looks for changes in a kernel's own file alone, not in those of the kernels it calls: after an update it
     would go on with parts of the old version.
     """
-    here = Path(__file__).parent
-    sources = [path.read_bytes() for path in sorted(here.rglob("*.py"))]
+    package = Path(__file__).parent
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
     kernels = b"".join(source for source in sources if b"njit" in source or b"@kernel" in source)
-    return here / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
+    return package / "__pycache__" / f"kernels-{hashlib.sha256(kernels).hexdigest()[:16]}"
 
 
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_folder()))  # before numba is imported

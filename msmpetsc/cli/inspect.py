@@ -47,14 +47,14 @@ def run(args: argparse.Namespace) -> int:
     body = read_body(MPI.COMM_WORLD, scene)
     assert body.surface is not None  # which rank 0 has
     mesh = peak_memory() - before
-    shares, counted = partition_of(body, scene.cages, args.ranks, MOST_BUILT)
-    cells = shares.cells.sum()
+    partition, counted = partition_of(body, scene.cages, args.ranks, MOST_BUILT)
+    cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
-    print_counts(args, scene, shares, counted)
+    print_counts(args, scene, partition, counted)
     if not args.no_times:
-        print_needs(args, scene, body.surface, shares, mesh)
-    print_limits(shares)
+        print_needs(args, scene, body.surface, partition, mesh)
+    print_limits(partition)
     return 0
 
 
@@ -69,31 +69,33 @@ def refuse_bad_numbers(args: argparse.Namespace) -> None:
         raise InputError(f"--bandwidth must be more than 0, not {args.bandwidth:g}")
 
 
-def print_counts(args: argparse.Namespace, scene: Scene, shares: "Partition", counted: int) -> None:
+def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition", counted: int) -> None:
     """Print a table of what there is, and what a rank has of it."""
-    how = "counted" if counted == shares.cells.sum() else f"scaled from a lattice of {counted} cells"
+    how = "counted" if counted == partition.cells.sum() else f"scaled from a lattice of {counted} cells"
     print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
     print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
     rows = {
-        "cells": shares.cells,
-        "nodes": shares.nodes,
-        SPRINGS: shares.springs,
-        "nonzeros of A": shares.nonzeros,
-        "ghosts": shares.ghosts,
-        "messages an exchange": shares.neighbours,
+        "cells": partition.cells,
+        "nodes": partition.nodes,
+        SPRINGS: partition.springs,
+        "nonzeros of A": partition.nonzeros,
+        "ghosts": partition.ghosts,
+        "messages an exchange": partition.neighbours,
     }
     for name, values in rows.items():
-        total = shares.all_springs if name == SPRINGS else values.sum()
+        total = partition.all_springs if name == SPRINGS else values.sum()
         print(f"{name:{WIDTH}}{total:15.0f}{values.mean():15.1f}{values.max():15.0f}")
     positions = f"positions of {scene.stored} frames, file [GB]"
-    print(f"{positions:{WIDTH}}{24 * scene.stored * shares.nodes.sum() / GB:15.3g}")
+    print(f"{positions:{WIDTH}}{24 * scene.stored * partition.nodes.sum() / GB:15.3g}")
 
 
-def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shares: "Partition", mesh: float) -> None:
+def print_needs(
+    args: argparse.Namespace, scene: Scene, surface: "Surface", partition: "Partition", mesh: float
+) -> None:
     """Print memory and time, and what they rest on; ``mesh``: bytes that preparing the surface took."""
     from msmpetsc.study.forecast import Network, forecast
 
-    options, cells = shlex.join(args.petsc_options), shares.cells.sum()
+    options, cells = shlex.join(args.petsc_options), partition.cells.sum()
     try:
         expected = forecast(
             file=args.scene, changes=args.set, options=options, scene=scene, surface=surface, cells=cells,
@@ -101,10 +103,10 @@ def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shar
         )  # fmt: skip
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
-    memory = expected.memory(shares, len(surface.points) if scene.output.surface else 0, mesh)
+    memory = expected.memory(partition, len(surface.points) if scene.output.surface else 0, mesh)
     print(f"{'memory [GB]':{WIDTH}}{memory.sum() / GB:15.3g}{memory.mean() / GB:15.3g}{memory.max() / GB:15.3g}")
     every, network = scene.output.every, Network(args.latency, args.bandwidth)
-    computing, messages = every * expected.computing(shares), every * expected.messages(shares, network)
+    computing, messages = every * expected.computing(partition), every * expected.messages(partition, network)
     trials = expected.coarse, expected.fine
     explicit = scene.time.integrator == "verlet"
     first, second = (f"{t.iterations if explicit else t.its:.1f} on {t.cells:.0f}" for t in trials)
@@ -119,7 +121,7 @@ def print_needs(args: argparse.Namespace, scene: Scene, surface: "Surface", shar
     )
 
 
-def print_limits(shares: "Partition") -> None:
+def print_limits(partition: "Partition") -> None:
     """Print at how many cells of this body, on as many ranks, integers end."""
     from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
 
@@ -131,12 +133,12 @@ def print_limits(shares: "Partition") -> None:
     }
     print()
     for name, (count, limit, integer) in ends.items():
-        cells = largest(shares, count, limit)
-        too_few = "" if cells >= shares.cells.sum() else ", fewer than here: run refuses or fails"
+        cells = largest(partition, count, limit)
+        too_few = "" if cells >= partition.cells.sum() else ", fewer than here: run refuses or fails"
         print(f"{name} end at {limit} ({integer}): {cells:.3g} cells{too_few}")
 
 
-def largest(shares: "Partition", count: Callable[["Partition"], float], limit: int) -> float:
+def largest(partition: "Partition", count: Callable[["Partition"], float], limit: int) -> float:
     """Return the number of cells with which this body's ``count`` comes to its limit, on as many ranks."""
-    log_cells = brentq(lambda x: np.log(count(shares.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
+    log_cells = brentq(lambda x: np.log(count(partition.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
     return float(np.exp(log_cells))

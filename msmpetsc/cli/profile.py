@@ -74,9 +74,9 @@ class Cost:
 def refuse_unwritable(path: Path | None) -> None:
     """Raise InputError for a file that cannot be written, before the run rather than after it."""
     if path:
-        was_there = path.exists()
+        existed = path.exists()
         _write(path, "", "a")
-        if not was_there:
+        if not existed:
             path.unlink()
 
 

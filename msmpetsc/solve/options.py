@@ -82,7 +82,7 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
         names, objects = set_defaults(preset, prefix, budget), []
         try:
             with petsc_errors(
-                "PETSc refuses its options", others=Exception
+                "PETSc refuses its options", further=Exception
             ):  # of what it is to load, a Python file maybe
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
                     objects.append(kind().create(PETSc.COMM_SELF))

@@ -12,7 +12,7 @@ NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked
 
 @contextmanager
 def petsc_errors(
-    what: str, abandon: Callable[[], None] = lambda: None, others: type[Exception] = ImportError
+    what: str, abandon: Callable[[], None] = lambda: None, further: type[Exception] = ImportError
 ) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
@@ -20,15 +20,15 @@ def petsc_errors(
     option made that an error, becomes StepFailed.
 
     abandon : called after such an error
-    others  : further exceptions that come of options here
+    further : more exceptions that come of options here
     """
     try:
         yield
-    except (PETSc.Error, ImportError, others) as error:  # type: ignore[misc]  # petsc4py has no types
+    except (PETSc.Error, ImportError, further) as error:  # type: ignore[misc]  # petsc4py has no types
         # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         cause = error.__cause__
-        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, others)):
+        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, further)):
             raise cause  # noqa: B904 (the error itself, not another)
         abandon()
         if getattr(error, "ierr", 0) == NOT_CONVERGED:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
 
@@ -158,6 +158,8 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
     except InputError as error:
         raise InputError(f"prepare: '{name}': {error}") from error
     except Exception as error:  # what the libraries below raise on odd meshes is not documented
+        if isinstance(error, ModuleNotFoundError) and (expected := as_expected(error)):
+            raise InputError(f"prepare: '{name}': {expected}") from error  # one line says which extra it needs
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():

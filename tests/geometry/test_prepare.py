@@ -120,7 +120,7 @@ def test_repair_that_loses_the_body_is_refused():
 
 def test_repair_without_its_package_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshfix", None)
-    with pytest.raises(InputError, match=r"pip install msmpetsc\[repair\]"):
+    with pytest.raises(InputError, match=r"pip install 'msmpetsc\[repair\]'"):
         prepare(box(), ["repair"])
 
 

@@ -72,3 +72,22 @@ def one_spring(m: float, k: float, r: float) -> Lattice:
         stiffness=np.array([k]),
         pinned=np.array([True, False]),
     )
+
+
+def chain(m: float, k: float, r: float) -> Lattice:
+    """Masses 1 apart along z, joined by springs of rest length r, the first and the last of the four pinned."""
+    count = 4
+    return Lattice(
+        table=SortedKeys(COMM, np.arange(count)),
+        cell_size=1.0,
+        nodes=np.arange(count)[:, None] * np.array([0.0, 0, 1]),
+        ghosts=np.empty(0, np.int64),
+        mass=np.full(count, m),
+        cells=np.empty((0, 8), np.int64),
+        cell_kind=np.empty(0, np.uint8),
+        springs=np.array([[0, 1], [1, 2], [2, 3]]),
+        springs_owned=count - 1,
+        rest_length=np.full(count - 1, r),
+        stiffness=np.full(count - 1, k),
+        pinned=np.arange(count) % (count - 1) == 0,
+    )

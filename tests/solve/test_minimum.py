@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 import trimesh
 from conftest import ROOT
+from lattices import T, chain
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
@@ -26,6 +27,7 @@ from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation
 
 BEAM, CUBE = [1, 0.2, 0.2], [1, 1, 1]
@@ -152,6 +154,23 @@ def dense_hessian(stepper: Stepper) -> np.ndarray:
         stepper.jacobian.hessian.mult(None, x, y)
         columns.append(y.array.copy())
     return np.array(columns)
+
+
+@pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
+@pytest.mark.parametrize("shift", [0.0, 0.1], ids=["exactly", "by rounding"])
+def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: float):
+    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring, M^(-1) H is no less than 1 - 4 t^2 c / m by
+    the springs one by one, which is negative here and calls for a search; its lowest eigenvalue is 1 - 3 t^2 c / m."""
+    k, r = 2e3, 1.1
+    lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
+    stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
+    q = lattice.nodes + shift
+    compression = stepper.minimum.curvature.compression(q)
+    assert not compression.is_harmless and compression.greatest == pytest.approx(4 * 0.29)
+    result = stepper.step(StepProblem(q, q, np.zeros((len(q), 3))))
+    stepper.destroy()
+    np.testing.assert_allclose(result.position, q, atol=1e-12)
+    assert result.error < 1e-3
 
 
 def test_a_body_that_is_not_compressed_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

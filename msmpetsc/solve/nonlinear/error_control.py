@@ -92,7 +92,7 @@ class ErrorControl:
             return now.bound
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature
-            if now.bound <= now.goal * lowest:
+            if lowest > 0 and now.bound <= now.goal * lowest:
                 return now.bound / lowest
         return self._estimated(iterate, distance, now.goal)
 
@@ -103,8 +103,9 @@ class ErrorControl:
         if not np.isfinite(length):
             now.alarmed = True
             return now.bound
-        self.ratio, now.early, now.corrected = max(now.bound * distance / length, 1.0), 1.0, True
-        return length / self.functional.distance(iterate.q, self.estimate.correction)
+        self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
+        now.early, now.corrected = 1.0, True
+        return self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
 
     def estimate_last(self, iterate: Iterate) -> None:
         """Estimate the error of the iterate that a budget ends at, unless that was done."""

@@ -16,6 +16,7 @@ from msmpetsc.backend.arrays import greatest
 from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
+from msmpetsc.solve.nonlinear.rounding import Rounding
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
@@ -41,8 +42,10 @@ class Examination:
 class Minimum:
     """Examines the points that a stepper comes to. All methods are collective."""
 
-    def __init__(self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature):
-        self.functional, self.estimate, self.curvature = functional, estimate, curvature
+    def __init__(
+        self, functional: StepFunctional, estimate: ErrorEstimate, curvature: LowestCurvature, rounding: Rounding
+    ):
+        self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
         self.unknowns, self.memory = functional.unknowns, functional.memory
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
 
@@ -70,7 +73,7 @@ class Minimum:
             return Examination(np.inf, direction, value)
         value = min(value, 1.0)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Examination(estimate.length / functional.distance(nearer.q))
+            return Examination(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
         return Examination(self._second_estimate(nearer, functional.dual_norm(self.f) / value, enough, value))
 
     def _bent(self) -> float:
@@ -81,15 +84,15 @@ class Minimum:
     def _second_estimate(self, nearer: Iterate, bound: float, enough: float, lowest: float) -> float:
         """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of
         little but rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
-        functional, correction = self.functional, self.estimate.correction
+        functional, correction, relative = self.functional, self.estimate.correction, self.rounding.relative
         first, distance = functional.norm(self.first), functional.distance(nearer.q)
         second = self.estimate(nearer, bound, enough, lowest)
         if not np.isfinite(second):
-            return (first + bound) / distance if lowest > CONVEX else np.inf
+            return relative(first + bound, distance) if lowest > CONVEX else np.inf
         if first > 0 and second > SMALL * first:
-            return DOUBTFUL * max(first, second) / distance
+            return DOUBTFUL * relative(max(first, second), distance)
         self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)
-        return functional.norm(self.first) / functional.distance(nearer.q, correction)
+        return relative(functional.norm(self.first), functional.distance(nearer.q, correction))
 
     def go_on(self, x: PETSc.Vec, examination: Examination) -> bool:
         """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the

@@ -1,5 +1,7 @@
 """Rounding errors of a step: nothing is known better than that, and no error is smaller."""
 
+import sys
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -35,6 +37,15 @@ class Rounding:
         squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
         return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= SINGLE_ROW)
 
+    @property
+    def reach(self) -> float:
+        """How far rounding moves the body at the most, in the norm of M."""
+        return self.moved * self.functional.extent
+
+    def relative(self, length: float, distance: float) -> float:
+        """Return |e|_M over |x - y|_M, which is known no better than rounding leaves it."""
+        return length / max(distance, self.reach, sys.float_info.min)
+
     def added_to(self, error: float, away: float) -> float:
         """A relative error of a step that took x ``away`` = |x - y|_M from y, or what rounding makes of it if that is
         more; where nothing moves but by rounding, that is relative to the size of the body.
@@ -42,7 +53,7 @@ class Rounding:
         Raises StepFailed where rounding moves the body about as far as its forces do.
         """
         extent = self.functional.extent
-        moved, size = self.moved * extent, self.size * extent
+        moved, size = self.reach, self.size * extent
         if moved > max(NEGLIGIBLE * size, HOPELESS * away):
             raise StepFailed(
                 f"cannot be solved in double precision: rounding in the stiffest springs moves the body by "

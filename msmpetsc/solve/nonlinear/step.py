@@ -140,8 +140,8 @@ class Stepper:
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.options.prefix))
         curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
-        minimum = self._keep(Minimum(functional, estimate, curvature))
         rounding = Rounding(functional, jacobian.diagonal.own[: self.unknowns.size])
+        minimum = self._keep(Minimum(functional, estimate, curvature, rounding))
         tightest = self.ksp.getTolerances()[0]
         return ErrorControl(functional, estimate, curvature, rounding, error, tightest), minimum
 
@@ -151,9 +151,7 @@ class Stepper:
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
-            self.jacobian.hessian.linearise(
-                self.lattice.nodes, None
-            )  # some solvers try it: Chebyshev's, for eigenvalues
+            self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 
@@ -208,7 +206,7 @@ class Stepper:
         now, enough = control.now, control.target * functional.distance(q) if control.target else np.inf
         examination = self.minimum.examine(self.x, now.corrected, compression, now.alarmed, enough)
         now.error = examination.error
-        if self.budget or now.error <= control.target or (now.at_rounding and not np.isinf(now.error)):  # x = y: 0 / 0
+        if self.budget or now.error <= control.target or (now.at_rounding and not np.isinf(now.error)):
             return True
         if not control.doubt(self.minimum.go_on(self.x, examination)):
             return True  # g has no digits left to tell the two points apart: the step is as good as it says

@@ -140,6 +140,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_commands_of_the_front_door_run(clone: Path):
     names = {path.name for path in (clone / "out").iterdir()}

@@ -49,9 +49,14 @@ def as_expected(error: Exception) -> MsmpetscError | None:
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
-    if isinstance(error, ModuleNotFoundError) and (extra := extra_of(error.name or "")):
-        return InputError(f"{error.name} is not installed: pip install 'msmpetsc[{extra}]' brings it")
+    if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
+        return missing_package(error.name or "")
     return error if isinstance(error, MsmpetscError) else None
+
+
+def missing_package(name: str) -> InputError:
+    """Return the error that says which extra brings a package that is not installed."""
+    return InputError(f"{name} is not installed: pip install 'msmpetsc[{extra_of(name)}]' brings it")
 
 
 def extra_of(module: str) -> str | None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
-from msmpetsc.errors import EXTRAS, InputError
+from msmpetsc.errors import EXTRAS, InputError, missing_package
 from msmpetsc.model.fields import FRAME_FIELDS
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def require_extra() -> None:
     """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
     for name in EXTRAS["study"]:
         if find_spec(name) is None:
-            raise InputError(f"{name} is not installed: pip install 'msmpetsc[study]' brings it")
+            raise missing_package(name)
 
 
 # Writing and reading

@@ -159,8 +159,9 @@ def dense_hessian(stepper: Stepper) -> np.ndarray:
 @pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
 @pytest.mark.parametrize("shift", [0.0, 0.1], ids=["exactly", "by rounding"])
 def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: float):
-    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring, M^(-1) H is no less than 1 - 4 t^2 c / m by
-    the springs one by one, which is negative here and calls for a search; its lowest eigenvalue is 1 - 3 t^2 c / m."""
+    """Its error is 0 / 0, or rounding over 0. With the push c = k (r - 1) across each spring, M^(-1) H is no less than
+    1 - 4 t^2 c / m by the springs one by one, which is negative here and calls for a search; its lowest eigenvalue is
+    1 - 3 t^2 c / m."""
     k, r = 2e3, 1.1
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)

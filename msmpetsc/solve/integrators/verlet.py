@@ -49,11 +49,11 @@ class Verlet:
         time: Time,
         _: Solver,
         probes: Probes = Probes(),
-        prefix: str = "",
+        _prefix: str = "",
     ):
         if probes != Probes():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
-        self.comm, self.lattice, self.environment, self.prefix = comm, model.lattice, environment, prefix
+        self.comm, self.lattice, self.environment = comm, model.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)

@@ -62,12 +62,18 @@ class Elasticity:
             return False
         return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
 
-    def hessian_at(self, q: np.ndarray, projected: bool = False) -> "Hessian":
+    def hessian_at(self, q: np.ndarray, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
 
         projected : without its negative parts, as of compressed springs
+        dtype     : of what is stored of it
         """
-        return Hessian([part.hessian_at(q, projected) for part in self.parts])
+        return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
+
+    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        for part in self.parts:
+            part.add_diagonal(q, blocks)
 
 
 @dataclass(frozen=True)

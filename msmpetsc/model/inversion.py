@@ -181,8 +181,9 @@ def _energy_of(first, count, step, q, cells, resistance, least, parts):
 def _change_of(first, count, step, q, base, cells, resistance, least, parts):
     for i in range(first, count, step):
         change = 0.0
-        for frame in range(8):
-            change += corner_change(q, base, cells[i], frame, resistance[i], least)
+        if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
+            for frame in range(8):
+                change += corner_change(q, base, cells[i], frame, resistance[i], least)
         parts[i] = change
 
 
@@ -268,6 +269,47 @@ def add_resistance_hessian(
                 _add_corner(product, cells[i], frame, 1.0, p[0], p[1], p[2])
 
 
+@numba.njit(cache=True)
+def corner_curvature(e: tuple[Vector, Vector, Vector], n: Vector, resistance: float, least: float) -> float:
+    """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors [N/m^5]: not
+    negative, and 0 where it does not resist."""
+    return 6.0 * resistance * max(lack_of(_dot(e[0], n), least), 0.0) / least**2
+
+
+@numba.njit(cache=True)
+def add_square(block: np.ndarray, factor: float, g: Vector) -> None:
+    """Add factor g g^T to a block (9,)."""
+    for r in range(3):
+        for c in range(3):
+            block[3 * r + c] += factor * g[r] * g[c]
+
+
+@numba.njit(cache=True)
+def add_resistance_diagonal(
+    q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float, blocks: np.ndarray
+) -> None:
+    """Add the diagonal blocks of the Hessian at q, without what the curvature of J adds, to ``blocks`` (l, 9)."""
+    for i in range(len(cells)):
+        for frame in range(8):
+            e = edges(q, cells[i], frame)
+            n = cofactors(e)
+            curvature = corner_curvature(e, n[0], resistance[i], volume)
+            if curvature > 0.0:
+                for role in range(4):
+                    add_square(blocks[cells[i, FRAMES[frame, role]]], curvature, vector_of(role, n))
+
+
+@numba.njit(cache=True)
+def vector_of(role, vectors):
+    """Return, of three vectors at the far ends of a corner's edges, that of a role; the corner's balances them."""
+    a, b, c = vectors
+    if role == 0:
+        return -(a[0] + b[0] + c[0]), -(a[1] + b[1] + c[1]), -(a[2] + b[2] + c[2])
+    if role == 1:
+        return a
+    return b if role == 2 else c
+
+
 @dataclass(frozen=True)
 class CellScatter:
     """The cells of a rank one after another, those that it owns first: how a CPU sums them.
@@ -307,10 +349,15 @@ class CellScatter:
         """Return which cells (r,) resist at q: few, so that products with the Hessian need not visit the others."""
         return np.flatnonzero(least_volumes(q, self.cells) < self.volume)
 
-    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to its second argument."""
         few = self.resisting(q)
         return partial(add_resistance_hessian, q.copy(), self.cells[few], self.resistance[few], self.volume, projected)
+
+    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m]."""
+        few = self.resisting(q)
+        add_resistance_diagonal(q, self.cells[few], self.resistance[few], self.volume, blocks)
 
 
 @dataclass(frozen=True)
@@ -356,24 +403,17 @@ class CellGather:
         """Add the gradient [N] to the owned rows of ``gradient``."""
         _cell_gradient_around(self.around.shape[1], q, *self._all, gradient)
 
-    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to the owned rows of its second argument."""
         return partial(_cell_product_around, self.around.shape[1], q.copy(), *self._all, projected)
+
+    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        _cell_diagonal_around(self.around.shape[1], q, *self._all, blocks)
 
     @property
     def _all(self) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray]:
         return self.cells, self.resistance, self.volume, self.around, self.corner
-
-
-@numba.njit(cache=True)
-def vector_of(role, vectors):
-    """Return, of three vectors at the far ends of a corner's edges, that of a role; the corner's balances them."""
-    a, b, c = vectors
-    if role == 0:
-        return -(a[0] + b[0] + c[0]), -(a[1] + b[1] + c[1]), -(a[2] + b[2] + c[2])
-    if role == 1:
-        return a
-    return b if role == 2 else c
 
 
 @kernel
@@ -424,3 +464,19 @@ def _cell_product_around(first, count, step, q, cells, resistance, volume, aroun
         product[i, 0] += px
         product[i, 1] += py
         product[i, 2] += pz
+
+
+@kernel
+def _cell_diagonal_around(first, count, step, q, cells, resistance, volume, around, corner, blocks):
+    for i in range(first, count, step):
+        for a in range(8):
+            c = around[a, i]
+            if c < 0:
+                break
+            for frame in range(8):
+                role = ROLE[frame, corner[a, i]]
+                if role < 0:
+                    continue
+                e = edges(q, cells[c], frame)
+                n = cofactors(e)
+                add_square(blocks[i], corner_curvature(e, n[0], resistance[c], volume), vector_of(role, n))

@@ -143,9 +143,15 @@ class SpringScatter:
         """Add to ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
         add_spring_concavity(q, *self._all, concavity)
 
-    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+    def hessian_at(self, q: np.ndarray, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
-        return partial(add_elastic_product, self.springs, elastic_hessian(q, *self._all, projected))
+        blocks = np.empty((len(self.springs), 4), dtype)
+        elastic_hessian(q, *self._all, projected, blocks)
+        return partial(add_elastic_product, self.springs, blocks)
+
+    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m]."""
+        add_elastic_diagonal(q, *self._all, blocks)
 
 
 @numba.njit(cache=True)
@@ -235,18 +241,49 @@ def elastic_hessian(
     stiffness: np.ndarray,
     stiffening: float,
     projected: bool,
-) -> np.ndarray:
-    """Return the Hessian of E at q as the c and e of ``spring_block``, (s, 4).
+    blocks: np.ndarray,
+) -> None:
+    """Write the Hessian of E at q as the c and e of ``spring_block`` into ``blocks`` (s, 4).
 
     projected : makes the whole positive semidefinite
     """
-    blocks = np.empty((len(springs), 4))
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, projected)
         blocks[s, 0], blocks[s, 1], blocks[s, 2], blocks[s, 3] = c, ex, ey, ez
-    return blocks
+
+
+@numba.njit(cache=True)
+def add_elastic_diagonal(
+    q: np.ndarray,
+    springs: np.ndarray,
+    rest_length: np.ndarray,
+    stiffness: np.ndarray,
+    stiffening: float,
+    blocks: np.ndarray,
+) -> None:
+    """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
+    for s in range(len(springs)):
+        a, b = springs[s, 0], springs[s, 1]
+        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+        c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, True)
+        add_spring_block(blocks[a], c, ex, ey, ez)
+        add_spring_block(blocks[b], c, ex, ey, ez)
+
+
+@numba.njit(cache=True)
+def add_spring_block(block: np.ndarray, c: float, ex: float, ey: float, ez: float) -> None:
+    """Add c I + e e^T to a block (9,)."""
+    block[0] += c + ex * ex
+    block[1] += ex * ey
+    block[2] += ex * ez
+    block[3] += ex * ey
+    block[4] += c + ey * ey
+    block[5] += ey * ez
+    block[6] += ex * ez
+    block[7] += ey * ez
+    block[8] += c + ez * ez
 
 
 @numba.njit(cache=True)
@@ -255,7 +292,8 @@ def add_elastic_product(springs: np.ndarray, blocks: np.ndarray, v: np.ndarray, 
 
     Springs of the same first end follow each other: what they have in common is read and written once.
     """
-    first, x, y, z, sx, sy, sz = -1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    none = v.dtype.type(0)  # so that single precision stays single
+    first, x, y, z, sx, sy, sz = -1, none, none, none, none, none, none
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         if a != first:
@@ -263,7 +301,7 @@ def add_elastic_product(springs: np.ndarray, blocks: np.ndarray, v: np.ndarray, 
                 product[first, 0] += sx
                 product[first, 1] += sy
                 product[first, 2] += sz
-            first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], 0.0, 0.0, 0.0
+            first, x, y, z, sx, sy, sz = a, v[a, 0], v[a, 1], v[a, 2], none, none, none
         dx, dy, dz = x - v[b, 0], y - v[b, 1], z - v[b, 2]
         fx, fy, fz = block_product(blocks[s, 0], blocks[s, 1], blocks[s, 2], blocks[s, 3], dx, dy, dz)
         sx += fx
@@ -337,9 +375,13 @@ class SpringGather:
         """Add to the owned rows of ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
         _concavity_around(self.neighbour.shape[1], q, *self._all, concavity)
 
-    def hessian_at(self, q: np.ndarray, projected: bool) -> Product:
+    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
         return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
+
+    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
 
 
 @kernel
@@ -419,3 +461,14 @@ def _product_around(first, count, step, q, neighbour, kind, stiffness, lengths, 
         product[i, 0] += px
         product[i, 1] += py
         product[i, 2] += pz
+
+
+@kernel
+def _diagonal_around(first, count, step, q, neighbour, kind, stiffness, lengths, stiffening, blocks):
+    for i in range(first, count, step):
+        for s in range(neighbour.shape[0]):
+            j = neighbour[s, i]
+            if j < 0:
+                break
+            x, y, z = q[i, 0] - q[j, 0], q[i, 1] - q[j, 1], q[i, 2] - q[j, 2]
+            add_spring_block(blocks[i], *spring_block(x, y, z, lengths[kind[s, i]], stiffness[s, i], stiffening, True))

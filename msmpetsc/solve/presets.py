@@ -24,6 +24,7 @@ class Preset:
     iterations   : a fixed number of them is the method as published; None iterates to the error target
     inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
     kronecker    : A is factored as A (x) I_3, 3m x 3m
+    chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
     """
 
     about: str
@@ -35,6 +36,7 @@ class Preset:
     iterations: int | None = None
     inexact: bool = False
     kronecker: bool = False
+    chooses: bool = False
 
 
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
@@ -42,6 +44,14 @@ JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
 NO_STOP_BY_SIZE = {"snes_stol": "0"}  # a step stops by its error alone, and so must a line search
 PLAIN = {"snes_type": "newtonls", "snes_linesearch_type": "basic", "snes_max_it": "1000", **NO_STOP_BY_SIZE}
 MANY = "3000"  # a hard step takes hundreds of newton's cheap iterations (tests/test_recovery.py), and gets there
+LATTICE_MULTIGRID = {  # the cycle of -pc_type mg
+    "mg_levels_ksp_type": "chebyshev",
+    "mg_levels_ksp_max_it": "1",
+    "mg_coarse_ksp_type": "preonly",
+    "mg_coarse_pc_type": "redundant",
+    "mg_coarse_redundant_pc_type": "cholesky",
+    "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",  # PETSc's is absolute, and a light body's pivots are small
+}
 NEWTON = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
@@ -50,6 +60,7 @@ NEWTON = {
     "snes_max_linear_solve_fail": MANY,  # of an indefinite Hessian: CG's direction leads down all the same
     **JACOBI_CG,
     "ksp_rtol": "3e-2",
+    **LATTICE_MULTIGRID,
 }
 
 LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
@@ -118,10 +129,17 @@ PRESETS = {
         NEWTON,
         true_hessian=True,
         inexact=True,
+        chooses=True,
+    ),
+    "newton-jacobi": Preset(
+        "The same with Jacobi's preconditioner, what newton itself takes for short steps of soft bodies",
+        NEWTON,
+        true_hessian=True,
+        inexact=True,
     ),
     "newton-multigrid": Preset(
-        "The same with algebraic multigrid for A: long steps, stiff bodies, fine lattices",
-        {**NEWTON, "pc_type": "gamg"},
+        "The same with multigrid on the lattice, what newton itself takes for all others",
+        {**NEWTON, "pc_type": "mg"},
         true_hessian=True,
         inexact=True,
     ),
@@ -131,6 +149,7 @@ PRESETS = {
         true_hessian=True,
         projected=100,
         inexact=True,
+        chooses=True,
     ),
     "fast-msm": Preset(
         "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a prefactored Cholesky",
@@ -257,6 +276,10 @@ class SolverOptions:
     def is_given(self, name: str) -> bool:
         """Whether an option stands in the database, the user's or the preset's."""
         return self.prefix + name in PETSc.Options().getAll()
+
+    def value(self, name: str) -> str:
+        """Value of an option, the user's or the preset's; "" where there is none."""
+        return PETSc.Options().getString(self.prefix + name, "")
 
     def withdraw(self) -> None:
         """Leave the database as the user has it."""

@@ -10,6 +10,7 @@ other steps the mode found last is followed in a few iterations.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from petsc4py import PETSc
@@ -18,13 +19,10 @@ from msmpetsc.backend.arrays import greatest, like, to_host
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
-BLOCK = 4  # directions of a long search
-MOST = 100  # iterations of it
-LEAST = 12  # of one that finds nothing
-FOLLOWED = 2  # of a short one, of two directions
+MOST = 100  # iterations of a long search
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
 MORE = 1.25  # times the compression of the last long search: time for another, for modes come and go
@@ -33,6 +31,18 @@ TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
 
 Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
+
+
+class Effort(NamedTuple):
+    """block: directions of a long search; least: its iterations where it finds nothing; followed: iterations of a short
+    one, of two directions."""
+
+    block: int
+    least: int
+    followed: int
+
+
+EFFORT, UNIFORM_EFFORT = Effort(4, 12, 2), Effort(2, 4, 1)  # smooth modes come slowly, or with multigrid at once
 
 
 @dataclass(frozen=True)
@@ -67,7 +77,7 @@ class LowestCurvature:
     preconditioner : of the step's linear solves
     """
 
-    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: Preconditioner):
+    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
@@ -75,6 +85,11 @@ class LowestCurvature:
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
         self.vectors: list[PETSc.Vec] | None = None
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
+
+    @property
+    def effort(self) -> Effort:
+        """Effort that a search takes with this preconditioner."""
+        return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
     def compression(self, q: np.ndarray) -> Compression:
         """Compression at positions q (l, 3) [m]."""
@@ -98,7 +113,8 @@ class LowestCurvature:
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
             values, modes = self._search_at_length(q, hint)
         else:
-            values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), FOLLOWED, FOLLOWED)
+            its = self.effort.followed
+            values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), its, its)
         if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
@@ -117,14 +133,14 @@ class LowestCurvature:
         """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
         rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
         of all of them."""
-        start = self._random(BLOCK)
+        start = self._random(self.effort.block)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
         self.rigid = self._rigid_motions(q)
-        _, modes = self._iterate(self._without_rigid(start), MOST, LEAST)
+        _, modes = self._iterate(self._without_rigid(start), MOST, self.effort.least)
         known = [] if self.mode is None else [self.mode[None]]
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
-        return self._iterate(np.concatenate([modes, *known, *rigid]), MOST, LEAST // 2)
+        return self._iterate(np.concatenate([modes, *known, *rigid]), MOST, self.effort.least // 2)
 
     def _random(self, count: int) -> np.ndarray:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
@@ -136,7 +152,7 @@ class LowestCurvature:
 
     def _iterate(self, start: np.ndarray, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest eigenvalues (k,) that the iterations come to from directions (l, n), and theirs (k, n)."""
-        size, mass = min(BLOCK, len(start)), self.functional.mass
+        size, mass = min(self.effort.block, len(start)), self.functional.mass
         values, (x, last) = self._ritz((start, self._product(start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):

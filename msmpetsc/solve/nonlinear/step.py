@@ -14,7 +14,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.linear.jacobian import Jacobian
+from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
@@ -111,9 +111,10 @@ class Stepper:
         return owned
 
     def _create_jacobian(self, comm: MPI.Comm, time_step: float, touches: bool) -> Jacobian:
-        flags = {"true_hessian": self.preset.true_hessian, "kronecker": self.preset.kronecker, "touches": touches}
+        preset = self.preset
+        flags = {"true_hessian": preset.true_hessian, "kronecker": preset.kronecker, "chooses": preset.chooses}
         elasticity = self.functional.elasticity
-        return Jacobian(comm, self.unknowns, elasticity, time_step, self.owned, **flags, options=self.options)
+        return Jacobian(comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options)
 
     def _create_solvers(self, comm: MPI.Comm) -> tuple[PETSc.SNES, PETSc.KSP]:
         """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
@@ -152,6 +153,7 @@ class Stepper:
         """
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
+            self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 
@@ -190,7 +192,7 @@ class Stepper:
 
     def _remembering(self) -> list:
         contact = [self.jacobian.diagonal] if self.jacobian.touches else []
-        return [self.first_guess, self.minimum.curvature, self.control, *contact]
+        return [self.first_guess, self.minimum.curvature, self.control, self.jacobian.preconditioner, *contact]
 
     def all_its(self) -> int:
         """KSP iterations of all steps so far, and of their estimates and searches for negative curvature."""
@@ -272,12 +274,14 @@ class Stepper:
         with self.local:
             self.functional.evaluate(x, f)
 
-    def _objective(self, _: PETSc.SNES, x: PETSc.Vec) -> float:
+    def _objective(self, snes: PETSc.SNES, x: PETSc.Vec) -> float:
         """g(x) - g(base): a line search compares values, and their difference must keep its digits.
 
         Close to the solution g falls by less than the rounding of x changes it: then any move is called
         a fall, so that Newton's full step is taken.
         """
+        if self.preset.true_hessian and x.handle == snes.getSolution().handle:
+            return 0.0  # the start of a line search, which is where it was linearised
         with self.local:
             change, distance = self.functional.change(self.functional.positions(x), self.base)
         return -1.0 if self.control.is_flat and distance > 0 else change
@@ -314,6 +318,8 @@ class Stepper:
         """Whether SNES is done (its convergence test): by the error of its iterate, or by the budget."""
         reasons, control = PETSc.SNES.ConvergedReason, self.control
         iterate = self._iterate(snes)
+        if its > 0:
+            self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
         control.now.alarmed |= self.ksp.reason == INDEFINITE

@@ -3,9 +3,11 @@
 import ctypes
 import os
 
+import numpy as np
 from petsc4py import PETSc
 
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
+INSERT = int(PETSc.InsertMode.INSERT_VALUES)
 
 
 def petsc_library() -> ctypes.CDLL:
@@ -55,3 +57,34 @@ class _DlInfo(ctypes.Structure):
     _fields_ = [
         ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("symbol", ctypes.c_char_p), ("address", ctypes.c_void_p)
     ]  # fmt: skip
+
+
+def preallocate_coo(matrix: PETSc.Mat, rows: np.ndarray, columns: np.ndarray) -> None:
+    """Say which entries ``set_values_coo`` will set, by their global indices (n,); negative ones are left out, those
+    named twice are added (MatSetPreallocationCOO) (collective)."""
+    index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
+    count = ctypes.c_int64(len(rows))  # PetscCount
+    _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
+
+
+def set_values_coo(matrix: PETSc.Mat, values: np.ndarray) -> None:
+    """Set those entries; values (n,) on the CPU or, of a matrix that is there, on a GPU (MatSetValuesCOO)
+    (collective)."""
+    _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
+
+
+def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
+    """Give Chebyshev's method the eigenvalues that it damps between; no matter for other methods
+    (KSPChebyshevSetEigenvalues)."""
+    bounds = ctypes.c_double(greatest), ctypes.c_double(least)
+    _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
+
+
+def _address(array: np.ndarray) -> ctypes.c_void_p:
+    on_gpu = getattr(array, "__cuda_array_interface__", None)
+    return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)
+
+
+def _check(error: int) -> None:
+    if error:
+        raise PETSc.Error(error)

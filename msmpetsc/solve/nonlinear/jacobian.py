@@ -5,12 +5,16 @@ from contextlib import ExitStack
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import greatest
+from msmpetsc.errors import InputError
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioned, Preconditioner
 from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import MULTIGRID, StepPreconditioner
 from msmpetsc.solve.presets import SolverOptions
 
 
@@ -22,8 +26,10 @@ class Jacobian:
     kronecker    : A is preconditioned as A (x) I_3, 3m x 3m
     touches      : steps may have a ``contact``
     options      : of the solver, for the types of matrices and preconditioner
+    chooses      : the preconditioner, where the user has chosen none
 
-    Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays (collective).
+    Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays, and for multigrid
+    of the Hessian where the operator is A (collective).
     """
 
     def __init__(
@@ -38,6 +44,7 @@ class Jacobian:
         kronecker: bool,
         touches: bool,
         options: SolverOptions,
+        chooses: bool,
     ):
         self.comm, self.true_hessian, self.touches = comm, true_hessian, touches
         self.matrix = assemble(comm, unknowns, time_step, prefix=options.prefix)
@@ -57,7 +64,16 @@ class Jacobian:
             owned.callback(preconditioned.destroy)
         self.diagonal = ContactDiagonal(preconditioned, unknowns, time_step)
         owned.callback(self.diagonal.destroy)
-        self.preconditioner = Preconditioner(preconditioned, unknowns.memory, 3 // columns, options.prefix)
+        kind = options.value("pc_type")
+        if kind == MULTIGRID and not true_hessian:
+            raise InputError(f"-{options.prefix}pc_type mg: it is of the true Hessian, which newton's presets have; try gamg")
+        self.preconditioner = StepPreconditioner(
+            Preconditioner(preconditioned, unknowns.memory, 3 // columns, options.prefix),
+            lambda: LatticePreconditioner(comm, unknowns, elasticity, time_step, options.prefix),
+            kind,
+            chooses and options.is_default("pc_type"),
+            self._stiffness_ratio(unknowns),
+        )
         self.pmat = python_matrix(unknowns, Preconditioned(preconditioned), comm)
         owned.callback(self.pmat.destroy)
 
@@ -67,6 +83,7 @@ class Jacobian:
         projected : without the negative parts of H
         known     : H was linearised at this very q already
         """
+        self.preconditioner.prepare(q, contact)
         if self.true_hessian and not known:
             self.hessian.linearise(q, contact, projected)
         elif self.blocks:
@@ -76,6 +93,11 @@ class Jacobian:
             self.operator.assemble()
         if changed:
             self.pmat.assemble()
+
+    def _stiffness_ratio(self, unknowns: Unknowns) -> float:
+        """Return the greatest t^2 k / m of a free node (collective)."""
+        mass = unknowns.lattice.mass[unknowns.free]
+        return self.comm.allreduce(greatest(self.diagonal.own[: unknowns.size] / mass - 1), MPI.MAX)
 
 
 def _blocks(touches: bool, unknowns: Unknowns, time_step: float) -> ContactBlocks | None:

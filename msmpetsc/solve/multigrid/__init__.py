@@ -1,0 +1,1 @@
+"""Geometric multigrid on the lattice, for the true Hessian of a step."""

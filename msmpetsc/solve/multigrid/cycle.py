@@ -1,0 +1,144 @@
+"""Multigrid cycle on a lattice's grids for the true Hessian, as a PCMG: levels, smoothers, coarse solve and cycle are
+set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
+
+The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
+one has a preconditioner that is, too. The finest level is applied spring by spring, the first coarse one is summed so
+(solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
+"""
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.geometry.grid import decode_morton
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.initial_state import uniform
+from msmpetsc.solve.linear.operators import python_matrix
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
+from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
+from msmpetsc.solve.multigrid.grids import Grid, grids, interpolation
+from msmpetsc.solve.petsc.library import set_chebyshev
+
+COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
+LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
+FINEST = 2.0  # that eigenvalue on the finest level: a spring's is 2, and a sum's no more
+FINEST_RESISTING = 4.0  # a resisting corner's, which has four nodes
+SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
+ITERATIONS = 10  # of these
+
+
+@dataclass(frozen=True)
+class Level:
+    """A coarse level: its grid, P from it to the next finer one, and its matrix (AIJ, block size 3)."""
+
+    grid: Grid
+    interpolation: PETSc.Mat
+    matrix: PETSc.Mat
+
+
+class Multigrid:
+    """The PCMG of one lattice and time step, and the hierarchy that it works on. All methods are collective.
+
+    pc     : its options have the ``prefix``
+    levels : the coarse ones, the finest of them first
+    """
+
+    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
+        self.unknowns, self.prefix, self.owned = unknowns, prefix, ExitStack()
+        self.fine = ProjectedHessian(unknowns, elasticity, time_step**2)
+        self.operator = python_matrix(unknowns, self.fine, comm)
+        self.owned.callback(self.operator.destroy)
+        self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
+        self.bounds = [FINEST_RESISTING if elasticity.cells else FINEST] + [0.0] * (len(self.levels) - 1)
+        self.pc = PETSc.PC().create(comm)
+        self.owned.callback(self.pc.destroy)
+        self.is_set_up = False
+
+    def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
+        unknowns = self.unknowns
+        lattice, size = unknowns.lattice, unknowns.size
+        ijk = decode_morton(lattice.table.keys)[to_host(unknowns.free)]
+        asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
+        coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
+        galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0])
+        rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
+        levels: list[Level] = []
+        for grid in coarse:
+            p = interpolation(comm, ijk, rows, sizes, grid, unknowns.memory.mat_type)
+            self.owned.callback(p.destroy)
+            levels.append(Level(grid, p, PETSc.Mat() if levels else galerkin.matrix))
+            self.owned.callback(levels[-1].matrix.destroy)
+            ijk, sizes = decode_morton(grid.table.keys), grid.sizes
+            rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
+        return galerkin, levels
+
+    def update(self, q: np.ndarray, contact: np.ndarray) -> None:
+        """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
+        self.fine.update(q, contact)
+        self.operator.assemble()
+        self.sum.update(q, contact)
+        for finer, level in zip(self.levels, self.levels[1:], strict=False):
+            self._galerkin_product(finer, level)
+        if not self.is_set_up:
+            self._set_up()
+        for i, level in enumerate(self.levels[:-1], 1):
+            self.bounds[i] = SAFETY * greatest_eigenvalue(level)
+        for i, bound in enumerate(self.bounds):
+            set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
+
+    def _galerkin_product(self, finer: Level, level: Level) -> None:
+        """P^T H P, its diagonal raised as that of the first one is."""
+        is_new = not level.matrix
+        finer.matrix.PtAP(level.interpolation, level.matrix)
+        if is_new:
+            level.matrix.setBlockSize(3)
+            level.matrix.setOption(PETSc.Mat.Option.SPD, True)
+        diagonal = level.matrix.getDiagonal()
+        diagonal.scale(RAISED)
+        level.matrix.setDiagonal(diagonal)
+        diagonal.destroy()
+
+    def _set_up(self) -> None:
+        """Make PCMG know the levels; the user's options come last, and win."""
+        pc, top = self.pc, len(self.levels)
+        pc.setOptionsPrefix(self.prefix)
+        pc.setOperators(self.operator)
+        pc.setType(PETSc.PC.Type.MG)
+        pc.setMGLevels(top + 1)
+        for i, level in enumerate(self.levels):
+            pc.setMGInterpolation(top - i, level.interpolation)
+            ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
+            ksp.setOperators(level.matrix, level.matrix)
+            ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
+        finest = pc.getMGSmoother(top)
+        finest.setOperators(self.operator, self.operator)
+        finest.getPC().setType(PETSc.PC.Type.PYTHON)
+        finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
+        pc.setFromOptions()
+        self.is_set_up = True
+
+    def destroy(self) -> None:
+        self.owned.close()
+
+
+def greatest_eigenvalue(level: Level) -> float:
+    """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective)."""
+    x, b = level.matrix.createVecs()
+    first = level.grid.table.first
+    b.array[:] = uniform(first + np.arange(len(level.grid.table.keys))).ravel() - 0.5
+    ksp = PETSc.KSP().create(level.matrix.comm)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.setOperators(level.matrix)
+    ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
+    ksp.setComputeEigenvalues(True)
+    ksp.setTolerances(max_it=ITERATIONS, rtol=np.finfo(float).eps)
+    ksp.solve(b, x)
+    greatest = ksp.computeExtremeSingularValues()[0]
+    for owned in (ksp, x, b):
+        owned.destroy()
+    return greatest

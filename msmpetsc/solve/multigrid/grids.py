@@ -1,0 +1,96 @@
+"""The coarse grids of a lattice: every second node of its grid, then every second of those, and how values pass from
+one to the next.
+
+A node of the finer grid at integer position i is interpolated trilinearly: along an axis it lies on the coarse node
+i / 2, or halfway between two. So all its weights are alike, 1 over the number of its parents: 1, 2, 4 or 8.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.model.lattice import CORNERS
+from msmpetsc.solve.petsc.limits import refuse_unknowns
+
+SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no help
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes of one level; ``table`` has their Morton keys, in whose order they are numbered over all ranks."""
+
+    table: SortedKeys
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Coordinates of this rank's nodes, and of all: x, y and z of a node follow each other."""
+        return 3 * len(self.table.keys), 3 * self.table.total
+
+
+def parents_of(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Morton keys (n, 8) of the coarse nodes that grid indices (n, 3) are interpolated from, and which of
+    them are needed, (n, 8) bool: those of a corner that lies beyond an even index have no weight."""
+    needed = ~((CORNERS[None] > 0) & (ijk[:, None, :] % 2 == 0)).any(axis=2)
+    return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
+
+
+def coarse_grid(comm: MPI.Comm, ijk: np.ndarray) -> Grid:
+    """Return the nodes that the unknown ones at grid indices (n, 3) are interpolated from (collective).
+
+    Raises InputError for more of them than PETSc can number.
+    """
+    keys, needed = parents_of(ijk)
+    grid = Grid(SortedKeys(comm, keys[needed]))
+    refuse_unknowns(grid.table.total)
+    return grid
+
+
+def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int | None = None) -> list[Grid]:
+    """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
+
+    There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a coarser one would
+    not be much smaller.
+    """
+    levels: list[Grid] = []
+    while not levels or (total > coarsest if count is None else len(levels) < count):
+        grid = coarse_grid(comm, ijk)
+        if levels and grid.table.total > SHRINK * total:
+            break
+        levels.append(grid)
+        total, ijk = grid.table.total, decode_morton(grid.table.keys)
+    return levels
+
+
+def interpolation(
+    comm: MPI.Comm, ijk: np.ndarray, rows: np.ndarray, row_sizes: tuple[int, int], grid: Grid, mat_type: str
+) -> PETSc.Mat:
+    """Return P (AIJ), from the values at a grid to those at finer nodes (collective).
+
+    ijk  : (n, 3) grid indices of this rank's finer nodes that are unknowns
+    rows : (n, 3) this rank's rows of their x, y and z
+    """
+    keys, needed = parents_of(ijk)
+    number = np.full(keys.shape, -1)
+    number[needed] = grid.table.find(keys[needed])
+    count = needed.sum(axis=1)
+    lengths = np.empty(row_sizes[0], np.int64)
+    lengths[rows] = count[:, None]
+    begin = np.concatenate([[0], np.cumsum(lengths)])
+    columns, values = np.empty(begin[-1], PETSc.IntType), np.empty(begin[-1])
+    slot = np.cumsum(needed, axis=1) - 1
+    node, corner = np.nonzero(needed)
+    for c in range(3):
+        entry = begin[rows[node, c]] + slot[node, corner]
+        columns[entry] = 3 * number[node, corner] + c
+        values[entry] = 1 / count[node]
+    csr = begin.astype(PETSc.IntType), columns, values
+    matrix = PETSc.Mat().create(comm=comm)
+    matrix.setSizes((row_sizes, grid.sizes))
+    matrix.setType(mat_type)
+    matrix.setPreallocationCSR(csr)
+    matrix.setName("interpolation")
+    return matrix

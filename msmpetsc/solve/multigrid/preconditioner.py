@@ -1,0 +1,96 @@
+"""Multigrid as a step's preconditioner: built where it is first needed, kept from step to step while it serves."""
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from msmpetsc.backend.arrays import like
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.solve.linear.ghosted import with_ghosts
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.cycle import Multigrid
+
+WORSE = 2.0  # times the iterations for a digit that the first solve took with a hierarchy: time for a new one
+FEW = 3  # iterations more than that: of a count so low nothing can be said
+
+
+class LatticePreconditioner:
+    """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
+
+    q        : positions (l, 3) [m] of that; None before the first
+    contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
+    first    : iterations a digit, and in all, of the first solve with it; None before that
+    is_stale : a new one is due
+    """
+
+    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
+        self.comm, self.unknowns = comm, unknowns
+        self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
+        self.q: np.ndarray | None = None
+        self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
+        self.first: tuple[float, int] | None = None
+        self.is_stale, self.built = True, 0
+
+    def prepare(self, q: np.ndarray, contact: Contact | None) -> None:
+        """See to it that there is a hierarchy that serves, a new one at positions q (l, 3) [m]."""
+        if self.is_stale:
+            self._build(q.copy(), self._blocks(q, contact))
+
+    def learn(self, its: int, rtol: float) -> None:
+        """A linear solve took so many iterations to a relative tolerance."""
+        pace = its / max(-np.log10(rtol), 0.1)
+        if self.first is None:
+            self.first = pace, its
+        elif pace > WORSE * self.first[0] and its > self.first[1] + FEW:
+            self.is_stale = True
+
+    def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
+        self.multigrid.update(q, contact)
+        self.q, self.contact, self.first, self.is_stale = q, contact, None, False
+        self.built += 1
+
+    def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
+        """The Hessian of contact (owned, 9) at q; (0, 9) where there is none."""
+        lattice = self.unknowns.lattice
+        blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
+        for nodes, added in contact.hessian(q, True) if contact else ():
+            blocks[nodes] += added.reshape(-1, 9)
+        return blocks
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        """The options are read when the levels are there."""
+
+    def setUp(self, _: PETSc.PC) -> None:
+        self.multigrid.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.multigrid.pc.apply(x, y)
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.multigrid.pc.view(viewer)
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store where the hierarchy was built."""
+        lattice = self.unknowns.lattice
+        q = lattice.nodes if self.q is None else self.q
+        contact = np.zeros((lattice.owned, 9), like=lattice.nodes)
+        contact[: len(self.contact)] = self.contact
+        pace, its = self.first or (0.0, 0)
+        numbers = {"hierarchy_pace": pace, "hierarchy_its": its, "hierarchy_serves": not self.is_stale}
+        checkpoint.keep({"hierarchy_q": q[: lattice.owned], "hierarchy_contact": contact}, numbers)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken."""
+        self.is_stale, lattice = True, self.unknowns.lattice
+        if not checkpoint.count("hierarchy_serves", 1):
+            return
+        contact = like(lattice.nodes, checkpoint.row("hierarchy_contact"))
+        touched = self.comm.allreduce(bool(contact.any()), MPI.LOR)
+        self._build(with_ghosts(self.comm, lattice, checkpoint.row("hierarchy_q")), contact if touched else contact[:0])
+        its = checkpoint.count("hierarchy_its")
+        self.first = (checkpoint.number("hierarchy_pace", 0.0, 0), its) if its else None
+
+    def destroy(self, _: PETSc.PC | None = None) -> None:
+        self.multigrid.destroy()

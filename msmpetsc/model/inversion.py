@@ -333,6 +333,11 @@ class CellScatter:
     def _owned(self) -> tuple[np.ndarray, np.ndarray, float]:
         return self.cells[: self.cells_owned], self.resistance[: self.cells_owned], self.volume
 
+    @property
+    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
+        return self.cells, self.resistance, self.volume
+
     def energy(self, q: np.ndarray) -> float:
         """Return the energy [J] of the cells that this rank owns."""
         return resistance_energy(q, *self._owned)
@@ -390,6 +395,11 @@ class CellGather:
         around[slot, node], corner[slot, node] = by_node // 8, by_node % 8
         resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
+
+    @property
+    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
+        return self.cells, self.resistance, self.volume
 
     def energy(self, q: np.ndarray) -> float:
         """Return the energy [J] of the cells that this rank owns."""

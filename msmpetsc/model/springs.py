@@ -145,7 +145,7 @@ class SpringScatter:
 
     def hessian_at(self, q: np.ndarray, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
-        blocks = np.empty((len(self.springs), 4), dtype)
+        blocks: np.ndarray = np.empty((len(self.springs), 4), dtype)
         elastic_hessian(q, *self._all, projected, blocks)
         return partial(add_elastic_product, self.springs, blocks)
 

@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.initial_state import uniform

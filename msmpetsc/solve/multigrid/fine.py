@@ -30,8 +30,9 @@ class ProjectedHessian(Viewable):
         self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
         blocks = np.zeros((len(q), 9), like=q)
         self.elasticity.add_diagonal(q, blocks)
-        invert_blocks(self.unknowns.size, blocks, self.unknowns.free, self.unknowns.lattice.mass, contact, self.t2,
-                      self.inverse)
+        invert_blocks(
+            self.unknowns.size, blocks, self.unknowns.free, self.unknowns.lattice.mass, contact, self.t2, self.inverse
+        )
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""

@@ -26,7 +26,9 @@ class ErrorEstimate:
     """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is
     left."""
 
-    def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str):
+    def __init__(
+        self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str
+    ):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.operator = python_matrix(functional.unknowns, hessian, functional.comm)
         self.correction, self.residual = self.operator.createVecs()

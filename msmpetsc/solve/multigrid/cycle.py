@@ -22,7 +22,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
 from msmpetsc.solve.multigrid.grids import Grid, grids, interpolation
-from msmpetsc.solve.petsc.library import set_chebyshev
+from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
@@ -119,7 +119,8 @@ class Multigrid:
         finest.setOperators(self.operator, self.operator)
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
-        pc.setFromOptions()
+        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):  # a preset may say what it begins with
+            pc.setFromOptions()
         self.is_set_up = True
 
     def destroy(self) -> None:

@@ -21,7 +21,7 @@ from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
-from msmpetsc.solve.multigrid.grids import Grid, grids, interpolation
+from msmpetsc.solve.multigrid.grids import Grid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
@@ -61,8 +61,7 @@ class Multigrid:
 
     def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         unknowns = self.unknowns
-        lattice, size = unknowns.lattice, unknowns.size
-        ijk = decode_morton(lattice.table.keys)[to_host(unknowns.free)]
+        size, ijk = unknowns.size, grid_indices(unknowns)[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
         galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0])

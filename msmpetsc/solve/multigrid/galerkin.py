@@ -21,7 +21,7 @@ from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges,
 from msmpetsc.model.lattice import CORNERS
 from msmpetsc.model.springs import spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.grids import Grid
+from msmpetsc.solve.multigrid.grids import Grid, grid_indices
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
 
@@ -143,15 +143,6 @@ class GalerkinSum:
 
     def destroy(self) -> None:
         self.matrix.destroy()
-
-
-def grid_indices(unknowns: Unknowns) -> np.ndarray:
-    """Return the grid index (l, 3) of each local node, ghosts included."""
-    lattice = unknowns.lattice
-    nodes, keys = to_host(lattice.nodes), lattice.table.keys
-    if not len(nodes):
-        return np.empty((0, 3), np.int64)
-    return decode_morton(keys[:1]) + np.rint((nodes - nodes[0]) / lattice.cell_size).astype(np.int64)
 
 
 def _by_cell(unknowns: Unknowns, elasticity: Elasticity) -> tuple[np.ndarray, ByCell, ByCell, ByCell]:

@@ -26,8 +26,7 @@ from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-FINEST = 2.0  # that eigenvalue on the finest level: a spring's is 2, and a sum's no more
-FINEST_RESISTING = 4.0  # a resisting corner's, which has four nodes
+FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound)
 SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
 ITERATIONS = 10  # of these
 
@@ -54,7 +53,7 @@ class Multigrid:
         self.operator = python_matrix(unknowns, self.fine, comm)
         self.owned.callback(self.operator.destroy)
         self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
-        self.bounds = [FINEST_RESISTING if elasticity.cells else FINEST] + [0.0] * (len(self.levels) - 1)
+        self.bounds = [FINEST] + [0.0] * (len(self.levels) - 1)
         self.pc = PETSc.PC().create(comm)
         self.owned.callback(self.pc.destroy)
         self.is_set_up = False

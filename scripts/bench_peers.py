@@ -94,6 +94,7 @@ CASES: list[Ours | Theirs] = [
     Ours("BDF2, `newton` to 1e-3", "bdf2"),
     Ours("Verlet, substeps by its limit", "verlet"),
     Theirs("Newton", "SemiImplicit, 20 substeps", "semi-implicit", 20, implicit=False),
+    Theirs("Newton", "SemiImplicit, 200 substeps", "semi-implicit", 200, implicit=False),
     Theirs("Newton", "VBD, 1 step, 10 iterations", "vbd", 1, 10),
     Theirs("Newton", "VBD, 20 substeps, 5 iterations", "vbd", 20, 5),
     Theirs("MuJoCo", "Euler, 20 substeps", "euler", 20, implicit=False),

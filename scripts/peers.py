@@ -11,7 +11,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from clone import parser
 
@@ -81,13 +81,13 @@ class Newton:
         import newton
 
         self.time_step = time_step
-        builder = newton.ModelBuilder(gravity=(0.0, 0.0, -G))
+        builder: Any = newton.ModelBuilder(gravity=(0.0, 0.0, -G))
         still = [(0.0, 0.0, 0.0)] * len(beam.nodes)
         builder.add_particles(beam.nodes.tolist(), still, np.where(beam.pinned, 0, beam.mass).tolist())
         for (i, j), stiffness in zip(beam.springs.tolist(), beam.stiffness.tolist(), strict=True):
             builder.add_spring(i, j, ke=stiffness, kd=0.0, control=0.0)
         builder.set_coloring(color_groups(beam))  # its own coloring does not see springs
-        model = builder.finalize(device="cpu")
+        model: Any = builder.finalize(device="cpu")
         model.spring_rest_length.assign(beam.rest_length)
         model.particle_grid = None  # no contact between particles
         vbd, semi_implicit = newton.solvers.SolverVBD, newton.solvers.SolverSemiImplicit
@@ -123,10 +123,10 @@ class MuJoCo:
             tendon = spec.add_tendon(stiffness=[k, 0, 0], springlength=[rest_length, rest_length])
             tendon.wrap_site(str(i))
             tendon.wrap_site(str(j))
-        self.model = spec.compile()
+        self.model, self.steps = spec.compile(), 0
         self.data = mujoco.MjData(self.model)
 
-    def _add_nodes(self, spec, beam: Beam) -> None:
+    def _add_nodes(self, spec: Any, beam: Beam) -> None:
         slide = self.mujoco.mjtJoint.mjJNT_SLIDE
         for i, (position, mass, pinned) in enumerate(zip(beam.nodes, beam.mass, beam.pinned, strict=True)):
             if pinned:
@@ -139,13 +139,13 @@ class MuJoCo:
 
     @property
     def note(self) -> str:
-        """What it warned of, where it did."""
-        warned = [warning.number for warning in self.data.warning]
-        unsolved = warned[self.mujoco.mjtWarning.mjWARN_INERTIA]
-        return f"warned that its linear solve had not converged, {unsolved} times" if unsolved else ""
+        """What it warned of in this run, where it did."""
+        unsolved = self.data.warning[self.mujoco.mjtWarning.mjWARN_INERTIA].number
+        return f"its linear solve did not converge in {unsolved} of {self.steps} steps, as it says" if unsolved else ""
 
     def advance(self, substeps: int) -> None:
         self.mujoco.mj_step(self.model, self.data, substeps)
+        self.steps += substeps
 
     def positions(self) -> np.ndarray:
         positions = self.rest.copy()

@@ -28,8 +28,6 @@ from msmpetsc.solve.petsc.limits import refuse_nonzeros
 HELD = 27  # code of an end that is no unknown; others are 9 i + 3 j + k of where they are in their coarse cell
 RAISED = 1 + 1e-5  # diagonals: few fine nodes in a coarse cell leave its columns linearly dependent
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])  # of corners: the upper triangle of a cell's matrix
-PAIR = np.zeros((8, 8), np.int64)
-PAIR[PAIRS[:, 0], PAIRS[:, 1]] = np.arange(len(PAIRS))
 
 
 def _weights() -> np.ndarray:
@@ -39,15 +37,19 @@ def _weights() -> np.ndarray:
     return np.concatenate([along.prod(axis=2), np.zeros((1, 8))])
 
 
-def _differences() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each two codes, 28 a + b, w_a - w_b: how many corners have a part, which (784, 8), and what part."""
-    d = (WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8)
-    corner = np.argsort(d == 0, axis=1, kind="stable")
-    return (d != 0).sum(axis=1), corner.astype(np.uint8), np.take_along_axis(d, corner, axis=1)
+def _products(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i + 1] of pairs and
+    their factors."""
+    factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
+    which, pair = np.nonzero(factors)
+    begin = np.searchsorted(which, np.arange(len(weights) + 1)).astype(np.int32)
+    return begin, pair.astype(np.int32), factors[which, pair]
 
 
 WEIGHTS = _weights()
-COUNT, CORNER, PART = _differences()
+OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times one code and the other
+OF_NODES = _products(WEIGHTS)
+SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a block stand among 6
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class GalerkinSum:
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
         keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity)
         self.law = tuple(like(lattice.nodes, a) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
-        self.tables = tuple(like(lattice.nodes, a) for a in (COUNT, CORNER, PART, WEIGHTS, PAIR))
+        self.of_springs, self.of_nodes = (tuple(like(lattice.nodes, a) for a in t) for t in (OF_SPRINGS, OF_NODES))
+        self.weights = like(lattice.nodes, WEIGHTS)
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         diagonal = np.flatnonzero((first == second) & (first >= 0))
@@ -131,13 +134,14 @@ class GalerkinSum:
     def update(self, q: np.ndarray, contact: np.ndarray) -> None:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
         (collective)."""
-        values = np.zeros((self.blocks, 9), like=q)
-        tables, stiffening, count = self.tables, self.elasticity.springs.stiffening, len(self.places)
-        add_springs(count, q, *self.springs.arrays, *self.law, stiffening, self.t2, *tables, self.places, values)
-        add_nodes(count, *self.nodes.arrays, self.unknowns.lattice.mass, contact, self.t2, *tables, self.places, values)
+        symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
+        law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.lattice.mass
+        add_springs(count, q, *self.springs.arrays, *law, self.t2, *self.of_springs, self.places, symmetric)
+        add_nodes(count, *self.nodes.arrays, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
+        values = symmetric[:, SYMMETRIC]
         if self.elasticity.cells:
             law = self.elasticity.cells.law
-            add_resistance(count, q, *self.cells.arrays, *law, self.t2, *tables, self.places, values)
+            add_resistance(count, q, *self.cells.arrays, *law, self.t2, self.weights, self.places, values)
         values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
@@ -168,25 +172,9 @@ def _by_cell(unknowns: Unknowns, elasticity: Elasticity) -> tuple[np.ndarray, By
     return every, of_springs, of_nodes, of_cells
 
 
-@numba.njit(cache=True)
-def _add_block(places, i, p, q, pair, values, f, b00, b01, b02, b10, b11, b12, b20, b21, b22):
-    """Add f times a block to that of corners p and q of cell i, p <= q."""
-    row = places[i, pair[p, q]]
-    if row >= 0:
-        values[row, 0] += f * b00
-        values[row, 1] += f * b01
-        values[row, 2] += f * b02
-        values[row, 3] += f * b10
-        values[row, 4] += f * b11
-        values[row, 5] += f * b12
-        values[row, 6] += f * b20
-        values[row, 7] += f * b21
-        values[row, 8] += f * b22
-
-
 @kernel
 def add_springs(
-    first, count, step, q, start, order, code, springs, rest, k, b, t2, counts, corner, part, _, pair, places, values
+    first, count, step, q, start, order, code, springs, rest, k, b, t2, begin, pair, factor, places, values
 ):
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
@@ -194,41 +182,39 @@ def add_springs(
             m, n = springs[s, 0], springs[s, 1]
             x, y, z = q[m, 0] - q[n, 0], q[m, 1] - q[n, 1], q[m, 2] - q[n, 2]
             c, ex, ey, ez = spring_block(x, y, z, rest[s], k[s], b, True)
-            for u in range(counts[kind]):
-                for v in range(counts[kind]):
-                    a, d = corner[kind, u], corner[kind, v]
-                    if a <= d:
-                        f = t2 * part[kind, u] * part[kind, v]
-                        _add_block(
-                            places, i, a, d, pair, values, f, c + ex * ex, ex * ey, ex * ez,
-                            ex * ey, c + ey * ey, ey * ez, ex * ez, ey * ez, c + ez * ez,
-                        )  # fmt: skip
+            xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
+            for entry in range(begin[kind], begin[kind + 1]):
+                f, block = t2 * factor[entry], values[places[i, pair[entry]]]
+                block[0] += f * xx
+                block[1] += f * xy
+                block[2] += f * xz
+                block[3] += f * yy
+                block[4] += f * yz
+                block[5] += f * zz
 
 
 @kernel
-def add_nodes(
-    first, count, step, start, order, code, mass, contact, t2, counts, corner, part, weights, pair, places, values
-):
+def add_nodes(first, count, step, start, order, code, mass, contact, t2, begin, pair, factor, places, values):
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
-            node, m = order[at], mass[order[at]]
-            for a in range(8):
-                for d in range(a, 8):
-                    f = weights[code[at, 0], a] * weights[code[at, 0], d]
-                    if f == 0.0:
-                        continue
-                    _add_block(places, i, a, d, pair, values, f, m, 0.0, 0.0, 0.0, m, 0.0, 0.0, 0.0, m)
-                    if len(contact):
-                        c = contact[node]
-                        _add_block(
-                            places, i, a, d, pair, values, t2 * f, c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]
-                        )
+            node, kind = order[at], code[at, 0]
+            for entry in range(begin[kind], begin[kind + 1]):
+                f, block = factor[entry], values[places[i, pair[entry]]]
+                block[0] += f * mass[node]
+                block[3] += f * mass[node]
+                block[5] += f * mass[node]
+                if len(contact):
+                    c = contact[node]
+                    block[0] += f * t2 * c[0]
+                    block[1] += f * t2 * c[1]
+                    block[2] += f * t2 * c[2]
+                    block[3] += f * t2 * c[4]
+                    block[4] += f * t2 * c[5]
+                    block[5] += f * t2 * c[8]
 
 
 @kernel
-def add_resistance(
-    first, count, step, q, start, order, code, cells, resistance, least, t2, _, __, ___, weights, pair, places, values
-):
+def add_resistance(first, count, step, q, start, order, code, cells, resistance, least, t2, weights, places, values):
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
             cell = order[at]
@@ -236,16 +222,23 @@ def add_resistance(
                 e = edges(q, cells[cell], frame)
                 n = cofactors(e)
                 curvature = t2 * corner_curvature(e, n[0], resistance[cell], least)
-                if curvature == 0.0:
-                    continue
-                for a in range(8):
-                    g = _slope(frame, code[at], weights, a, n)
-                    for d in range(a, 8):
-                        h = _slope(frame, code[at], weights, d, n)
-                        _add_block(
-                            places, i, a, d, pair, values, curvature, g[0] * h[0], g[0] * h[1], g[0] * h[2],
-                            g[1] * h[0], g[1] * h[1], g[1] * h[2], g[2] * h[0], g[2] * h[1], g[2] * h[2],
-                        )  # fmt: skip
+                if curvature > 0.0:
+                    _add_corner(i, frame, code[at], curvature, n, weights, places, values)
+
+
+@numba.njit(cache=True)
+def _add_corner(i, frame, code, curvature, n, weights, places, values):
+    """Add curvature G G^T to the blocks of cell i."""
+    pair = -1
+    for a in range(8):
+        g = _slope(frame, code, weights, a, n)
+        for b in range(a, 8):
+            pair += 1
+            if places[i, pair] >= 0:
+                h, block = _slope(frame, code, weights, b, n), values[places[i, pair]]
+                for r in range(3):
+                    for c in range(3):
+                        block[3 * r + c] += curvature * g[r] * h[c]
 
 
 @numba.njit(cache=True)

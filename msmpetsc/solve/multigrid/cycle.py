@@ -19,6 +19,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.bodies import bodies_of
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
 from msmpetsc.solve.multigrid.grids import Grid, grid_indices, grids, interpolation
@@ -43,12 +44,14 @@ class Level:
 class Multigrid:
     """The PCMG of one lattice and time step, and the hierarchy that it works on. All methods are collective.
 
+    bodies : that have coarse grids of their own
     pc     : its options have the ``prefix``
     levels : the coarse ones, the finest of them first
     """
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.unknowns, self.prefix, self.owned = unknowns, prefix, ExitStack()
+        self.bodies = bodies_of(comm, unknowns)
         self.fine = ProjectedHessian(unknowns, elasticity, time_step**2)
         self.operator = python_matrix(unknowns, self.fine, comm)
         self.owned.callback(self.operator.destroy)
@@ -60,10 +63,12 @@ class Multigrid:
 
     def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         unknowns = self.unknowns
-        size, ijk = unknowns.size, grid_indices(unknowns)[to_host(unknowns.free)]
+        size, everywhere = unknowns.size, grid_indices(unknowns)
+        apart = self.bodies.apart(comm, everywhere)
+        ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
-        galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0])
+        galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
         for grid in coarse:

@@ -21,7 +21,7 @@ from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges,
 from msmpetsc.model.lattice import CORNERS
 from msmpetsc.model.springs import spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.grids import Grid, grid_indices
+from msmpetsc.solve.multigrid.grids import Grid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
 
@@ -84,16 +84,27 @@ class ByCell:
 class GalerkinSum:
     """Sums P^T H P of a lattice, H = M + t^2 (projected Hessian of E), into a matrix of the first coarse grid.
 
+    ijk    : (l, 3) grid index of each local node
+    apart  : (l,) how far its body is moved along the first axis, to have coarse cells of its own
     matrix : AIJ of block size 3; it has values after the first ``update``
 
     On a CPU all cells add to the blocks of this rank's pairs of nodes; on a GPU each has blocks of its own, which PETSc
     then adds.
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, t2: float, grid: Grid):
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        unknowns: Unknowns,
+        elasticity: Elasticity,
+        t2: float,
+        grid: Grid,
+        ijk: np.ndarray,
+        apart: np.ndarray,
+    ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
-        keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity)
+        keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, apart)
         self.law = tuple(like(lattice.nodes, a) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
         self.of_springs, self.of_nodes = (tuple(like(lattice.nodes, a) for a in t) for t in (OF_SPRINGS, OF_NODES))
         self.weights = like(lattice.nodes, WEIGHTS)
@@ -149,9 +160,11 @@ class GalerkinSum:
         self.matrix.destroy()
 
 
-def _by_cell(unknowns: Unknowns, elasticity: Elasticity) -> tuple[np.ndarray, ByCell, ByCell, ByCell]:
+def _by_cell(
+    unknowns: Unknowns, elasticity: Elasticity, ijk: np.ndarray, apart: np.ndarray
+) -> tuple[np.ndarray, ByCell, ByCell, ByCell]:
     """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and resisting cells."""
-    lattice, ijk = unknowns.lattice, grid_indices(unknowns)
+    lattice = unknowns.lattice
     held, free = to_host(lattice.pinned), to_host(unknowns.free)
     springs = to_host(lattice.springs)[: lattice.springs_owned]
     moving = np.flatnonzero(~held[springs].all(axis=1))
@@ -159,7 +172,8 @@ def _by_cell(unknowns: Unknowns, elasticity: Elasticity) -> tuple[np.ndarray, By
     corners = np.empty((0, 8), np.int64) if cells is None else to_host(cells.cells[: cells.cells_owned])
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
-    keys = [encode_morton(corner) for corner in low]
+    along = [apart[nodes].max(axis=1) // 2 for nodes in ends]  # what is held is moved with what it holds
+    keys = [encode_morton(corner + [1, 0, 0] * by[:, None]) for corner, by in zip(low, along, strict=True)]
     codes = [
         np.where(held[nodes], HELD, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
         for nodes, corner in zip(ends, low, strict=True)

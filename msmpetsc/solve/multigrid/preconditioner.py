@@ -11,6 +11,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
+from msmpetsc.solve.multigrid.rigid import RigidMotions
 
 WORSE = 2.0  # times the iterations for a digit that the first solve took with a hierarchy: time for a new one
 FEW = 3  # iterations more than that: of a count so low nothing can be said
@@ -19,6 +20,7 @@ FEW = 3  # iterations more than that: of a count so low nothing can be said
 class LatticePreconditioner:
     """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
 
+    rigid    : motions of bodies that nothing holds, kept exactly; None where all are held
     q        : positions (l, 3) [m] of that; None before the first
     contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
     first    : iterations a digit, and in all, of the first solve with it; None before that
@@ -28,14 +30,23 @@ class LatticePreconditioner:
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.comm, self.unknowns = comm, unknowns
         self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
+        bodies = self.multigrid.bodies
+        self.rigid = RigidMotions(comm, unknowns, bodies) if bodies.free.any() else None
         self.q: np.ndarray | None = None
         self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
         self.first: tuple[float, int] | None = None
         self.is_stale, self.built = True, 0
 
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """The projected Hessian."""
+        return self.multigrid.operator
+
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
         due = self.is_stale
+        if self.rigid:
+            self.rigid.follow(q)
         if due:
             self._build(q.copy(), self._blocks(q, contact))
         return due
@@ -68,7 +79,10 @@ class LatticePreconditioner:
         self.multigrid.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.multigrid.pc.apply(x, y)
+        if self.rigid:
+            self.rigid.around(self.multigrid.pc, x, y)
+        else:
+            self.multigrid.pc.apply(x, y)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.multigrid.pc.view(viewer)

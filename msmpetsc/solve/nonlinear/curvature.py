@@ -158,8 +158,9 @@ class LowestCurvature:
         values, (x, last) = self._ritz((start, self._product(start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
-            residuals = self._without_rigid(self._preconditioned(x[1] - like(mass, values)[:, None] * mass * x[0]))
-            w = self._unit(residuals)
+            residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
+            residuals /= np.maximum(np.abs(residuals).max(axis=1, initial=TINY), TINY)[:, None]  # for single precision
+            w = self._unit(self._without_rigid(self._preconditioned(residuals)))
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
             values, (x, last) = self._ritz((span, products), size)

@@ -16,7 +16,7 @@ from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble, diagonal_of
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
-from msmpetsc.solve.nonlinear.preconditioning import MULTIGRID, StepPreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import MULTIGRID, Preconditioned, StepPreconditioner
 from msmpetsc.solve.presets import SolverOptions
 
 
@@ -65,6 +65,8 @@ class Jacobian:
         self.preconditioner = StepPreconditioner(
             self._of_matrix, of_lattice, kind, chooses and options.is_default("pc_type"), self._stiffness_ratio()
         )
+        self.pmat = python_matrix(unknowns, Preconditioned(self.preconditioner), comm)
+        owned.callback(self.pmat.destroy)
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -109,3 +111,5 @@ class Jacobian:
         changed = self.preconditioner.prepare(q, contact)
         if self.true_hessian or changed:
             self.operator.assemble()
+        if changed:
+            self.pmat.assemble()

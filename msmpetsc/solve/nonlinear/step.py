@@ -130,7 +130,7 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
-        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.operator)
+        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
         snes.setObjective(self._objective)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -156,7 +156,7 @@ class Stepper:
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
             self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
-            self.ksp.setOperators(self.jacobian.operator)
+            self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:

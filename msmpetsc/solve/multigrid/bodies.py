@@ -1,0 +1,75 @@
+"""Bodies that no spring joins, as a step's unknowns see them: what is held lies between them, too.
+
+Each has coarse grids of its own, and what no spring holds moves freely.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from msmpetsc.backend.arrays import to_host
+from msmpetsc.comm import Route, SortedKeys
+from msmpetsc.geometry.grid import LIMIT
+from msmpetsc.solve.linear.unknowns import Unknowns
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Bodies of a lattice.
+
+    number : (l,) of each local node's body; -1 where it is held
+    free   : (b,) bool of each body, whether no spring holds it
+    """
+
+    number: np.ndarray
+    free: np.ndarray
+
+    def apart(self, comm: MPI.Comm, ijk: np.ndarray) -> np.ndarray:
+        """Return how far each local node's body is to be moved along the grid's first axis, (l,), so that no two have a
+        coarse cell in common; 0 where the grid has no room for that, and of what is held (collective).
+
+        ijk : (l, 3) grid indices of the local nodes
+        """
+        farthest = comm.allreduce(int(ijk.max(initial=0)), MPI.MAX)
+        room = 2 << farthest.bit_length()  # twice what they take, and a power of two, so on the coarser grids as well
+        return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
+
+
+def bodies_of(comm: MPI.Comm, unknowns: Unknowns) -> Bodies:
+    """Return the bodies of a lattice (collective)."""
+    lattice = unknowns.lattice
+    moves, springs = ~to_host(lattice.pinned), lattice.springs
+    both, either = moves[springs].all(axis=1), moves[springs].any(axis=1)
+    joined = springs[both]
+    graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2)
+    part = connected_components(graph, directed=False)[1]
+    name = _names(comm, unknowns, part)
+    table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
+    number = np.where(moves, table.find(np.where(moves, name, -1)), -1)
+    held = np.zeros(table.total, bool)
+    ends = springs[either & ~both]
+    held[number[ends[moves[ends]]]] = True
+    comm.Allreduce(MPI.IN_PLACE, held, MPI.LOR)
+    return Bodies(number, ~held)
+
+
+def _names(comm: MPI.Comm, unknowns: Unknowns, part: np.ndarray) -> np.ndarray:
+    """The least global number (l,) in the body of each node; ``part`` (l,) that of this rank it belongs to.
+
+    Ranks that have parts of one body tell each other until none learns of a lesser number.
+    """
+    lattice = unknowns.lattice
+    to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
+    asked = to_owner.send(lattice.ghosts) - lattice.table.first
+    name, is_new = lattice.global_numbers, True
+    while is_new:
+        least = np.full(part.max(initial=-1) + 1, np.iinfo(np.int64).max)
+        np.minimum.at(least, part, name)
+        lesser = least[part]
+        lesser[lattice.owned :] = np.minimum(lesser[lattice.owned :], to_owner.answer(lesser[asked]))
+        is_new = comm.allreduce(bool((lesser < name).any()), MPI.LOR)
+        name = lesser
+    return name

@@ -51,6 +51,14 @@ class LatticePreconditioner:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
+    def balance(self, q: np.ndarray, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
+        their forces balance: linear solves leave them there."""
+        if self.rigid:
+            self.rigid.follow(q)
+            columns = self.unknowns.columns_to_write(x)
+            columns -= self.rigid.of(self.unknowns.columns(f))
+
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
         pace = its / max(-np.log10(rtol), 0.1)

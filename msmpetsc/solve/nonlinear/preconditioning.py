@@ -82,6 +82,17 @@ class StepPreconditioner:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
+    def balance(self, q: np.ndarray, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
+        where linear solves would not."""
+        if self.multigrid:
+            self.multigrid.balance(q, f, x)
+
+    @property
+    def has_to_balance(self) -> bool:
+        """Whether ``balance`` does anything."""
+        return self.multigrid is not None and self.multigrid.rigid is not None
+
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
         if self.multigrid:

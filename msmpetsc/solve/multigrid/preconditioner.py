@@ -11,7 +11,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
-from msmpetsc.solve.multigrid.rigid import RigidMotions
+from msmpetsc.solve.multigrid.translations import Translations
 
 WORSE = 2.0  # times the iterations for a digit that the first solve took with a hierarchy: time for a new one
 FEW = 3  # iterations more than that: of a count so low nothing can be said
@@ -20,7 +20,7 @@ FEW = 3  # iterations more than that: of a count so low nothing can be said
 class LatticePreconditioner:
     """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
 
-    rigid    : motions of bodies that nothing holds, kept exactly; None where all are held
+    translations : of bodies that nothing holds, kept exactly; None where all are held
     q        : positions (l, 3) [m] of that; None before the first
     contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
     first    : iterations a digit, and in all, of the first solve with it; None before that
@@ -31,7 +31,7 @@ class LatticePreconditioner:
         self.comm, self.unknowns = comm, unknowns
         self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
         bodies = self.multigrid.bodies
-        self.rigid = RigidMotions(comm, unknowns, bodies) if bodies.free.any() else None
+        self.translations = Translations(comm, unknowns, bodies) if bodies.free.any() else None
         self.q: np.ndarray | None = None
         self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
         self.first: tuple[float, int] | None = None
@@ -45,19 +45,16 @@ class LatticePreconditioner:
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
         due = self.is_stale
-        if self.rigid:
-            self.rigid.follow(q)
         if due:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
-    def balance(self, q: np.ndarray, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
-        their forces balance: linear solves leave them there."""
-        if self.rigid:
-            self.rigid.follow(q)
+    def balance(self, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies that nothing holds as wholes, from x where F is f, to where their forces balance: linear solves
+        leave them there."""
+        if self.translations:
             columns = self.unknowns.columns_to_write(x)
-            columns -= self.rigid.of(self.unknowns.columns(f))
+            columns -= self.translations.of(self.unknowns.columns(f))
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
@@ -87,8 +84,8 @@ class LatticePreconditioner:
         self.multigrid.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self.rigid:
-            self.rigid.around(self.multigrid.pc, x, y)
+        if self.translations:
+            self.translations.around(self.multigrid.pc, x, y)
         else:
             self.multigrid.pc.apply(x, y)
 

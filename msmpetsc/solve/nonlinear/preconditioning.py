@@ -19,6 +19,7 @@ from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
 MULTIGRID = PETSc.PC.Type.MG
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
+MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
 def expected_iterations(ratio: float) -> float:
@@ -82,16 +83,15 @@ class StepPreconditioner:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, q: np.ndarray, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
-        where linear solves would not."""
+    def balance(self, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies as wholes, from x where F is f, to where their forces balance, where linear solves would not."""
         if self.multigrid:
-            self.multigrid.balance(q, f, x)
+            self.multigrid.balance(f, x)
 
     @property
     def has_to_balance(self) -> bool:
         """Whether ``balance`` does anything."""
-        return self.multigrid is not None and self.multigrid.rigid is not None
+        return self.multigrid is not None and self.multigrid.translations is not None
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""

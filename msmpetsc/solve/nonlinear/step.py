@@ -173,7 +173,7 @@ class Stepper:
             self.base[:] = problem.fixed
             self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
             if start is None and self.jacobian.preconditioner.has_to_balance:
-                self.jacobian.preconditioner.balance(self._evaluate(self.x).q, self.work, self.x)
+                self.jacobian.preconditioner.balance(self._evaluate(self.x).f, self.x)
             iterations, is_done = 0, False
             while not is_done:
                 for _ in self._solves():

@@ -75,6 +75,7 @@ class Frame:
     true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
     energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
     inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
+    products: Annotated[int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")] = 0
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0

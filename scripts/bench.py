@@ -165,10 +165,10 @@ def alternated(case: Case, repeats: int, folder: Path) -> dict[str, list[Run]]:
 
 
 def moving(runs: Sequence[Run]) -> np.ndarray:
-    """(frames,) bool: those that count."""
+    """(frames,) bool: those that count; where there are none of that kind the first, or all."""
     solved = np.all([one.is_solved for one in runs], axis=0)
     later = solved & (np.arange(len(solved)) > 0)
-    return later if later.any() else solved
+    return next((some for some in (later, solved) if some.any()), np.ones(len(solved), bool))
 
 
 def figures(runs: Sequence[Run], counted: np.ndarray) -> dict[str, float]:
@@ -183,7 +183,7 @@ def figures(runs: Sequence[Run], counted: np.ndarray) -> dict[str, float]:
         "us a cell": 1e3 * median(times) / cost["cells"],
         "iterations": iterations / len(frames["iterations"]),
         "KSP its": float(frames["ksp_its"].mean()),
-        "its an iteration": its / iterations,
+        "its an iteration": its / max(iterations, 1.0),
         "products": float(frames["products"].mean()),
         "error": float(frames["step_error"].max()),
         "set-up s": median(one.cost["time"]["setup"] for one in runs),

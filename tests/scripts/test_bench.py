@@ -44,6 +44,8 @@ def test_frames_that_count_are_those_that_all_had_to_solve_but_the_first(bench):
     runs = [one_run(bench, [1.0] * 4, iterations) for iterations in ([1, 2, 0, 3], [1, 1, 1, 1])]
     assert bench.moving(runs).tolist() == [False, True, False, True]
     assert bench.moving([one_run(bench, [1.0] * 2, [2, 0])]).tolist() == [True, False]  # better than none
+    falls = [one_run(bench, [1.0] * 2, [0, 0])]
+    assert bench.moving(falls).tolist() == [True, True] and bench.figures(falls, bench.moving(falls))["KSP its"] == 0
 
 
 def test_figures_are_of_the_frames_that_count(bench):

@@ -2,17 +2,22 @@
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import pytest
 from block_scene import block_scene, play
 from conftest import run as on_ranks
+from petsc4py import PETSc
 
+from msmpetsc.cli.main import main
 from msmpetsc.errors import StepFailed
 from msmpetsc.output.reader import Result
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.petsc import events
+from msmpetsc.solve.simulate import Simulation
 from msmpetsc.study.metrics import of_frames
 
 FRAMES = 3
@@ -54,8 +59,20 @@ def test_events_are_in_their_stages(run: tuple):
     names = "gradient", "energy", "hessian", "product", "fine", "cycle", "estimate", "local"
     assert {f"msmpetsc {name}" for name in names} <= set(stages["steps"])
     assert stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
-    assert "msmpetsc ghosts" in stages["Main Stage"]  # of the explicit limit, when all is done
     assert not any(name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage])
+
+
+def test_the_set_up_is_over_when_steps_begin(tmp_path: Path, monkeypatch):
+    mark, advance = PETSc.Log.Event("mark of a test"), Simulation.advance
+
+    def marked(simulation: Simulation) -> Iterator:
+        with mark:
+            yield from advance(simulation)
+
+    monkeypatch.setattr(Simulation, "advance", marked)
+    words = block_scene(tmp_path, **SWINGS), "-o", tmp_path / "o.h5", "--measure", tmp_path / "m.json"
+    assert main(["run", *map(str, words)]) == 0
+    assert [mark.getPerfInfo(stage)["count"] for stage in (events.MAIN, events.SETUP.id)] == [1, 0]
 
 
 def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
@@ -79,8 +96,8 @@ def test_flops_of_a_product_are_those_of_its_springs(run: tuple):
 def test_times_are_of_all_stages_of_the_run_but_not_of_its_reference(run: tuple):
     stages, cost, frames = run
     told = {"local": ["msmpetsc local"], "ksp": ["KSPSolve"], "hierarchy": ["msmpetsc grids", "msmpetsc hierarchy"]}
-    for name, events in told.items():
-        rows = [stages[s].get(event) for s in ("Main Stage", "set-up", "steps", "output") for event in events]
+    for name, sources in told.items():
+        rows = [stages[s].get(event) for s in ("Main Stage", "set-up", "steps", "output") for event in sources]
         assert cost["time"][name] == pytest.approx(sum(row[1] for row in rows if row), rel=1e-3) and any(rows)
     assert cost["time"]["local"] + cost["time"]["ksp"] < cost["time"]["stepping"]
     assert cost["time"]["stepping"] == pytest.approx(frames["wall_time"].sum())

@@ -34,6 +34,7 @@ from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.instrumentation import Probes, begin_timing
 from msmpetsc.solve.options import refuse_early
 from msmpetsc.solve.petsc.device import choose
+from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
@@ -103,6 +104,7 @@ def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
     with (
         compilation_logged(plan.kernels_are_new),
         Signals(comm) as signals,
+        begun(SETUP) as set_up,
         open_output(comm, plan) as file,
         Simulation(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
     ):
@@ -112,6 +114,7 @@ def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 frames = start_output(comm, plan, file, model, simulation)
                 checkpoints = Checkpoints(file, simulation, plan.interval, signals)
+                set_up.close()
                 with ProgressLine.shown(comm, simulation.steps) as progress:
                     observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
                     signals.begin()

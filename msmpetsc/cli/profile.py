@@ -28,11 +28,12 @@ class Cost:
     setup    : seconds until the first step
     output   : seconds that observers take: frames and checkpoints are written in them
     stepping : seconds of the steps
+    products : with the Hessian
     """
 
     def __init__(self, comm: MPI.Comm, simulation: "Simulation", setup: float):
         self.comm, self.simulation, self.setup = comm, simulation, setup
-        self.output = self.stepping = 0.0
+        self.output, self.stepping, self.products = 0.0, 0.0, 0
         model = simulation.model
         own = len(model.lattice.cells), model.lattice.owned, model.lattice.springs_owned, simulation.integrator.unknowns
         self.counts = dict(zip(("cells", "nodes", "springs", "unknowns"), map(comm.allreduce, own), strict=True))
@@ -40,18 +41,23 @@ class Cost:
     @contextmanager
     def of_output(self) -> Iterator[None]:
         """Count the time of the block as that of output."""
+        from msmpetsc.solve.petsc.events import FILES, OUTPUT
+
         began = perf_counter()
-        yield
+        with OUTPUT, FILES:
+            yield
         self.output += perf_counter() - began
 
     def after_step(self, frame: Frame | None) -> bool:
         """Count the steps since the frame before."""
-        self.stepping += frame.wall_time if frame else 0.0
+        if frame:
+            self.stepping += frame.wall_time
+            self.products += frame.products
         return False
 
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
-        from msmpetsc.solve.instrumentation import times
+        from msmpetsc.solve.instrumentation import hierarchies, times
         from msmpetsc.solve.integrators.stability_limit import explicit_limit
 
         comm, simulation = self.comm, self.simulation
@@ -59,10 +65,13 @@ class Cost:
         own = {"setup": self.setup, "output": self.output, "stepping": self.stepping}
         time = {name: comm.allreduce(seconds, MPI.MAX) for name, seconds in own.items()} | times(comm)
         time["setup"] -= min(time["factor"], time["setup"])
+        stepper = getattr(simulation.integrator, "stepper", None)  # an explicit integrator has none
         record = {
             "machine": machine(), "device": device, "versions": versions(), "ranks": comm.size, "command": command,
             **self.counts,
             "time": time,
+            "products": self.products,
+            "hierarchy": hierarchies(comm, stepper),
             "memory": comm.allreduce(peak_memory()),
             "trace": simulation.trace,
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),

@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import on_host
+from msmpetsc.model.flops import Flops
 from msmpetsc.model.inversion import CellGather, CellScatter, least_volumes
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.springs import Product, SpringGather, SpringScatter
@@ -21,11 +22,11 @@ class Elasticity:
     resist being turned inside out (model.inversion).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
-    owned nodes. ``cells`` is None where they do not resist.
+    owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.owned = lattice.owned
+        self.owned, self.flops = lattice.owned, Flops.of(lattice)
         on_cpu = on_host(lattice.nodes)
         self.springs: SpringScatter | SpringGather = (SpringScatter if on_cpu else SpringGather).of(lattice)
         self.cells: CellScatter | CellGather | None = None

@@ -75,6 +75,7 @@ class Frame:
     true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
     energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan
     inverted: Annotated[int, _number("i8", "1", "cells turned inside out")] = 0
+    products: Annotated[int, _number("i8", "1", "products with the Hessian, and at multigrid's finest level")] = 0
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
@@ -112,6 +113,8 @@ CHECKPOINT = {  # two slots, of which the one with the greater step holds
     "correction": Field("f8", (2, "n", 3), "m", "correction x - y of the last step"),
     "correction_before": Field("f8", (2, "n", 3), "m", "correction x - y of the step before that"),
     "contact_bound": Field("f8", (2, "n"), "N/m", "contact stiffness that the preconditioner knows"),
+    "hierarchy_q": Field("f8", (2, "n", 3), "m", "positions that the multigrid hierarchy was built at"),
+    "hierarchy_contact": Field("f8", (2, "n", 9), "N/m", "contact's Hessian that the hierarchy was built with"),
     "history_q": Field("f8", (2, "n", 3), "m", "positions that BDF2 looks back to"),
     "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
     "mode": Field("f8", (2, "n", 3), "1", "highest mode, which limits the explicit step"),

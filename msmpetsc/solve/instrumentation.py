@@ -7,9 +7,13 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.solve.nonlinear.step import LOCAL_EVENT, Stepper
+from msmpetsc.solve.multigrid.memory import stored_bytes
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.petsc.events import GRIDS, HIERARCHY, LOCAL, count, seconds
 
-EVENTS = {"factor": "PCSetUp", "local": LOCAL_EVENT, "ksp": "KSPSolve"}
+EVENTS = {
+    "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name]
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,12 @@ def begin_timing() -> None:
 
 
 def times(comm: MPI.Comm) -> dict[str, float]:
-    """Seconds in the events of PETSc's main stage, the greatest of all ranks (collective)."""
-    return {
-        name: comm.allreduce(PETSc.Log.Event(event).getPerfInfo()["time"], MPI.MAX) for name, event in EVENTS.items()
-    }
+    """Seconds in events of the run, those of its references left out, the greatest of all ranks (collective)."""
+    return {name: comm.allreduce(sum(map(seconds, events)), MPI.MAX) for name, events in EVENTS.items()}
+
+
+def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
+    """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective)."""
+    multigrid = stepper.jacobian.preconditioner.multigrid if stepper else None
+    own = stored_bytes(multigrid.multigrid) if multigrid else 0
+    return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}

@@ -30,12 +30,14 @@ class StepCost:
     error: float = 0.0
     iterations: int = 0
     ksp_its: int = 0
+    products: int = 0
 
     def add(self, result: StepResult) -> None:
         """Count one more solve."""
         self.error = max(self.error, result.error)
         self.iterations += result.iterations
         self.ksp_its += result.ksp_its
+        self.products += result.products
 
 
 class Recovery:
@@ -80,7 +82,8 @@ class Recovery:
             cost.fallbacks = 1
         else:
             result, after = self._in_pieces(state, time, max(self.level, 1) if failure else self.level, cost)
-        result = replace(result, error=cost.error, iterations=cost.iterations, ksp_its=cost.ksp_its)
+        result = replace(result, error=cost.error, iterations=cost.iterations)
+        result = replace(result, ksp_its=cost.ksp_its, products=cost.products)
         return result, after, cost
 
     def save(self, checkpoint: Checkpoint) -> None:

@@ -29,6 +29,7 @@ from msmpetsc.solve.nonlinear.reference import PRESET
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.petsc.device import sender
+from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery, StepCost
@@ -61,6 +62,7 @@ class FrameCost:
     step_error: float = 0.0
     iterations: int = 0
     ksp_its: int = 0
+    products: int = 0
     wall_time: float = 0.0  # [s]
     true_error: float = np.nan
     energy_error: float = np.nan
@@ -76,6 +78,7 @@ class FrameCost:
         self.step_error = max(self.step_error, result.error)
         self.iterations += result.iterations
         self.ksp_its += result.ksp_its
+        self.products += result.products
         self.wall_time += wall_time
         if cost:
             self.substeps += cost.substeps
@@ -135,30 +138,36 @@ class Simulation:
             self.balance.start(self.state, self.time_step)
             yield self._frame(0, self.state.q)
         for index in range(self.step + 1, self.steps + 1):
-            time = index * self.time_step
-            if index == self.probes.trace:
-                self.integrator.follow()
-            self._overlaps(index, time)
-            begin, cost = perf_counter(), None
-            try:
-                if self.recovery.is_on:
-                    result, after, cost = self.recovery.step(self.state, time, None)
-                else:
-                    result, after = self.integrator.advance(self.state, time)
-                    self.balance.examine(self.state, result, after, time, self.time_step)
-            except StepFailed as failure:
-                result, after, cost = self._recovered(index, time, failure)
-            self.state = after
-            self.cost.add(result, cost, perf_counter() - begin)
-            if self.probes.asks(index) and cost is None:
-                errors, trace = self.integrator.true_errors(index, result)
-                self.cost.measure(errors)
-                self.trace = trace or self.trace
-            self.monitors.gain(index, time, self.balance.ledger)
-            self.step = index
-            yield self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+            with STEPS:
+                frame = self._advance(index)
+            yield frame
         self.monitors.sum_up()
         self.recovery.sum_up()
+
+    def _advance(self, index: int) -> Frame | None:
+        """The next step (collective), as a frame if that is stored. Raises StepFailed, naming the step."""
+        time = index * self.time_step
+        if index == self.probes.trace:
+            self.integrator.follow()
+        self._overlaps(index, time)
+        begin, cost = perf_counter(), None
+        try:
+            if self.recovery.is_on:
+                result, after, cost = self.recovery.step(self.state, time, None)
+            else:
+                result, after = self.integrator.advance(self.state, time)
+                self.balance.examine(self.state, result, after, time, self.time_step)
+        except StepFailed as failure:
+            result, after, cost = self._recovered(index, time, failure)
+        self.state = after
+        self.cost.add(result, cost, perf_counter() - begin)
+        if self.probes.asks(index) and cost is None:
+            errors, trace = self.integrator.true_errors(index, result)
+            self.cost.measure(errors)
+            self.trace = trace or self.trace
+        self.monitors.gain(index, time, self.balance.ledger)
+        self.step = index
+        return self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State, StepCost]:
         """A step that failed, taken another way (collective). Raises StepFailed, naming the step."""

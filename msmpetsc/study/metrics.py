@@ -15,7 +15,7 @@ from msmpetsc.study.table import Row
 
 COUNTS = ("cells", "nodes", "unknowns", "springs")
 PARTS = ("setup", "factor", "local", "ksp", "output")
-ITERATIONS = ("iterations", "ksp_its")
+COUNTED = ("iterations", "ksp_its", "products")  # of the steps; an older file lacks the last
 
 OUTCOMES = (  # of a run of a map: from the worst to the best
     "crashed", "timeout", "refused", "not finite", "energy", "diverged", "not recovered", "inverted", "slow", "ok",
@@ -86,9 +86,10 @@ def of_frames(result: Path, time_step: float) -> Row:
         return {"frames": count, "steps": 0} | shape
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
     start = 2 if count > 2 else 1  # what is only done once shows in the first frame
-    mean = {name: series[name][start:].sum() / steps[start - 1 :].sum() for name in ("wall_time", *ITERATIONS)}
+    known = [name for name in ("wall_time", *COUNTED) if name in series]
+    mean = {name: series[name][start:].sum() / steps[start - 1 :].sum() for name in known}
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
-    row |= {name: float(mean[name]) for name in ITERATIONS}
+    row |= {name: float(mean[name]) for name in COUNTED if name in mean}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
     return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
 

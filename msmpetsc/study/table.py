@@ -76,6 +76,7 @@ COLUMNS = {
     "iterations": Column(float, "1", "outer iterations, mean of a step"),
     "most_iterations": Column(float, "1", "outer iterations, the most of a step"),
     "ksp_its": Column(float, "1", "KSP iterations, mean of a step"),
+    "products": Column(float, "1", "products with the Hessian, mean of a step"),
     "substeps": _of_frames("substeps"),
     "fallbacks": _of_frames("fallbacks"),
     "inverted": _of_frames("inverted", " in the last frame"),

@@ -33,6 +33,7 @@ def test_frames_are_those_of_every_third_step_and_the_last(scene: Path):
     for frame, steps in zip(few[1:], (each[1:4], each[4:7], each[7:8]), strict=True):
         assert frame.iterations == sum(step.iterations for step in steps) > 0
         assert frame.ksp_its == sum(step.ksp_its for step in steps) > 0
+        assert frame.products == sum(step.products for step in steps)
         assert frame.step_error == max(step.step_error for step in steps) > 0
 
 

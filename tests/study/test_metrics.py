@@ -70,12 +70,12 @@ def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
     positions = [np.zeros((1, 3))] * 4
     file = result(
         tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0], iterations=[0, 50, 4, 8],
-        ksp_its=[0, 0, 40, 0], step_error=[0, 0.3, 0.4, 0.0],
+        ksp_its=[0, 0, 40, 0], products=[0, 0, 60, 12], step_error=[0, 0.3, 0.4, 0.0],
     )  # fmt: skip
     row = of_frames(file, 0.1)
     assert (row["frames"], row["steps"]) == (4, 6)
     assert row["time_frame"] == pytest.approx(6 / 4)
-    assert (row["iterations"], row["ksp_its"]) == (3, 10)
+    assert (row["iterations"], row["ksp_its"], row["products"]) == (3, 10, 18)
     assert row["estimated_error"] == pytest.approx(np.sqrt((0.09 + 0.16) / 3))
 
 

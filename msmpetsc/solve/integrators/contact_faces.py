@@ -6,6 +6,7 @@ from mpi4py import MPI
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.environment import Environment
 from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.petsc.events import CONTACT
 
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 
@@ -43,7 +44,8 @@ class ContactFaces:
 
     def _crossed(self, end: np.ndarray) -> np.ndarray:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
-        return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
+        with CONTACT:
+            return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
 
     def problem(self) -> StepProblem:
         """The step with the faces as they are known now."""

@@ -78,13 +78,14 @@ class ImplicitEuler:
         faces = ContactFaces(
             self.comm, self.environment, q, y, time=time, time_step=time_step, before=before, fixed=fixed
         )
-        iterations = ksp_its = 0
+        iterations = ksp_its = products = 0
         while not faces.is_settled:
             self.problem = faces.problem()
             result = self.stepper.step(self.problem)
             iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
+            products += result.products
             faces.compare(result.position)
-        return replace(result, iterations=iterations, ksp_its=ksp_its), faces.sides
+        return replace(result, iterations=iterations, ksp_its=ksp_its, products=products), faces.sides
 
     def follow(self) -> None:
         self.trace = Trace()
@@ -166,10 +167,10 @@ class Bdf2(ImplicitEuler):
         of its energy.
         """
         self._let_go(time)
-        q, v, began = state.q, state.velocity(self.time_step), 0
+        q, v, its, products = state.q, state.velocity(self.time_step), 0, 0
         history = state.history
         if history is None:
-            history, began = self._history(q, v, time, state.sides)
+            history, its, products = self._history(q, v, time, state.sides)
         q_0, v_0 = history
         y = (4 * q - q_0 + self.tau * (4 * v - v_0)) / 3
         result, sides = self._solve(q, y, time, self.time_step, state.sides)
@@ -179,7 +180,8 @@ class Bdf2(ImplicitEuler):
         before, work = self.environment.turn(
             result.position, previous, a, time, self.time_step, self.stepper.lattice.pinned, sides
         )
-        result = replace(result, previous=previous, ksp_its=result.ksp_its + began, work=work)
+        its, products = its + result.ksp_its, products + result.products
+        result = replace(result, previous=previous, ksp_its=its, products=products, work=work)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
@@ -188,10 +190,10 @@ class Bdf2(ImplicitEuler):
 
     def _history(
         self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None
-    ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
+    ) -> tuple[tuple[np.ndarray, np.ndarray], int, int]:
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
-        which is the true one but for a part of first order; and the KSP iterations that this takes."""
+        which is the true one but for a part of first order; the KSP iterations and products that this takes."""
         t, tau = self.time_step, self.tau
         result, _ = self._solve(q, q + tau * v, time - t + tau, tau, sides)
         a = ((result.position - q) / tau - v) / tau
-        return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its
+        return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its, result.products

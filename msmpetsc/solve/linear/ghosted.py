@@ -6,6 +6,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
@@ -25,7 +26,8 @@ class Ghosted:
 
     def update(self) -> None:
         """Bring the ghosts their owners' values (collective)."""
-        self.scatter.scatter(self.owned, self.ghosts)
+        with GHOSTS:
+            self.scatter.scatter(self.owned, self.ghosts)
 
     def destroy(self) -> None:
         for owner in (self.scatter, self.owned, self.ghosts):

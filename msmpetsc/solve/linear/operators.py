@@ -11,6 +11,7 @@ from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity, Hessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
 from msmpetsc.solve.petsc.memory import Memory
 
 
@@ -41,17 +42,21 @@ class ContactBlocks:
     def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
         """Take the blocks at positions q, ``true`` ones or such as go with A."""
         self.parts = []
-        for nodes, blocks in contact.hessian(q, true) if contact else ():
-            free = np.flatnonzero(self.row[nodes] >= 0)
-            if len(free):
-                self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
+        with CONTACT:
+            for nodes, blocks in contact.hessian(q, true) if contact else ():
+                free = np.flatnonzero(self.row[nodes] >= 0)
+                if len(free):
+                    self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
 
     def add(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y += blocks x."""
-        if self.parts:
+        if not self.parts:
+            return
+        with CONTACT:
             x, y = self.unknowns.columns(x), self.unknowns.columns_to_write(y)
-        for rows, blocks in self.parts:
-            y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
+            for rows, blocks in self.parts:
+                y[:, rows] += np.einsum("aij,ja->ia", blocks, x[:, rows])
+                count_flops(18 * len(rows))
 
 
 class Viewable:
@@ -87,7 +92,10 @@ class ThreeColumns(Viewable):
 
 
 class TrueHessian(Viewable):
-    """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring."""
+    """M + t^2 (Hessian of E, and of contact) at the positions last linearised about, applied spring by spring.
+
+    products : so far
+    """
 
     def __init__(
         self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, contact: ContactBlocks | None = None
@@ -97,21 +105,27 @@ class TrueHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
         self.elastic: Hessian | None = None  # until it is linearised
+        self.products = 0
 
     def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool = False) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs)."""
-        self.elastic = self.elasticity.hessian_at(q, projected)
-        if self.contact:
-            self.contact.linearise(contact, q, True)
+        with HESSIAN:
+            self.elastic = self.elasticity.hessian_at(q, projected)
+            count_flops(self.elasticity.flops.hessian)
+            if self.contact:
+                self.contact.linearise(contact, q, True)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"
-        self.unknowns.to_nodes(x, self.v)
-        self.product[:] = 0
-        self.elastic.add_product(self.v, self.product)
-        self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
-        if self.contact:
-            self.contact.add(x, y)
+        self.products += 1
+        with PRODUCT:
+            self.unknowns.to_nodes(x, self.v)
+            self.product[:] = 0
+            self.elastic.add_product(self.v, self.product)
+            self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            count_flops(self.elasticity.flops.product)
+            if self.contact:
+                self.contact.add(x, y)
 
 
 def python_matrix(unknowns: Unknowns, context: object, comm: PETSc.Comm) -> PETSc.Mat:

@@ -13,6 +13,7 @@ from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.model.lattice import Lattice
+from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
@@ -80,7 +81,8 @@ class Unknowns:
     def to_nodes(self, vector: PETSc.Vec, nodes: np.ndarray) -> None:
         """Write unknowns into the free rows, ghosts included, of ``nodes`` (l, 3) (collective)."""
         if self.has_ghosts:
-            self.scatter.scatter(vector, self.ghost_values)
+            with GHOSTS:
+                self.scatter.scatter(vector, self.ghost_values)
         _spread(self.size, self.columns(vector), self.free, nodes)
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)

@@ -8,12 +8,17 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.elasticity import Elasticity, Hessian
 from msmpetsc.solve.linear.operators import Viewable
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.events import FINE, count_flops
+
+BLOCK = 15  # operations of a product with a 3 x 3 block
 
 
 class ProjectedHessian(Viewable):
     """H = M + t^2 (projected Hessian of E, and of contact) at the positions that the hierarchy was built at.
 
     It is positive definite whatever these are (a context of MATPYTHON).
+
+    products : so far
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, t2: float):
@@ -22,6 +27,7 @@ class ProjectedHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None  # until ``update``
+        self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
 
@@ -37,12 +43,15 @@ class ProjectedHessian(Viewable):
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""
         assert self.elastic is not None, "the hierarchy was not built"
-        self.unknowns.to_nodes(x, self.v)
-        self.product[:] = 0
-        self.elastic.add_product(self.v, self.product)
-        if len(self.contact):
-            add_node_blocks(len(self.contact), self.contact, self.v, self.product)
-        self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+        self.products += 1
+        with FINE:
+            self.unknowns.to_nodes(x, self.v)
+            self.product[:] = 0
+            self.elastic.add_product(self.v, self.product)
+            if len(self.contact):
+                add_node_blocks(len(self.contact), self.contact, self.v, self.product)
+            self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
 
 
 class DiagonalBlocks:
@@ -54,6 +63,7 @@ class DiagonalBlocks:
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         unknowns = self.hessian.unknowns
         apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, unknowns.columns_to_write(y))
+        count_flops(BLOCK * unknowns.size)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

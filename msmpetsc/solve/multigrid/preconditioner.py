@@ -12,6 +12,7 @@ from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.multigrid.translations import Translations
+from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 WORSE = 2.0  # times the iterations for a digit that the first solve took with a hierarchy: time for a new one
 FEW = 3  # iterations more than that: of a count so low nothing can be said
@@ -29,7 +30,8 @@ class LatticePreconditioner:
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.comm, self.unknowns = comm, unknowns
-        self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
+        with GRIDS:
+            self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
         bodies = self.multigrid.bodies
         self.translations = Translations(comm, unknowns, bodies) if bodies.free.any() else None
         self.q: np.ndarray | None = None
@@ -65,7 +67,8 @@ class LatticePreconditioner:
             self.is_stale = True
 
     def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
-        self.multigrid.update(q, contact)
+        with HIERARCHY:
+            self.multigrid.update(q, contact)
         self.q, self.contact, self.first, self.is_stale = q, contact, None, False
         self.built += 1
 
@@ -84,10 +87,11 @@ class LatticePreconditioner:
         self.multigrid.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self.translations:
-            self.translations.around(self.multigrid.pc, x, y)
-        else:
-            self.multigrid.pc.apply(x, y)
+        with CYCLE:
+            if self.translations:
+                self.translations.around(self.multigrid.pc, x, y)
+            else:
+                self.multigrid.pc.apply(x, y)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.multigrid.pc.view(viewer)

@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
+from msmpetsc.solve.petsc.events import ESTIMATE
 
 CHECK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
@@ -59,11 +60,12 @@ class ErrorEstimate:
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
-        self.linearise(iterate.q)
-        self.ksp.solve(iterate.f, self.correction)
-        if self.preconditioner.is_uniform:
-            self.residual = self.ksp.buildResidual(self.residual)
-        self.length = self._length() if self.ksp.reason > 0 else np.inf
+        with ESTIMATE:
+            self.linearise(iterate.q)
+            self.ksp.solve(iterate.f, self.correction)
+            if self.preconditioner.is_uniform:
+                self.residual = self.ksp.buildResidual(self.residual)
+            self.length = self._length() if self.ksp.reason > 0 else np.inf
         return self.length
 
     def _length(self) -> float:

@@ -14,6 +14,7 @@ from msmpetsc.backend.arrays import greatest
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,17 @@ class StepFunctional:
 
     def evaluate(self, x: PETSc.Vec, f: PETSc.Vec) -> Iterate:
         """Positions of x, and F there, written into f [kg m]."""
-        q, gradient, owned = self.positions(x), self._gradient, self.lattice.owned
-        gradient[:] = 0
-        self.elasticity.add_gradient(q, gradient)
-        gradient[:owned] -= self.problem.load
-        if self.problem.contact:
-            self.problem.contact.add_gradient(q, gradient)
-        self.unknowns.scaled_sum(q[:owned] - self.problem.y[:owned], self.t2, gradient, f)
+        problem, gradient, owned = self.problem, self._gradient, self.lattice.owned
+        with GRADIENT:
+            q = self.positions(x)
+            gradient[:] = 0
+            self.elasticity.add_gradient(q, gradient)
+            gradient[:owned] -= problem.load
+            if problem.contact:
+                with CONTACT:
+                    problem.contact.add_gradient(q, gradient)
+            self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
+            count_flops(self.elasticity.flops.gradient)
         return Iterate(q, f)
 
     def value(self, q: np.ndarray) -> float:
@@ -98,13 +103,16 @@ class StepFunctional:
     def change(self, q: np.ndarray, base: np.ndarray) -> tuple[float, float]:
         """g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3); a difference that keeps its digits."""
         problem, owned = self.problem, slice(self.lattice.owned)
-        moved = q[owned] - base[owned]
-        twice = q[owned] + base[owned] - 2 * problem.y[owned]
-        inertia = 0.5 * self._inner(moved, twice)
-        elastic = self.elasticity.change(q, base) - float(np.vdot(moved, problem.load))
-        if problem.contact:
-            elastic += problem.contact.change(q, base)
-        change, squared = self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))]))
+        with ENERGY:
+            moved = q[owned] - base[owned]
+            twice = q[owned] + base[owned] - 2 * problem.y[owned]
+            inertia = 0.5 * self._inner(moved, twice)
+            elastic = self.elasticity.change(q, base) - float(np.vdot(moved, problem.load))
+            count_flops(self.elasticity.flops.change)
+            if problem.contact:
+                with CONTACT:
+                    elastic += problem.contact.change(q, base)
+            change, squared = self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))]))
         return change, squared
 
     def _inner(self, a: np.ndarray, b: np.ndarray) -> float:

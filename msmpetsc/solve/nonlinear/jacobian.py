@@ -16,7 +16,7 @@ from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble, diagonal_of
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
-from msmpetsc.solve.nonlinear.preconditioning import MULTIGRID, Preconditioned, StepPreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import MASSLESS, MULTIGRID, Preconditioned, StepPreconditioner
 from msmpetsc.solve.presets import SolverOptions
 
 
@@ -62,9 +62,9 @@ class Jacobian:
         self.operator = python_matrix(unknowns, context, comm)
         owned.callback(self.operator.destroy)
         of_lattice = partial(LatticePreconditioner, comm, unknowns, elasticity, time_step, options.prefix)
-        self.preconditioner = StepPreconditioner(
-            self._of_matrix, of_lattice, kind, chooses and options.is_default("pc_type"), self._stiffness_ratio()
-        )
+        ratio, is_held = self._stiffness_ratio(), unknowns.total < unknowns.lattice.table.total
+        chooses = chooses and options.is_default("pc_type") and (is_held or ratio < MASSLESS)
+        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio)
         self.pmat = python_matrix(unknowns, Preconditioned(self.preconditioner), comm)
         owned.callback(self.pmat.destroy)
 

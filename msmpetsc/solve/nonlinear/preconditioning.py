@@ -75,6 +75,11 @@ class StepPreconditioner:
         """Whether smooth errors fade as fast as rough ones."""
         return self.multigrid is not None
 
+    @property
+    def products(self) -> int:
+        """Products with the Hessian so far."""
+        return self.multigrid.multigrid.fine.products if self.multigrid else 0
+
     def _choose(self, reason: str) -> None:
         log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
         self.multigrid = self.make_multigrid()

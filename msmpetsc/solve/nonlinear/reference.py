@@ -2,7 +2,6 @@
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
@@ -10,42 +9,41 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.petsc.events import REFERENCE
 from msmpetsc.solve.presets import find_preset
 
 PRESET, ERROR = "newton-multigrid", 1e-10
 PREFIX = "reference_"  # of its PETSc options
-STAGE = "reference"  # of PETSc's log, so that its time is told apart
 
 
 class Reference:
     """The solver, its options under PREFIX; not timed with the run."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool):
-        self.stage = PETSc.Log.Stage(STAGE)
-        self.stage.push()
-        self.stepper = Stepper(comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX)
-        self.stepper.set_up()
-        self.stage.pop()
+        with REFERENCE:
+            self.stepper = Stepper(comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX)
+            self.stepper.set_up()
 
     def errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
         """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
         """
-        self.stage.push()
         try:
-            self.stepper.restore(Checkpoint())  # what is measured does not depend on what was measured before
-            exact = self.stepper.step(problem, positions[-1]).position
-            start = self._distances(problem.y, exact)
-            distances = np.array([self._distances(x, exact) for x in positions])
-            errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
-            errors[:, 0] = [self.stepper.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
-            return errors
+            with REFERENCE:
+                return self._errors(problem, positions)
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
             return np.full((len(positions), 2), np.nan)
-        finally:
-            self.stage.pop()
+
+    def _errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
+        self.stepper.restore(Checkpoint())  # what is measured does not depend on what was measured before
+        exact = self.stepper.step(problem, positions[-1]).position
+        start = self._distances(problem.y, exact)
+        distances = np.array([self._distances(x, exact) for x in positions])
+        errors = np.divide(distances, start, out=np.zeros_like(distances), where=start > 0)
+        errors[:, 0] = [self.stepper.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
+        return errors
 
     def _distances(self, x: np.ndarray, exact: np.ndarray) -> np.ndarray:
         """|x - x*|_M and g(x) - g*."""

@@ -25,13 +25,13 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.errors import petsc_errors
+from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
 INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
-LOCAL_EVENT = "msmpetsc local"  # in -log_view and in measurements: all that is done spring by spring outside of KSP
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class StepResult:
     ksp_its    : KSP iterations of all of them, and of what examines the result
     work       : of obstacles that struck this rank's nodes [J]
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
+    products   : with the Hessian, of all of it; those at multigrid's finest level are counted, too
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     """
 
@@ -56,6 +57,7 @@ class StepResult:
     work: float = 0.0
     explicit: bool = False
     swing: float = 0.0
+    products: int = 0
 
 
 class Stepper:
@@ -86,7 +88,6 @@ class Stepper:
         if error is None and not self.budget:
             error = DEFAULT_ERROR
         self.observer: Callable[[np.ndarray], None] | None = None
-        self.local = PETSc.Log.Event(LOCAL_EVENT)
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
         self.owned = ExitStack()
@@ -167,7 +168,7 @@ class Stepper:
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
-            its_before = self.all_its()
+            its_before, products_before = self.all_its(), self.all_products()
             self.functional.begin(problem)
             self.control.begin()
             self.base[:] = problem.fixed
@@ -182,7 +183,8 @@ class Stepper:
                 is_done = self._is_minimum()
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
-            return StepResult(q, problem.q, self.control.final_error(q), iterations, self.all_its() - its_before)
+            its, error = self.all_its() - its_before, self.control.final_error(q)
+            return StepResult(q, problem.q, error, iterations, its, products=self.all_products() - products_before)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on beside its problem."""
@@ -201,6 +203,10 @@ class Stepper:
         """KSP iterations of all steps so far, and of their estimates and searches for negative curvature."""
         estimate, curvature = self.control.estimate, self.minimum.curvature
         return total_iterations(self.ksp) + total_iterations(estimate.ksp) + curvature.its
+
+    def all_products(self) -> int:
+        """Products with the Hessian of all steps so far."""
+        return self.jacobian.hessian.products + self.jacobian.preconditioner.products
 
     def _is_minimum(self) -> bool:
         """Whether x is a minimum and its error what was said; x is moved on if not (collective). Raises StepFailed."""
@@ -269,12 +275,12 @@ class Stepper:
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
         """F at x, in ``work``."""
-        with self.local:
+        with LOCAL:
             return self.functional.evaluate(x, self.work)
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """F for SNES."""
-        with self.local:
+        with LOCAL:
             self.functional.evaluate(x, f)
 
     def _objective(self, snes: PETSc.SNES, x: PETSc.Vec) -> float:
@@ -285,13 +291,13 @@ class Stepper:
         """
         if self.preset.true_hessian and x.handle == snes.getSolution().handle:
             return 0.0  # the start of a line search, which is where it was linearised
-        with self.local:
+        with LOCAL:
             change, distance = self.functional.change(self.functional.positions(x), self.base)
         return -1.0 if self.control.is_flat and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: the Jacobian there, and what that solve starts from."""
-        with self.local:
+        with LOCAL:
             self.unknowns.to_nodes(x, self.base)
             self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
             known = self.control.now.corrected and not self.projected  # the estimate has linearised at this very x

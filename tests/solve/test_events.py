@@ -1,0 +1,160 @@
+"""Events, stages and flops in PETSc's log, products with the Hessian, and what --measure makes of them."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import pytest
+from block_scene import block_scene, play
+from conftest import run as on_ranks
+from petsc4py import PETSc
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import StepFailed
+from msmpetsc.output.reader import Result
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.petsc import events
+from msmpetsc.solve.simulate import Simulation
+from msmpetsc.study.metrics import of_frames
+
+FRAMES = 3
+SWINGS = {
+    "gravity": {"acceleration": [0, 0, -9.81]},
+    "pin": [{"region": {"box": [[0, 0, 0], [0.01, 1, 1]], "relative": True}}],
+    "time": {"step": 1 / 60, "duration": FRAMES / 60},
+    "solver": {"preset": "newton", "error": 1e-6},
+}
+LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) \S+ (\S+) ")  # name, count, seconds, flops
+
+
+def logged(text: str) -> dict[str, dict[str, tuple[int, float, float]]]:
+    """Of each stage of -log_view its events: count, seconds, flops."""
+    tables = text.split("\nEvent  ", 1)[1].split("Object Type", 1)[0]
+    stages = {}
+    for part in tables.split("--- Event Stage ")[1:]:
+        name, _, rows = part.partition("\n")
+        found = (LINE.match(row) for row in rows.splitlines())
+        stages[name.split(": ")[1]] = {m[1]: (int(m[2]), float(m[3]), float(m[4])) for m in found if m}
+    return stages
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
+    """Stages of the log, the measure file and the frames' numbers of a run that has a reference, too."""
+    folder = tmp_path_factory.mktemp("run")
+    words = "-o", folder / "o.h5", "--measure", folder / "m.json", "--true-error", 2, "-pc_type", "mg", "-log_view"
+    done = on_ranks(1, "-m", "msmpetsc.cli.main", "run", block_scene(folder, **SWINGS), *words)
+    assert done.returncode == 0, done.stderr
+    with h5py.File(folder / "o.h5") as file:
+        frames = {name: file["frames"][name][:] for name in ("products", "ksp_its", "wall_time")}
+    return logged(done.stdout), json.loads((folder / "m.json").read_text()), frames
+
+
+def test_events_are_in_their_stages(run: tuple):
+    stages, _, _ = run
+    assert {"msmpetsc grids", "msmpetsc hierarchy", "msmpetsc hessian"} <= set(stages["set-up"])
+    names = "gradient", "energy", "hessian", "product", "fine", "cycle", "estimate", "local"
+    assert {f"msmpetsc {name}" for name in names} <= set(stages["steps"])
+    assert stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
+    assert not any(name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage])
+
+
+def test_the_set_up_is_over_when_steps_begin(tmp_path: Path, monkeypatch):
+    mark, advance = PETSc.Log.Event("mark of a test"), Simulation.advance
+
+    def marked(simulation: Simulation) -> Iterator:
+        with mark:
+            yield from advance(simulation)
+
+    monkeypatch.setattr(Simulation, "advance", marked)
+    words = block_scene(tmp_path, **SWINGS), "-o", tmp_path / "o.h5", "--measure", tmp_path / "m.json"
+    assert main(["run", *map(str, words)]) == 0
+    assert [mark.getPerfInfo(stage)["count"] for stage in (events.MAIN, events.SETUP.id)] == [1, 0]
+
+
+def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
+    floor = {"shape": "plane", "point": [0, 0, 0.01], "normal": [0, 0, 1], "response": "penalty"}
+    words = block_scene(tmp_path, **SWINGS, obstacle=[floor]), "-o", tmp_path / "o.h5", "-log_view"
+    done = on_ranks(2, "-m", "msmpetsc.cli.main", "run", *words)
+    assert done.returncode == 0, done.stderr
+    steps = logged(done.stdout)["steps"]
+    assert steps["msmpetsc ghosts"][0] >= steps["msmpetsc product"][0] + steps["msmpetsc gradient"][0]
+    assert steps["msmpetsc contact"][2] > 0
+
+
+def test_flops_of_a_product_are_those_of_its_springs(run: tuple):
+    stages, cost, _ = run
+    count, _, flops = stages["steps"]["msmpetsc product"]
+    assert 23 * cost["springs"] < flops / count < 27 * cost["springs"]
+    count, _, flops = stages["steps"]["msmpetsc gradient"]
+    assert 22 * cost["springs"] < flops / count < 27 * cost["springs"]
+
+
+def test_times_are_of_all_stages_of_the_run_but_not_of_its_reference(run: tuple):
+    stages, cost, frames = run
+    told = {"local": ["msmpetsc local"], "ksp": ["KSPSolve"], "hierarchy": ["msmpetsc grids", "msmpetsc hierarchy"]}
+    for name, sources in told.items():
+        rows = [stages[s].get(event) for s in ("Main Stage", "set-up", "steps", "output") for event in sources]
+        assert cost["time"][name] == pytest.approx(sum(row[1] for row in rows if row), rel=1e-3) and any(rows)
+    assert cost["time"]["local"] + cost["time"]["ksp"] < cost["time"]["stepping"]
+    assert cost["time"]["stepping"] == pytest.approx(frames["wall_time"].sum())
+
+
+def test_the_hierarchy_is_measured(run: tuple):
+    stages, cost, _ = run
+    builds = [stages[stage].get("msmpetsc hierarchy", (0,))[0] for stage in ("set-up", "steps")]
+    assert cost["hierarchy"]["builds"] == sum(builds) > 0 and "msmpetsc hierarchy" in stages["reference"]
+    blocks = 16 * cost["springs"] + 36 * cost["unknowns"]  # of the finest level, in single precision
+    assert blocks < cost["hierarchy"]["bytes"] < 10 * blocks
+
+
+def test_products_are_those_of_the_log(run: tuple):
+    stages, cost, frames = run
+    counts = [stages["steps"][f"msmpetsc {name}"][0] for name in ("product", "fine")]
+    assert frames["products"].sum() == cost["products"] == sum(counts) and min(counts) > 0
+    assert frames["products"][0] == 0 and (frames["products"][1:] > frames["ksp_its"][1:]).all()
+
+
+def test_products_repeat_and_verlet_has_none(tmp_path: Path):
+    first, again = ([frame.products for frame in play(block_scene(tmp_path, **SWINGS))[1]] for _ in range(2))
+    assert first == again and first[0] == 0 and min(first[1:]) > 0
+    assert {frame.products for frame in play(block_scene(tmp_path, **SWINGS), 'time.integrator="verlet"')[1]} == {0}
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_a_frame_has_the_products_of_all_its_steps(tmp_path: Path, monkeypatch, integrator: str):
+    """Those of the history that BDF2 begins with, and of a step that failed and was taken in two."""
+    taken, step = [], Stepper.step
+
+    def counted(self: Stepper, problem: StepProblem, *rest) -> StepResult:
+        if sum(taken) > 0 and len(taken) == (2 if integrator == "bdf2" else 1):
+            taken.append(0)
+            raise StepFailed("fails here", "diverged")
+        before = self.jacobian.hessian.products
+        result = step(self, problem, *rest)
+        taken.append(self.jacobian.hessian.products - before)
+        return result
+
+    monkeypatch.setattr(Stepper, "step", counted)
+    scene = block_scene(tmp_path, **SWINGS, safety={"on_failure": "substep"})
+    frames = play(scene, f'time.integrator="{integrator}"')[1]
+    assert sum(frame.products for frame in frames) == sum(taken) > 0 and frames[2].substeps == 2 and 0 in taken
+
+
+def test_a_file_without_products_is_read_and_gone_on_with(tmp_path: Path, msmpetsc):
+    """As an earlier version left it."""
+    path = tmp_path / "o.h5"
+    words = "run", block_scene(tmp_path, **SWINGS), "-o", path
+    assert msmpetsc(1, *words, "--frames", "2").returncode == 0
+    with h5py.File(path, "r+") as file:
+        del file["frames/products"]
+    with Result(path) as result:
+        assert "products" not in result.frames and len(result.frames.ksp_its) == 3
+    assert "products" not in of_frames(path, 1 / 60)
+    done = msmpetsc(1, "run", "--resume", path, "--frames", FRAMES, "--force")
+    assert done.returncode == 0, done.stderr
+    with Result(path) as result:
+        assert result.frames.products[-1] > 0 and len(result.frames.products) == 1 + FRAMES

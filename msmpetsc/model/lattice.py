@@ -251,7 +251,7 @@ def _springs(cells, numbers, owned):
         for direction in range(27):
             far = neighbour[node, direction]
             count += far >= 0 and direction != 13 and (numbers[far] > numbers[node] or far >= owned)
-    springs = np.empty((count, 2), np.int64)
+    springs = np.empty((count, 2), np.int32)
     kind = np.empty(count, np.int64)
     shared = np.empty(count, np.int64)
     low, high = 0, count  # springs of this rank fill the front, the others the back
@@ -277,7 +277,7 @@ def _springs(cells, numbers, owned):
 # bytes of each array of a Lattice, for one cell, node (ghosts too) or spring: a forecast of memory asks for them
 BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "local_cells": 8 * 8, "cell_stiffness": 8}
 BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
-BYTES_OF_SPRING = {"springs": 2 * 8, "rest_length": 8, "stiffness": 8}
+BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
 
 
 def lattice_bytes(

@@ -20,7 +20,7 @@ from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
-from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
+from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import Grid, grids, interpolation
 from msmpetsc.solve.petsc.library import set_chebyshev
 
@@ -96,7 +96,7 @@ class Multigrid:
         is_new = not level.matrix
         finer.matrix.PtAP(level.interpolation, level.matrix)
         if is_new:
-            level.matrix.setBlockSize(3)
+            set_block_size(level.matrix)
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)
         diagonal = level.matrix.getDiagonal()
         diagonal.scale(RAISED)

@@ -112,6 +112,9 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
+            restriction = PETSc.Mat().createTranspose(level.interpolation)  # of a square P PETSc cannot tell it
+            pc.setMGRestriction(top - i, restriction)
+            self.owned.callback(restriction.destroy)
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)

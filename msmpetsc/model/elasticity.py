@@ -70,10 +70,15 @@ class Elasticity:
         """
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
 
-    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
+    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the owned rows of
+        ``blocks`` (l, 9) [N/m].
+
+        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, and four of a
+        cell's corner, whose D is twice that.
+        """
         for part in self.parts:
-            part.add_diagonal(q, blocks)
+            part.add_half_bound(q, blocks)
 
 
 @dataclass(frozen=True)

@@ -285,10 +285,10 @@ def add_square(block: np.ndarray, factor: float, g: Vector) -> None:
 
 
 @numba.njit(cache=True)
-def add_resistance_diagonal(
+def add_resistance_bound(
     q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float, blocks: np.ndarray
 ) -> None:
-    """Add the diagonal blocks of the Hessian at q, without what the curvature of J adds, to ``blocks`` (l, 9)."""
+    """Add twice the diagonal blocks of the Hessian at q, without what the curvature of J adds, to ``blocks`` (l, 9)."""
     for i in range(len(cells)):
         for frame in range(8):
             e = edges(q, cells[i], frame)
@@ -296,7 +296,7 @@ def add_resistance_diagonal(
             curvature = corner_curvature(e, n[0], resistance[i], volume)
             if curvature > 0.0:
                 for role in range(4):
-                    add_square(blocks[cells[i, FRAMES[frame, role]]], curvature, vector_of(role, n))
+                    add_square(blocks[cells[i, FRAMES[frame, role]]], 2.0 * curvature, vector_of(role, n))
 
 
 @numba.njit(cache=True)
@@ -333,6 +333,11 @@ class CellScatter:
     def _owned(self) -> tuple[np.ndarray, np.ndarray, float]:
         return self.cells[: self.cells_owned], self.resistance[: self.cells_owned], self.volume
 
+    @property
+    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
+        return self.cells, self.resistance, self.volume
+
     def energy(self, q: np.ndarray) -> float:
         """Return the energy [J] of the cells that this rank owns."""
         return resistance_energy(q, *self._owned)
@@ -354,10 +359,10 @@ class CellScatter:
         few = self.resisting(q)
         return partial(add_resistance_hessian, q.copy(), self.cells[few], self.resistance[few], self.volume, projected)
 
-    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m]."""
+    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add what elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         few = self.resisting(q)
-        add_resistance_diagonal(q, self.cells[few], self.resistance[few], self.volume, blocks)
+        add_resistance_bound(q, self.cells[few], self.resistance[few], self.volume, blocks)
 
 
 @dataclass(frozen=True)
@@ -391,6 +396,11 @@ class CellGather:
         resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
 
+    @property
+    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
+        return self.cells, self.resistance, self.volume
+
     def energy(self, q: np.ndarray) -> float:
         """Return the energy [J] of the cells that this rank owns."""
         return resistance_energy(q, self.cells[: self.cells_owned], self.resistance, self.volume)
@@ -407,9 +417,9 @@ class CellGather:
         """Return what adds (Hessian at q) v [N] to the owned rows of its second argument."""
         return partial(_cell_product_around, self.around.shape[1], q.copy(), *self._all, projected)
 
-    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
-        _cell_diagonal_around(self.around.shape[1], q, *self._all, blocks)
+    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add what elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        _cell_bound_around(self.around.shape[1], q, *self._all, blocks)
 
     @property
     def _all(self) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray]:
@@ -467,7 +477,7 @@ def _cell_product_around(first, count, step, q, cells, resistance, volume, aroun
 
 
 @kernel
-def _cell_diagonal_around(first, count, step, q, cells, resistance, volume, around, corner, blocks):
+def _cell_bound_around(first, count, step, q, cells, resistance, volume, around, corner, blocks):
     for i in range(first, count, step):
         for a in range(8):
             c = around[a, i]
@@ -479,4 +489,4 @@ def _cell_diagonal_around(first, count, step, q, cells, resistance, volume, arou
                     continue
                 e = edges(q, cells[c], frame)
                 n = cofactors(e)
-                add_square(blocks[i], corner_curvature(e, n[0], resistance[c], volume), vector_of(role, n))
+                add_square(blocks[i], 2.0 * corner_curvature(e, n[0], resistance[c], volume), vector_of(role, n))

@@ -145,12 +145,12 @@ class SpringScatter:
 
     def hessian_at(self, q: np.ndarray, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
-        blocks = np.empty((len(self.springs), 4), dtype)
+        blocks: np.ndarray = np.empty((len(self.springs), 4), dtype)
         elastic_hessian(q, *self._all, projected, blocks)
         return partial(add_elastic_product, self.springs, blocks)
 
-    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add the diagonal blocks of the projected Hessian at q to ``blocks`` (l, 9) [N/m]."""
+    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add what elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, *self._all, blocks)
 
 
@@ -379,8 +379,8 @@ class SpringGather:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
         return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
 
-    def add_diagonal(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add the diagonal blocks of the projected Hessian at q to the owned rows of ``blocks`` (l, 9) [N/m]."""
+    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+        """Add what elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
 
 

@@ -14,31 +14,39 @@ from msmpetsc.solve.petsc.memory import HOST, Memory
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 
 
-class Preconditioned:
-    """Context of the MATPYTHON (3m x 3m) that stands for A where PETSc wants a matrix to precondition with."""
-
-    def __init__(self, matrix: PETSc.Mat):
-        self.matrix = matrix
-
-    def view(self, _: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        self.matrix.view(viewer)
-
-
 class Preconditioner:
     """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
 
     It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
     preconditioned with.
 
-    matrix : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
+    matrix  : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
+    columns : 3, or 1 for A (x) I_3
+    contact : what is added to its diagonal, if anything
     """
 
-    def __init__(self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str):
-        self.matrix, self.memory, self.columns = matrix, memory, columns
+    def __init__(
+        self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str, contact: "ContactDiagonal | None" = None
+    ):
+        self.matrix, self.memory, self.columns, self.contact = matrix, memory, columns, contact
         self.blocks: list[Block] = []
         self.pc = PETSc.PC().create(matrix.comm)
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
+
+    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
+        return self.contact is not None and self.contact.follow(self.matrix.comm.tompi4py(), contact, q)
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next step depends on."""
+        if self.contact:
+            self.contact.save(checkpoint)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
+        if self.contact:
+            self.contact.restore(checkpoint)
 
     def setFromOptions(self, _: PETSc.PC) -> None:
         self.pc.setFromOptions()
@@ -65,8 +73,8 @@ class Preconditioner:
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.pc.view(viewer)
 
-    def destroy(self, _: PETSc.PC) -> None:
-        for part in (*self.blocks, self.pc):
+    def destroy(self) -> None:
+        for part in (*self.blocks, self.pc, *([self.contact] if self.contact else [])):
             part.destroy()
 
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
@@ -26,8 +26,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     row[free] = np.arange(unknowns.size)
     weight = time_step**2 * lattice.stiffness
     ends = np.concatenate([lattice.springs, lattice.springs[:, ::-1]])
-    diagonal = np.bincount(ends[:, 0], np.tile(weight, 2), minlength=len(row))[free]
-    diagonal += to_host(lattice.mass)[free]
+    diagonal = to_host(diagonal_of(unknowns, time_step))
     kept = (row[ends[:, 0]] >= 0) & (unknowns.numbers[ends[:, 1]] >= 0)
     refuse_nonzeros(comm, columns * (unknowns.size + int(kept.sum())))
     rows = np.concatenate([np.arange(unknowns.size), row[ends[kept, 0]]])
@@ -48,6 +47,15 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     _check_memory(matrix, unknowns)
     matrix.setPreallocationCSR((csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data))
     return matrix
+
+
+def diagonal_of(unknowns: Unknowns, time_step: float) -> np.ndarray:
+    """Return the diagonal of A (m,), of this rank's free nodes [kg], where the lattice's arrays are."""
+    lattice, free = unknowns.lattice, to_host(unknowns.free)
+    stiffness = np.zeros(len(lattice.nodes))
+    for end in (0, 1):
+        stiffness += np.bincount(lattice.springs[:, end], lattice.stiffness, len(stiffness))
+    return like(unknowns.free, to_host(lattice.mass)[free] + time_step**2 * stiffness[free])
 
 
 def assembly_bytes(

@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.initial_state import uniform
@@ -21,13 +21,12 @@ from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
-from msmpetsc.solve.multigrid.grids import Grid, grids, interpolation
-from msmpetsc.solve.petsc.library import set_chebyshev
+from msmpetsc.solve.multigrid.grids import Grid, grid_indices, grids, interpolation
+from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-FINEST = 2.0  # that eigenvalue on the finest level: a spring's is 2, and a sum's no more
-FINEST_RESISTING = 4.0  # a resisting corner's, which has four nodes
+FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound)
 SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
 ITERATIONS = 10  # of these
 
@@ -54,15 +53,14 @@ class Multigrid:
         self.operator = python_matrix(unknowns, self.fine, comm)
         self.owned.callback(self.operator.destroy)
         self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
-        self.bounds = [FINEST_RESISTING if elasticity.cells else FINEST] + [0.0] * (len(self.levels) - 1)
+        self.bounds = [FINEST] + [0.0] * (len(self.levels) - 1)
         self.pc = PETSc.PC().create(comm)
         self.owned.callback(self.pc.destroy)
         self.is_set_up = False
 
     def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         unknowns = self.unknowns
-        lattice, size = unknowns.lattice, unknowns.size
-        ijk = decode_morton(lattice.table.keys)[to_host(unknowns.free)]
+        size, ijk = unknowns.size, grid_indices(unknowns)[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
         galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0])
@@ -122,7 +120,8 @@ class Multigrid:
         finest.setOperators(self.operator, self.operator)
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
-        pc.setFromOptions()
+        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):  # a preset may say what it begins with
+            pc.setFromOptions()
         self.is_set_up = True
 
     def destroy(self) -> None:

@@ -1,5 +1,5 @@
-"""The finest level of the cycle: the projected Hessian, spring by spring in single precision, and the inverses of its
-diagonal blocks."""
+"""The finest level of the cycle: the projected Hessian, spring by spring in single precision, and a block diagonal D
+to smooth with, of which it is no more than twice."""
 
 import numpy as np
 from petsc4py import PETSc
@@ -29,9 +29,10 @@ class ProjectedHessian(Viewable):
         """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
         blocks = np.zeros((len(q), 9), like=q)
-        self.elasticity.add_diagonal(q, blocks)
-        invert_blocks(self.unknowns.size, blocks, self.unknowns.free, self.unknowns.lattice.mass, contact, self.t2,
-                      self.inverse)
+        self.elasticity.add_half_bound(q, blocks)
+        invert_blocks(
+            self.unknowns.size, blocks, self.unknowns.free, self.unknowns.lattice.mass, contact, self.t2, self.inverse
+        )
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""

@@ -21,7 +21,7 @@ from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges,
 from msmpetsc.model.lattice import CORNERS
 from msmpetsc.model.springs import spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.grids import Grid
+from msmpetsc.solve.multigrid.grids import Grid, grid_indices
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
 
@@ -107,10 +107,10 @@ class GalerkinSum:
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
         exists = (first >= 0) & (second >= 0)
         pairs, places = (first * grid.table.total + second)[exists], np.full(exists.shape, -1, np.int32)
+        places[exists] = np.arange(len(pairs))
         if on_host(self.unknowns.lattice.nodes):
-            pairs, places[exists] = np.unique(pairs, return_inverse=True)
-        else:
-            places[exists] = np.arange(len(pairs))
+            pairs, shared = np.unique(pairs, return_inverse=True)
+            places[exists] = shared
         return pairs // grid.table.total, pairs % grid.table.total, places
 
     def _create_matrix(
@@ -133,13 +133,12 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
         (collective)."""
         values = np.zeros((self.blocks, 9), like=q)
-        cells, tables = self.cells, self.tables
-        stiffening, count = self.elasticity.springs.stiffening, len(self.places)
+        tables, stiffening, count = self.tables, self.elasticity.springs.stiffening, len(self.places)
         add_springs(count, q, *self.springs.arrays, *self.law, stiffening, self.t2, *tables, self.places, values)
         add_nodes(count, *self.nodes.arrays, self.unknowns.lattice.mass, contact, self.t2, *tables, self.places, values)
-        if len(cells.order):
-            law = self.elasticity.cells.cells, self.elasticity.cells.resistance, self.elasticity.cells.volume
-            add_resistance(count, q, *cells.arrays, *law, self.t2, *tables, self.places, values)
+        if self.elasticity.cells:
+            law = self.elasticity.cells.law
+            add_resistance(count, q, *self.cells.arrays, *law, self.t2, *tables, self.places, values)
         values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
@@ -154,35 +153,27 @@ def set_block_size(matrix: PETSc.Mat) -> None:
     matrix.getDiagonalBlock().setBlockSize(3)
 
 
-def grid_indices(unknowns: Unknowns) -> np.ndarray:
-    """Return the grid index (l, 3) of each local node, ghosts included."""
-    lattice = unknowns.lattice
-    nodes, keys = to_host(lattice.nodes), lattice.table.keys
-    if not len(nodes):
-        return np.empty((0, 3), np.int64)
-    return decode_morton(keys[:1]) + np.rint((nodes - nodes[0]) / lattice.cell_size).astype(np.int64)
-
-
 def _by_cell(unknowns: Unknowns, elasticity: Elasticity) -> tuple[np.ndarray, ByCell, ByCell, ByCell]:
     """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and resisting cells."""
     lattice, ijk = unknowns.lattice, grid_indices(unknowns)
     held, free = to_host(lattice.pinned), to_host(unknowns.free)
     springs = to_host(lattice.springs)[: lattice.springs_owned]
-    springs = np.flatnonzero(~held[springs].all(axis=1)), springs[~held[springs].all(axis=1)]
-    cells = to_host(elasticity.cells.cells[: elasticity.cells.cells_owned]) if elasticity.cells else np.empty((0, 8), int)
-    things = [springs, (free, free[:, None]), (np.arange(len(cells)), cells)]
-    corners = [ijk[nodes].min(axis=1) // 2 for _, nodes in things]
-    keys = [encode_morton(corner) for corner in corners]
+    moving = np.flatnonzero(~held[springs].all(axis=1))
+    cells = elasticity.cells
+    corners = np.empty((0, 8), np.int64) if cells is None else to_host(cells.cells[: cells.cells_owned])
+    ends = [springs[moving], free[:, None], corners]
+    low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
+    keys = [encode_morton(corner) for corner in low]
     codes = [
         np.where(held[nodes], HELD, (ijk[nodes] - 2 * corner[:, None]) @ [9, 3, 1])
-        for (_, nodes), corner in zip(things, corners, strict=True)
+        for nodes, corner in zip(ends, low, strict=True)
     ]
-    every = np.unique(np.concatenate(keys))
-    parts = (
-        ByCell.of(key, every, code, which).near(lattice.nodes)
-        for key, code, (which, _) in zip(keys, codes, things, strict=True)
+    every, which = np.unique(np.concatenate(keys)), (moving, free, np.arange(len(corners)))
+    of_springs, of_nodes, of_cells = (
+        ByCell.of(key, every, code, number).near(lattice.nodes)
+        for key, code, number in zip(keys, codes, which, strict=True)
     )
-    return every, *parts
+    return every, of_springs, of_nodes, of_cells
 
 
 @numba.njit(cache=True)

@@ -11,9 +11,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.lattice import CORNERS
+from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 
 SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no help
@@ -29,6 +31,15 @@ class Grid:
     def sizes(self) -> tuple[int, int]:
         """Coordinates of this rank's nodes, and of all: x, y and z of a node follow each other."""
         return 3 * len(self.table.keys), 3 * self.table.total
+
+
+def grid_indices(unknowns: Unknowns) -> np.ndarray:
+    """Return the grid index (l, 3) of each local node, ghosts included."""
+    lattice = unknowns.lattice
+    nodes, keys = to_host(lattice.nodes), lattice.table.keys
+    if not len(nodes):
+        return np.empty((0, 3), np.int64)
+    return decode_morton(keys[:1]) + np.rint((nodes - nodes[0]) / lattice.cell_size).astype(np.int64)
 
 
 def parents_of(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

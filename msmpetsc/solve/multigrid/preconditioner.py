@@ -33,10 +33,12 @@ class LatticePreconditioner:
         self.first: tuple[float, int] | None = None
         self.is_stale, self.built = True, 0
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> None:
-        """See to it that there is a hierarchy that serves, a new one at positions q (l, 3) [m]."""
-        if self.is_stale:
+    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
+        due = self.is_stale
+        if due:
             self._build(q.copy(), self._blocks(q, contact))
+        return due
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
@@ -92,5 +94,5 @@ class LatticePreconditioner:
         its = checkpoint.count("hierarchy_its")
         self.first = (checkpoint.number("hierarchy_pace", 0.0, 0), its) if its else None
 
-    def destroy(self, _: PETSc.PC | None = None) -> None:
+    def destroy(self) -> None:
         self.multigrid.destroy()

@@ -42,7 +42,7 @@ class Effort(NamedTuple):
     followed: int
 
 
-EFFORT, UNIFORM_EFFORT = Effort(4, 12, 2), Effort(2, 4, 1)  # smooth modes come slowly, or with multigrid at once
+EFFORT, UNIFORM_EFFORT = Effort(4, 12, 2), Effort(2, 3, 1)  # smooth modes come slowly, or with multigrid at once
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,11 @@ class LowestCurvature:
         start = self._random(self.effort.block)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
-        self.rigid = self._rigid_motions(q)
-        _, modes = self._iterate(self._without_rigid(start), MOST, self.effort.least)
         known = [] if self.mode is None else [self.mode[None]]
+        self.rigid = self._rigid_motions(q)
+        if self.rigid is None and self.preconditioner.is_uniform:  # nothing hides a mode, nor is any slow to come
+            return self._iterate(np.concatenate([start, *known]), MOST, self.effort.least)
+        _, modes = self._iterate(self._without_rigid(start), MOST, self.effort.least)
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
         return self._iterate(np.concatenate([modes, *known, *rigid]), MOST, self.effort.least // 2)
 

@@ -8,7 +8,6 @@ are Jacobi's, until they are seen to take longer than they should.
 from collections.abc import Callable
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.comm import log
@@ -30,30 +29,35 @@ def expected_iterations(ratio: float) -> float:
 class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
-    of_matrix      : any PETSc preconditioner of A
-    make_multigrid : makes the other one
-    kind           : -pc_type; multigrid is taken where that is mg
-    chooses        : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
+    make_of_matrix, make_multigrid : make them where they are needed
+    kind    : -pc_type; multigrid is taken where that is mg
+    chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
     """
 
     def __init__(
         self,
-        of_matrix: Preconditioner,
+        make_of_matrix: Callable[[], Preconditioner],
         make_multigrid: Callable[[], LatticePreconditioner],
         kind: str,
         chooses: bool,
         ratio: float,
     ):
-        self.of_matrix, self.make_multigrid, self.chooses = of_matrix, make_multigrid, chooses
+        self.make_multigrid, self.chooses = make_multigrid, chooses
+        self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
+        expected = expected_iterations(ratio)
         if kind == MULTIGRID:
             self.multigrid = make_multigrid()
-        elif chooses and expected_iterations(ratio) > LONG:
-            self._choose(f"t^2 k / m = {ratio:.3g}: Jacobi's would take some {expected_iterations(ratio):.0f} iterations")
+        elif chooses and expected > LONG:
+            self._choose(f"t^2 k / m = {ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
+        else:
+            self.of_matrix = make_of_matrix()
 
     @property
     def in_use(self) -> Preconditioner | LatticePreconditioner:
-        return self.multigrid or self.of_matrix
+        chosen = self.multigrid or self.of_matrix
+        assert chosen is not None
+        return chosen
 
     @property
     def is_uniform(self) -> bool:
@@ -64,10 +68,9 @@ class StepPreconditioner:
         log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
         self.multigrid = self.make_multigrid()
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> None:
-        """Make ready to be applied about positions q (l, 3) [m]."""
-        if self.multigrid:
-            self.multigrid.prepare(q, contact)
+    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
+        return self.in_use.prepare(q, contact)
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
@@ -91,17 +94,15 @@ class StepPreconditioner:
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on."""
         checkpoint.keep(numbers={"multigrid": self.multigrid is not None})
-        if self.multigrid:
-            self.multigrid.save(checkpoint)
+        self.in_use.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint; from an empty one as if no step had been taken."""
         if checkpoint.count("multigrid", 1) and self.chooses and not self.multigrid:
             self.multigrid = self.make_multigrid()
-        if self.multigrid:
-            self.multigrid.restore(checkpoint)
+        self.in_use.restore(checkpoint)
 
-    def destroy(self, _: PETSc.PC | None = None) -> None:
+    def destroy(self, _: PETSc.PC) -> None:
         for owned in (self.of_matrix, self.multigrid):
             if owned:
-                owned.destroy(None)
+                owned.destroy()

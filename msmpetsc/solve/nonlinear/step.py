@@ -14,7 +14,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
@@ -22,6 +21,7 @@ from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
+from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.errors import petsc_errors
@@ -114,7 +114,9 @@ class Stepper:
         preset = self.preset
         flags = {"true_hessian": preset.true_hessian, "kronecker": preset.kronecker, "chooses": preset.chooses}
         elasticity = self.functional.elasticity
-        return Jacobian(comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options)
+        return Jacobian(
+            comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options
+        )
 
     def _create_solvers(self, comm: MPI.Comm) -> tuple[PETSc.SNES, PETSc.KSP]:
         """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
@@ -128,7 +130,7 @@ class Stepper:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
-        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
+        snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.operator)
         snes.setObjective(self._objective)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -141,7 +143,7 @@ class Stepper:
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.options.prefix))
         curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
-        rounding = Rounding(functional, jacobian.diagonal.own[: self.unknowns.size])
+        rounding = Rounding(functional, jacobian.diagonal)
         minimum = self._keep(Minimum(functional, estimate, curvature, rounding))
         tightest = self.ksp.getTolerances()[0]
         return ErrorControl(functional, estimate, curvature, rounding, error, tightest), minimum
@@ -154,7 +156,7 @@ class Stepper:
         with petsc_errors("PETSc cannot set up the solver", self._abandon):
             self.jacobian.hessian.linearise(self.lattice.nodes, None)  # Chebyshev's method tries it, for eigenvalues
             self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
-            self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
+            self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
 
     def step(self, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:
@@ -191,8 +193,7 @@ class Stepper:
             part.restore(checkpoint)
 
     def _remembering(self) -> list:
-        contact = [self.jacobian.diagonal] if self.jacobian.touches else []
-        return [self.first_guess, self.minimum.curvature, self.control, self.jacobian.preconditioner, *contact]
+        return [self.first_guess, self.minimum.curvature, self.control, self.jacobian.preconditioner]
 
     def all_its(self) -> int:
         """KSP iterations of all steps so far, and of their estimates and searches for negative curvature."""

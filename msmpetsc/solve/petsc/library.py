@@ -2,6 +2,8 @@
 
 import ctypes
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from petsc4py import PETSc
@@ -71,6 +73,18 @@ def set_values_coo(matrix: PETSc.Mat, values: np.ndarray) -> None:
     """Set those entries; values (n,) on the CPU or, of a matrix that is there, on a GPU (MatSetValuesCOO)
     (collective)."""
     _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
+
+
+@contextmanager
+def replaced_option(name: str, value: str) -> Iterator[None]:
+    """Have another value of an option that is set, or none, while the block is run."""
+    database, before = PETSc.Options(), PETSc.Options().getAll()
+    database.setValue(name, value)
+    yield
+    if name in before:
+        database.setValue(name, before[name])
+    else:
+        database.delValue(name)
 
 
 def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:

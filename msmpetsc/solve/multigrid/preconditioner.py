@@ -41,7 +41,9 @@ class LatticePreconditioner:
         return due
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance."""
+        """A linear solve took so many iterations to a relative tolerance; none say nothing."""
+        if its == 0:
+            return
         pace = its / max(-np.log10(rtol), 0.1)
         if self.first is None:
             self.first = pace, its

@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import to_host
+from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.initial_state import uniform
@@ -52,7 +53,11 @@ class Multigrid:
         self.fine = ProjectedHessian(unknowns, elasticity, time_step**2)
         self.operator = python_matrix(unknowns, self.fine, comm)
         self.owned.callback(self.operator.destroy)
-        self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
+        try:
+            self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
+        except InputError:
+            self.owned.close()
+            raise
         self.bounds = [FINEST] + [0.0] * (len(self.levels) - 1)
         self.pc = PETSc.PC().create(comm)
         self.owned.callback(self.pc.destroy)
@@ -63,6 +68,8 @@ class Multigrid:
         size, ijk = unknowns.size, grid_indices(unknowns)[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
+        if asked and asked != len(coarse) + 1:
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {_possible(asked, len(coarse))}")
         galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0])
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -126,6 +133,10 @@ class Multigrid:
 
     def destroy(self) -> None:
         self.owned.close()
+
+
+def _possible(asked: int, coarse: int) -> str:
+    return "two levels or more" if asked < 2 else f"{coarse + 1} at most, for a coarser grid would not be much smaller"
 
 
 def greatest_eigenvalue(level: Level) -> float:

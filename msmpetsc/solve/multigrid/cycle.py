@@ -6,7 +6,7 @@ one has a preconditioner that is, too. The finest level is applied spring by spr
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
 """
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +99,10 @@ class Multigrid:
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """P^T H P, its diagonal raised as that of the first one is."""
         is_new = not level.matrix
-        finer.matrix.PtAP(level.interpolation, level.matrix)
+        several = finer.matrix.comm.size > 1 and "matptap_via" not in PETSc.Options().getAll()
+        # PETSc's default adds what other ranks send as it comes in, so that no two runs are alike
+        with replaced_option("matptap_via", "allatonce") if is_new and several else nullcontext():
+            finer.matrix.PtAP(level.interpolation, level.matrix)
         if is_new:
             set_block_size(level.matrix)
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)

@@ -83,7 +83,7 @@ def test_the_true_hessian_of_a_crushed_body_is_indefinite():
 @pytest.mark.parametrize("density", [1e-3, 1e3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_sheet_with_its_underside_held(density: float, shape: str):
-    """Its free nodes lie halfway between two layers of coarse ones: P^T H P is singular, but for the raised diagonal."""
+    """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the raised diagonal."""
     lattice = build(COMM, LATTICES["thin sheet"], density=density)
     with hierarchy(COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10) as case:
         p = case.interpolation(0)

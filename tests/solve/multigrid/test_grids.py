@@ -6,8 +6,7 @@ from conftest import WORKERS
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.solve.multigrid.galerkin import grid_indices
-from msmpetsc.solve.multigrid.grids import grids, parents_of
+from msmpetsc.solve.multigrid.grids import grid_indices, grids, parents_of
 
 
 @pytest.mark.parametrize("pins", [False, True])

@@ -85,6 +85,11 @@ class Array(NDArrayOperatorsMixin):
     def __len__(self):
         return len(self.values)
 
+    @property
+    def __cuda_array_interface__(self) -> dict:
+        """By which PETSc is given an array's address."""
+        return self.values.__array_interface__
+
     shape, size, nbytes, dtype, T = (
         property(lambda self: self.values.shape),
         property(lambda self: self.values.size),

@@ -6,7 +6,7 @@ one has a preconditioner that is, too. The finest level is applied spring by spr
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
 """
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import to_host
+from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.initial_state import uniform
@@ -21,13 +22,13 @@ from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import bodies_of
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
-from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum
+from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import Grid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound)
+FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound); thrice for D's own diagonal
 SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
 ITERATIONS = 10  # of these
 
@@ -55,11 +56,15 @@ class Multigrid:
         self.fine = ProjectedHessian(unknowns, elasticity, time_step**2)
         self.operator = python_matrix(unknowns, self.fine, comm)
         self.owned.callback(self.operator.destroy)
-        self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
-        self.bounds = [FINEST] + [0.0] * (len(self.levels) - 1)
+        try:
+            self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
+        except InputError:
+            self.owned.close()
+            raise
+        smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
+        self.bounds = [FINEST * (3 if smoother == PETSc.PC.Type.JACOBI else 1)] + [0.0] * (len(self.levels) - 1)
         self.pc = PETSc.PC().create(comm)
         self.owned.callback(self.pc.destroy)
-        self.is_set_up = False
 
     def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         unknowns = self.unknowns
@@ -68,6 +73,8 @@ class Multigrid:
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
+        if asked and asked != len(coarse) + 1:
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {_possible(asked, len(coarse))}")
         galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -87,27 +94,33 @@ class Multigrid:
         self.sum.update(q, contact)
         for finer, level in zip(self.levels, self.levels[1:], strict=False):
             self._galerkin_product(finer, level)
-        if not self.is_set_up:
-            self._set_up()
+        is_new = self.pc.getType() is None
+        if is_new:
+            self._create_cycle()
         for i, level in enumerate(self.levels[:-1], 1):
             self.bounds[i] = SAFETY * greatest_eigenvalue(level)
         for i, bound in enumerate(self.bounds):
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
+        if is_new:
+            self._read_options()
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """P^T H P, its diagonal raised as that of the first one is."""
         is_new = not level.matrix
-        finer.matrix.PtAP(level.interpolation, level.matrix)
+        several = finer.matrix.comm.size > 1 and "matptap_via" not in PETSc.Options().getAll()
+        # PETSc's default adds what other ranks send as it comes in, so that no two runs are alike
+        with replaced_option("matptap_via", "allatonce") if is_new and several else nullcontext():
+            finer.matrix.PtAP(level.interpolation, level.matrix)
         if is_new:
-            level.matrix.setBlockSize(3)
+            set_block_size(level.matrix)
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)
         diagonal = level.matrix.getDiagonal()
         diagonal.scale(RAISED)
         level.matrix.setDiagonal(diagonal)
         diagonal.destroy()
 
-    def _set_up(self) -> None:
-        """Make PCMG know the levels; the user's options come last, and win."""
+    def _create_cycle(self) -> None:
+        """Make PCMG know the levels."""
         pc, top = self.pc, len(self.levels)
         pc.setOptionsPrefix(self.prefix)
         pc.setOperators(self.operator)
@@ -115,6 +128,9 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
+            restriction = PETSc.Mat().createTranspose(level.interpolation)  # of a square P PETSc cannot tell it
+            pc.setMGRestriction(top - i, restriction)
+            self.owned.callback(restriction.destroy)
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
@@ -122,12 +138,23 @@ class Multigrid:
         finest.setOperators(self.operator, self.operator)
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
-        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG):  # a preset may say what it begins with
-            pc.setFromOptions()
-        self.is_set_up = True
+
+    def _read_options(self) -> None:
+        """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG. The
+        finest level's blocks are the only pbjacobi of a matrix that is not assembled."""
+        levels = f"{self.prefix}mg_levels_"
+        is_blocks = PETSc.Options().getString(f"{levels}pc_type", "") == PETSc.PC.Type.PBJACOBI
+        finest = replaced_option(f"{levels}{len(self.levels)}_pc_type", PETSc.PC.Type.PYTHON)
+        with replaced_option(f"{self.prefix}pc_type", PETSc.PC.Type.MG), finest if is_blocks else nullcontext():
+            self.pc.setFromOptions()
+            self.pc.setUp()
 
     def destroy(self) -> None:
         self.owned.close()
+
+
+def _possible(asked: int, coarse: int) -> str:
+    return "two levels or more" if asked < 2 else f"{coarse + 1} at most, for a coarser grid would not be much smaller"
 
 
 def greatest_eigenvalue(level: Level) -> float:

@@ -27,18 +27,27 @@ class ProjectedHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None  # until ``update``
-        self.products = 0
+        self.products, self.q = 0, lattice.nodes
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
 
     def update(self, q: np.ndarray, contact: np.ndarray) -> None:
         """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
-        self.elastic, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), contact
-        blocks = np.zeros((len(q), 9), like=q)
-        self.elasticity.add_half_bound(q, blocks)
-        invert_blocks(
-            self.unknowns.size, blocks, self.unknowns.free, self.unknowns.lattice.mass, contact, self.t2, self.inverse
-        )
+        self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
+        unknowns, blocks = self.unknowns, self._half_bound()
+        invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.lattice.mass, contact, self.t2, self.inverse)
+
+    def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
+        """Write that of D, for -mg_levels_pc_type jacobi."""
+        unknowns, (blocks, contact) = self.unknowns, (self._half_bound(), self.contact)
+        acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
+        own = unknowns.lattice.mass[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
+        unknowns.columns_to_write(diagonal)[:] = own
+
+    def _half_bound(self) -> np.ndarray:
+        blocks = np.zeros((len(self.q), 9), like=self.q)
+        self.elasticity.add_half_bound(self.q, blocks)
+        return blocks
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = H x."""

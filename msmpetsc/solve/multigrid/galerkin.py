@@ -140,6 +140,7 @@ class GalerkinSum:
         rows = np.concatenate([row.ravel(), column[upper].ravel()])
         columns = np.concatenate([column.ravel(), row[upper].ravel()])
         preallocate_coo(matrix, rows, columns)
+        set_block_size(matrix)
         return matrix
 
     def update(self, q: np.ndarray, contact: np.ndarray) -> None:
@@ -158,6 +159,13 @@ class GalerkinSum:
 
     def destroy(self) -> None:
         self.matrix.destroy()
+
+
+def set_block_size(matrix: PETSc.Mat) -> None:
+    """Give a matrix of three rows a node this block size, its diagonal part, which pbjacobi inverts, too: PETSc makes
+    that of a matrix on several ranks without one."""
+    matrix.setBlockSize(3)
+    matrix.getDiagonalBlock().setBlockSize(3)
 
 
 def _by_cell(

@@ -59,7 +59,9 @@ class LatticePreconditioner:
             columns -= self.translations.of(self.unknowns.columns(f))
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance."""
+        """A linear solve took so many iterations to a relative tolerance; none say nothing."""
+        if its == 0:
+            return
         pace = its / max(-np.log10(rtol), 0.1)
         if self.first is None:
             self.first = pace, its

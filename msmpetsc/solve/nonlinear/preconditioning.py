@@ -124,8 +124,12 @@ class StepPreconditioner:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        if checkpoint.count("multigrid", 1) and self.chooses and not self.multigrid:
+        chosen = checkpoint.count("multigrid", 1)
+        if chosen and self.chooses and not self.multigrid:
             self.multigrid = self.make_multigrid()
+        elif self.multigrid and self.of_matrix and not chosen:  # which it was changed for since
+            self.multigrid.destroy()
+            self.multigrid = None
         self.in_use.restore(checkpoint)
 
     def destroy(self, _: PETSc.PC) -> None:

@@ -1,0 +1,282 @@
+"""Lattices that are hard for multigrid, on any number of ranks, and the parts of the cycle as dense matrices whose rows
+and columns are x, y, z of one node after another, whatever the ranks."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+from lattices import block
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_array
+
+from msmpetsc.comm import SortedKeys
+from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.grid import Grid, encode_morton
+from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.model.material import CellMaterial
+from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid import cycle
+from msmpetsc.solve.multigrid.cycle import Multigrid
+from msmpetsc.solve.presets import LATTICE_MULTIGRID
+
+CELL, YOUNG, DENSITY = 0.1, 2e5, 1000.0
+ORIGIN = np.array([1.0, -2.0, 3.0])
+COMM = MPI.COMM_SELF
+
+
+def at(cells: np.ndarray, *first: int) -> np.ndarray:
+    """Cells moved on the grid."""
+    return cells + np.array(first)
+
+
+def l_shape() -> np.ndarray:
+    cells = block(6, 6, 2)
+    return cells[(cells[:, 0] < 2) | (cells[:, 1] < 2)]
+
+
+def tilted_beam(length: int = 9) -> np.ndarray:
+    """Cells near a line that is parallel to no axis."""
+    cells = block(length, length, length)
+    along = np.array([3, 2, 1]) / np.sqrt(14)
+    away = cells - (cells @ along)[:, None] * along
+    return cells[np.linalg.norm(away, axis=1) < 1.5]
+
+
+def limbs(reach: int = 7) -> np.ndarray:
+    """A cube with an arm along each axis that is a cell thick; none of them begins at an even index."""
+    arms = [at(block(reach, 1, 1), 4, 2, 1), at(block(1, reach, 1), 1, 4, 2), at(block(1, 1, reach), 2, 1, 4)]
+    return np.concatenate([block(4, 4, 4), *arms])
+
+
+def box_of_cells(low: list[int], high: list[int], fineness: int) -> np.ndarray:
+    return block(*fineness * (np.array(high) - low)) + fineness * np.array(low)
+
+
+def figure(fineness: int = 1) -> np.ndarray:
+    """A trunk with a head, legs, arms that reach out and a tail."""
+    parts = [
+        ([6, 2, 8], [12, 8, 18]), ([7, 3, 18], [11, 7, 22]), ([7, 4, 0], [9, 6, 8]), ([10, 4, 0], [12, 6, 8]),
+        ([0, 4, 14], [6, 6, 16]), ([12, 4, 15], [18, 6, 16]), ([8, 0, 17], [9, 2, 18]),
+    ]  # fmt: skip
+    return np.concatenate([box_of_cells(*ends, fineness) for ends in parts])
+
+
+LATTICES: dict[str, np.ndarray] = {
+    "block": block(5, 4, 3),
+    "block that begins at odd indices": at(block(4, 3, 3), 1, 3, 5),
+    "L": l_shape(),
+    "tilted beam": tilted_beam(),
+    "two bodies": np.concatenate([block(3, 3, 3), at(block(3, 2, 2), 6, 1, 0)]),
+    "two bodies in one coarse cell": np.concatenate([block(3, 3, 1), at(block(3, 3, 1), 0, 0, 2)]),
+    "thin sheet": block(9, 9, 1),
+    "limbs": limbs(),
+    "rod": at(block(14, 1, 1), 1, 1, 1),
+    "a cell": block(1, 1, 1),
+    "a cell at odd indices": block(1, 1, 1) + 1,
+    "many bodies": np.concatenate([at(block(1, 1, 1), 2 * i, 2 * j, 0) for i in range(3) for j in range(3)]),
+}
+
+
+def build(
+    comm: MPI.Comm,
+    cells: np.ndarray,
+    young: float = YOUNG,
+    density: float = DENSITY,
+    contrast: float = 1.0,
+    stiffening: float = 0.0,
+    pins: bool = False,
+) -> Lattice:
+    """contrast : the cells beyond the middle of x are so many times stiffer; pins: the lowest nodes of x are held."""
+    grid = Grid(ORIGIN, CELL, cells.max(axis=0) + 1)
+    mine = encode_morton(cells)[comm.rank :: comm.size]
+    table = SortedKeys(comm, mine)
+    cages = Cages(grid, table, np.ones(len(table.keys), np.uint8))
+    middle = cells[:, 0].mean()
+
+    def of_cells(ijk: np.ndarray) -> CellMaterial:
+        return CellMaterial(np.full(len(ijk), density), np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
+
+    lattice = build_lattice(cages, density, young, stiffening=stiffening, of_cells=of_cells if contrast != 1 else None)
+    low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
+    return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
+
+
+def heavier(lattice: Lattice, mass: float) -> Lattice:
+    """The same with nodes of this mass [kg]."""
+    return replace(lattice, mass=np.full(lattice.owned, mass))
+
+
+def at_rest(nodes: np.ndarray) -> np.ndarray:
+    return nodes.copy()
+
+
+def twisted(nodes: np.ndarray) -> np.ndarray:
+    """By 2 rad a metre about x, and by a wave: the same on all ranks."""
+    x, y, z = (nodes - ORIGIN).T
+    q = nodes.copy()
+    q[:, 1] = ORIGIN[1] + np.cos(2 * x) * y - np.sin(2 * x) * z
+    q[:, 2] = ORIGIN[2] + np.sin(2 * x) * y + np.cos(2 * x) * z
+    return q + 0.02 * np.sin(31 * nodes[:, [1, 2, 0]])
+
+
+def crushed(nodes: np.ndarray) -> np.ndarray:
+    """To a fifth of its height: the true Hessian is indefinite, cells resist."""
+    return ORIGIN + (twisted(nodes) - ORIGIN) * [1.0, 1.1, 0.2]
+
+
+def turned(nodes: np.ndarray) -> np.ndarray:
+    """By half a rad a metre about an axis along x, and stretched, so that no spring is compressed."""
+    x, y, z = (nodes - ORIGIN - 0.1).T
+    angle = 0.5 * x
+    across = [np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z]
+    return ORIGIN + 1.4 * np.stack([x, *across], axis=1)
+
+
+SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "rest": at_rest,
+    "twisted": twisted,
+    "crushed": crushed,
+    "turned": turned,
+}
+
+
+def contact_blocks(lattice: Lattice) -> np.ndarray:
+    """(owned, 9) [N/m]: a push along an oblique normal on every third node, its stiffness no small one."""
+    normal = np.array([0.6, 0.0, 0.8])
+    touched = lattice.global_numbers[: lattice.owned] % 3 == 0
+    return touched[:, None] * 5e4 * np.outer(normal, normal).ravel()
+
+
+class Applied:
+    """A PC as the context of another one."""
+
+    def __init__(self, pc: PETSc.PC):
+        self.pc = pc
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.pc.apply(x, y)
+
+
+class Case:
+    """A lattice, and the cycle that is built for the Hessian at positions q."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, q: np.ndarray, time_step: float, contact: bool = False):
+        self.comm, self.lattice, self.q, self.time_step = comm, lattice, q, time_step
+        self.unknowns = Unknowns(comm, lattice)
+        self.elasticity = Elasticity(comm, lattice)
+        self.multigrid = Multigrid(comm, self.unknowns, self.elasticity, time_step, "")
+        self.blocks = contact_blocks(lattice) if contact else np.empty((0, 9))
+        self.multigrid.update(q, self.blocks)
+        self.x, self.y = self.multigrid.operator.createVecs()
+
+    @property
+    def size(self) -> int:
+        return 3 * self.unknowns.total
+
+    def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None]) -> np.ndarray:
+        """Matrix of what writes into its second vector, column by column (collective)."""
+        matrix, first = np.empty((self.size, self.size)), self.multigrid.operator.getOwnershipRange()[0] // 3
+        for column in range(self.size):
+            node, c = column // 3 - first, column % 3
+            chosen = self.unknowns.columns_to_write(self.x)
+            chosen[:] = 0
+            if 0 <= node < self.unknowns.size:
+                chosen[c, node] = 1
+            act(self.x, self.y)
+            matrix[:, column] = np.concatenate(self.comm.allgather(self.unknowns.columns(self.y).T.ravel()))
+        return matrix
+
+    def hessian(self, projected: bool = True, dtype: type = np.float64) -> np.ndarray:
+        """H = M + t^2 (Hessian of E), and of contact where there is: by its products."""
+        hessian, t2 = TrueHessian(self.unknowns, self.elasticity, self.time_step), self.time_step**2
+        hessian.elastic = self.elasticity.hessian_at(self.q, projected, dtype)
+        matrix = self.dense(lambda x, y: hessian.mult(None, x, y))
+        own = self.blocks[self.unknowns.free] if len(self.blocks) else np.zeros((self.unknowns.size, 9))
+        for node, added in enumerate(np.concatenate(self.comm.allgather(own))):
+            matrix[3 * node : 3 * node + 3, 3 * node : 3 * node + 3] += t2 * added.reshape(3, 3)
+        return matrix
+
+    def cycle(self) -> np.ndarray:
+        return self.dense(self.multigrid.pc.apply)
+
+    def interpolation(self, level: int) -> np.ndarray:
+        """P to the ``level``-th coarse grid's finer neighbour; 0 is that from the first coarse grid to the nodes."""
+        p = self.gathered(self.multigrid.levels[level].interpolation)
+        if level:
+            return p
+        sizes, rows = np.array(self.comm.allgather(self.unknowns.size)), []
+        for size, begin in zip(sizes, np.cumsum(3 * sizes) - 3 * sizes, strict=True):
+            rows.append(begin + np.arange(size)[:, None] + size * np.arange(3))
+        return p[np.concatenate(rows).ravel()]
+
+    def level(self, level: int) -> np.ndarray:
+        return self.gathered(self.multigrid.levels[level].matrix)
+
+    def gathered(self, matrix: PETSc.Mat) -> np.ndarray:
+        """A matrix with entries, on every rank."""
+        indptr, indices, data = matrix.getValuesCSR()
+        own = csr_array((data, indices, indptr), shape=(len(indptr) - 1, matrix.getSize()[1])).toarray()
+        return np.concatenate(self.comm.allgather(own))
+
+    def true_hessian(self) -> tuple[PETSc.Mat, TrueHessian]:
+        """The operator of CG: with its negative parts."""
+        hessian = TrueHessian(self.unknowns, self.elasticity, self.time_step)
+        hessian.linearise(self.q, None)
+        return python_matrix(self.unknowns, hessian, self.comm), hessian
+
+    def iterations(self, rtol: float, rough: bool) -> int:
+        """CG's on the true Hessian with the cycle, to this tolerance in the norm of the error, as newton's; of a step
+        under weight, or of pushes that differ from node to node."""
+        operator, _ = self.true_hessian()
+        ksp = PETSc.KSP().create(self.comm)
+        ksp.setType(PETSc.KSP.Type.CG)
+        ksp.setNormType(PETSc.KSP.NormType.NATURAL)
+        ksp.setOperators(operator)
+        ksp.getPC().setType(PETSc.PC.Type.PYTHON)
+        ksp.getPC().setPythonContext(Applied(self.multigrid.pc))
+        ksp.setTolerances(rtol=rtol, max_it=100)
+        owned = self.lattice.nodes[: self.lattice.owned]
+        push = np.sin(1000 * (owned - ORIGIN) ** 2) if rough else self.lattice.mass[:, None] * [0.3, -0.2, -9.81]
+        self.unknowns.from_nodes(push, self.x)
+        ksp.solve(self.x, self.y)
+        assert ksp.reason > 0, ksp.reason
+        its = ksp.its
+        ksp.destroy()
+        operator.destroy()
+        return its
+
+    def destroy(self) -> None:
+        for owned in (self.x, self.y, self.multigrid, self.unknowns):
+            owned.destroy()
+
+
+@contextmanager
+def hierarchy(
+    comm: MPI.Comm,
+    lattice: Lattice,
+    shape: Callable[[np.ndarray], np.ndarray] = at_rest,
+    time_step: float = 1 / 60,
+    contact: bool = False,
+    coarsest: int = 800,
+    options: dict[str, str] | None = None,
+) -> Iterator[Case]:
+    """The cycle as presets have it, with coarser grids until one has ``coarsest`` nodes or less."""
+    database, before = PETSc.Options(), cycle.COARSEST
+    given = LATTICE_MULTIGRID | (options or {})
+    for name, value in given.items():
+        database.setValue(name, value)
+    cycle.COARSEST = coarsest
+    case = None
+    try:
+        case = Case(comm, lattice, shape(lattice.nodes), time_step, contact)
+        yield case
+    finally:
+        cycle.COARSEST = before
+        if case:
+            case.destroy()
+        for name in given:
+            database.delValue(name)

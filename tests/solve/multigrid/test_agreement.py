@@ -1,0 +1,54 @@
+"""Frames by multigrid are those by Jacobi's preconditioner, to the error that was asked for, whatever a scene has."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import CELL, block_scene
+
+ERROR, STEPS, STEP = 1e-6, 8, 0.01
+HELD = [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}]
+FAR = {"box": [[0.95, 0, 0], [1, 1, 1]], "relative": True}
+LED = [{"region": FAR, "path": [{"time": 4 * STEP, "by": [0.05, 0, 0.05]}], "stop": 5 * STEP}]
+FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1], "response": "penalty", "friction": 0.4}
+FALLING = {"start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR]}
+SOFT = {"young_modulus": 1e5, "density": 1000.0}
+TIME = {"step": STEP, "duration": STEPS * STEP}
+CASES = {
+    "held": {"pin": HELD},
+    "led and let go": {"pin": HELD, "anchor": LED},
+    "touching": FALLING,
+    "stiffening": {"pin": HELD, "anchor": LED, "material": SOFT | {"law": "stiffening"}},
+    "bdf2": {"pin": HELD, "time": TIME | {"integrator": "bdf2"}},
+    "of two materials": {
+        "pin": HELD,
+        "part": [
+            {"region": {"box": [[0.6, 0, 0], [1, 1, 1]], "relative": True}, "young_modulus": 1e9, "density": 5000.0}
+        ],
+    },
+    "substep": FALLING | {"safety": {"on_failure": "substep"}},
+    "fallback": FALLING | {"safety": {"on_failure": "fallback"}},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_frames_are_those_by_jacobi(msmpetsc, tmp_path: Path, case: str):
+    """On one rank and on two, with several coarse levels. Errors of N steps add up to N (N + 1) / 2 of the greatest."""
+    base = {"sides": np.array([8, 3, 3]) * CELL, "material": SOFT, "time": TIME}
+    gravity = {"gravity": {"acceleration": [0, 1.0, -9.81]}, "solver": {"preset": "newton", "error": ERROR}}
+    path, found = block_scene(tmp_path, **base | gravity | CASES[case]), []
+    for ranks, preset, *options in (
+        (1, "newton-jacobi"),
+        *((n, "newton-multigrid", "-pc_mg_levels", 3) for n in (1, 2)),
+    ):
+        file = tmp_path / f"{preset}{ranks}.h5"
+        done = msmpetsc(ranks, "run", path, "-o", file, "--preset", preset, *options)
+        assert done.returncode == 0, done.stderr
+        with h5py.File(file) as result:
+            found.append(result["frames/position"][:])
+            assert np.nanmax(result["frames/step_error"][:]) <= ERROR
+    far = np.abs(found[0] - found[0][0]).max()
+    assert far > 1e-3
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=0, atol=ERROR * STEPS * (STEPS + 1) / 2 * far)

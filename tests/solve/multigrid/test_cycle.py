@@ -1,0 +1,91 @@
+"""The cycle is symmetric and positive definite, and no more than the inverse of what it is built from."""
+
+import numpy as np
+import pytest
+from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
+from scipy.linalg import eigh
+
+SYMMETRIC = 1e-6  # of the greatest number: single precision has 6e-8
+BEYOND = 1e-5  # what single precision adds to the greatest eigenvalue, 1
+LOOSE = {"two bodies", "many bodies"}  # of which some are not held
+
+
+def check(case: Case, least: float, beyond: float = BEYOND) -> None:
+    """Symmetric, B H with eigenvalues between ``least`` and 1: each part of B moves along a descent, none too far."""
+    b, h = case.cycle(), case.hessian()
+    assert np.isfinite(b).all()
+    assert np.abs(b - b.T).max() < SYMMETRIC * np.abs(b).max()
+    b = (b + b.T) / 2
+    assert np.linalg.eigvalsh(b).min() > 0
+    values = eigh(h, np.linalg.inv(b), eigvals_only=True)
+    assert least < values.min() and values.max() < 1 + beyond, values[[0, -1]]
+
+
+@pytest.mark.parametrize("coarsest", [800, 10])
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("name", LATTICES)
+def test_cycles(name: str, shape: str, coarsest: int):
+    """Bodies that share a coarse node, though nothing joins them, have the least."""
+    with hierarchy(COMM, build(COMM, LATTICES[name]), SHAPES[shape], coarsest=coarsest) as case:
+        check(case, {"many bodies": 0.07, "two bodies in one coarse cell": 0.18}.get(name, 0.3))
+
+
+@pytest.mark.parametrize("coarsest", [800, 10])
+@pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
+def test_cycles_with_contact_resistance_and_pins(name: str, coarsest: int):
+    """Of cells pressed to a fifth the cycle has less: their curvature is along few directions that it cannot smooth."""
+    lattice = build(COMM, LATTICES[name], stiffening=2.0, pins=True)
+    with hierarchy(COMM, lattice, SHAPES["crushed"], contact=True, coarsest=coarsest) as case:
+        check(case, 0.002)
+
+
+@pytest.mark.parametrize("mass", [1e-9, 1e9])
+@pytest.mark.parametrize("shape", ["twisted", "crushed"])
+@pytest.mark.parametrize("name", LATTICES)
+def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
+    """A light body that nothing holds moves as a whole by what the raised diagonals lets it, a 1e10th."""
+    pinned = heavier(build(COMM, LATTICES[name], pins=True), mass)
+    with hierarchy(COMM, pinned, SHAPES[shape], coarsest=10) as case:
+        check(case, 1e-10 if name in LOOSE and mass < 1 else 0.07)
+
+
+@pytest.mark.parametrize("contrast", [1e3, 1e6])
+@pytest.mark.parametrize("pins", [False, True])
+@pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "rod"])
+def test_cycles_of_two_materials(name: str, contrast: float, pins: bool):
+    """One precision serves both: what is 1e6 times softer has a digit or so of it left."""
+    with hierarchy(COMM, build(COMM, LATTICES[name], contrast=contrast, pins=pins), SHAPES["twisted"]) as case:
+        check(case, 0.1 if contrast < 1e6 else 0.02, beyond=1e-7 * contrast if contrast > 1e3 else 1e-4)
+
+
+@pytest.mark.parametrize("step", [1e-4, 1.0])
+@pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
+def test_cycles_of_short_and_long_steps(name: str, step: float):
+    with hierarchy(COMM, build(COMM, LATTICES[name]), SHAPES["twisted"], step, coarsest=10) as case:
+        check(case, 0.1, beyond=1e-3)
+
+
+def test_one_free_node():
+    lattice = build(COMM, LATTICES["a cell"])
+    lattice = lattice.pin(np.arange(8) != 5)
+    with hierarchy(COMM, lattice, SHAPES["twisted"]) as case:
+        assert case.size == 3
+        check(case, 0.9)
+
+
+def test_the_true_hessian_of_a_crushed_body_is_indefinite():
+    """Or the tests above would show nothing."""
+    with hierarchy(COMM, build(COMM, LATTICES["block"]), SHAPES["crushed"]) as case:
+        assert np.linalg.eigvalsh(case.hessian(projected=False)).min() < -0.1
+        assert np.linalg.eigvalsh(case.hessian()).min() > 0
+
+
+@pytest.mark.parametrize("density", [1e-3, 1e3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_sheet_with_its_underside_held(density: float, shape: str):
+    """Its free nodes lie halfway between layers of coarse ones: P^T H P is singular, but for the raised diagonal."""
+    lattice = build(COMM, LATTICES["thin sheet"], density=density)
+    with hierarchy(COMM, lattice.pin(lattice.nodes[:, 2] < 3.01), SHAPES[shape], coarsest=10) as case:
+        p = case.interpolation(0)
+        assert np.linalg.matrix_rank(p) <= p.shape[1] / 2
+        check(case, 0.3)

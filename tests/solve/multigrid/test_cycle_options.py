@@ -1,0 +1,57 @@
+"""PETSc's options of the cycle: obeyed, or refused in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import CELL, block_scene
+
+SCENE = {
+    "sides": np.array([8, 3, 3]) * CELL,
+    "gravity": {"acceleration": [0, 0, -9.81]},
+    "time": {"step": 0.02, "duration": 0.04},
+    "pin": [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}],
+    "solver": {"preset": "newton-multigrid", "error": 1e-4},
+}
+OBEYED = [
+    "-pc_mg_levels 2", "-pc_mg_levels 3 -pc_mg_cycle_type w", "-mg_levels_ksp_max_it 2", "-mg_coarse_pc_type cholesky",
+    "-pc_mg_type additive", "-pc_mg_type full", "-mg_levels_ksp_type richardson", "-mg_coarse_redundant_pc_type lu",
+    "-ksp_view", "-pc_mg_log -log_view", "-mg_levels_2_ksp_max_it 3 -pc_mg_levels 3",
+    "-matptap_via scalable -pc_mg_levels 3",
+]  # fmt: skip
+REFUSED = {
+    "-pc_mg_levels 1": "two levels or more",
+    "-pc_mg_levels 9": "at most",
+    "-pc_mg_galerkin both": "PETSc cannot set up the solver",
+    "--preset anderson -pc_type mg": "newton's presets",
+    "-mg_levels_ksp_typ cg": "no part of this run",
+    "-mg_levels_pc_type nonsense": "nonsense",
+}
+
+
+def error_lines(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.startswith("msmpetsc: error:")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
+    path = block_scene(tmp_path, **SCENE)
+    for options in OBEYED:
+        done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split())
+        assert done.returncode == 0, options + done.stderr
+        assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV")), options
+        shown = {"-ksp_view": "type=MULTIPLICATIVE, levels=2", "-pc_mg_log -log_view": "MGSmooth Level 1"}.get(
+            options, ""
+        )
+        assert shown in done.stdout, options
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("options", REFUSED)
+def test_options_that_cannot_be_are_one_line(msmpetsc, tmp_path: Path, options: str, ranks: int):
+    path = block_scene(tmp_path, **SCENE)
+    done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", *options.split())
+    errors = error_lines(done.stderr)
+    assert done.returncode == 2 and len(errors) == 1 and REFUSED[options] in errors[0], done.stderr
+    assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV"))

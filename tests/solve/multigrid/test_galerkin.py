@@ -1,0 +1,71 @@
+"""Coarse matrices are P^T H P, H the projected Hessian as its products have it, whatever the lattice has."""
+
+import numpy as np
+import pytest
+from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
+
+RAISED = 1 + 1e-5
+CASES = {  # lattice, shape, contact, more
+    "pinned": ("block", "twisted", False, {"pins": True}),
+    "crushed": ("block that begins at odd indices", "crushed", False, {}),
+    "of two materials": ("L", "twisted", False, {"contrast": 1e6, "pins": True}),
+    "touching": ("tilted beam", "twisted", True, {"pins": True}),
+    "resisting": ("block", "crushed", False, {"stiffening": 2.0, "pins": True}),
+    "resisting, touching, of two materials": ("limbs", "crushed", True, {"stiffening": 2.0, "contrast": 1e3}),
+    "in two pieces": ("two bodies in one coarse cell", "crushed", True, {"stiffening": 2.0}),
+    "many": ("many bodies", "twisted", True, {}),
+    "thin": ("thin sheet", "twisted", False, {"pins": True}),
+}
+
+
+def raised(matrix: np.ndarray) -> np.ndarray:
+    return matrix + (RAISED - 1) * np.diag(matrix.diagonal())
+
+
+def assert_close(found: np.ndarray, expected: np.ndarray, accuracy: float = 1e-12) -> None:
+    """Beside what the nodes have themselves: a soft part stands by a stiff one."""
+    size = np.sqrt(expected.diagonal())
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=accuracy)
+
+
+def check_levels(case: Case) -> None:
+    h = case.hessian()
+    for level in range(len(case.multigrid.levels)):
+        p, found = case.interpolation(level), case.level(level)
+        assert_close(found, raised(p.T @ h @ p))
+        assert np.linalg.eigvalsh(found).min() > 0
+        h = found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_levels_are_galerkin_products(name: str):
+    """And positive definite, at whatever positions."""
+    lattice, shape, contact, more = CASES[name]
+    with hierarchy(COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10) as case:
+        assert len(case.multigrid.levels) > 1
+        if "stiffening" in more:
+            assert len(case.elasticity.cells.resisting(case.q)) > 10
+        check_levels(case)
+        np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)), case.hessian(),
+                                   rtol=0, atol=1e-5 * np.abs(case.hessian()).max())  # fmt: skip
+
+
+@pytest.mark.parametrize("mass", [1e-9, 1e9])
+@pytest.mark.parametrize("name", LATTICES)
+def test_levels_of_light_and_heavy_bodies(name: str, mass: float):
+    with hierarchy(COMM, heavier(build(COMM, LATTICES[name]), mass), SHAPES["twisted"], coarsest=10) as case:
+        check_levels(case)
+
+
+def test_a_new_hierarchy_takes_nothing_of_the_old_one():
+    """Positions, contact, and what stood in the matrices."""
+    with hierarchy(
+        COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["crushed"], contact=True, coarsest=10
+    ) as case:
+        check_levels(case)
+        case.q, case.blocks = SHAPES["twisted"](case.lattice.nodes), np.empty((0, 9))
+        case.multigrid.update(case.q, case.blocks)
+        check_levels(case)
+        again = case.cycle()
+    with hierarchy(COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["twisted"], coarsest=10) as case:
+        np.testing.assert_array_equal(case.cycle(), again)

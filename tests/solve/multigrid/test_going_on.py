@@ -1,0 +1,123 @@
+"""Runs with multigrid go on from a checkpoint to the last bit: the hierarchy of then is built again."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import CELL, block_scene
+from conftest import WORKERS
+from mpi4py import MPI
+from stopped_runs import assert_same
+
+from msmpetsc.model.build import build_model
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.multigrid import cycle
+from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
+from msmpetsc.solve.nonlinear import preconditioning
+from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
+from msmpetsc.solve.simulate import Simulation
+
+COMM = MPI.COMM_SELF
+STEPS = 10
+GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
+HELD = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
+FAR = {"box": [[0.74, -1, -1], [0.76, 1, 1]]}
+LED = [{"region": FAR, "path": [{"time": 0.08, "by": [0.05, 0, 0.05]}], "stop": 0.1}]
+GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
+PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
+SOFT = {"young_modulus": 1e5, "density": 1000.0}
+
+
+def scene(preset: str, **tables) -> dict:
+    time = {"step": 0.02, "duration": 0.02 * STEPS}
+    solver = {"preset": preset, "error": 1e-3}
+    sides = np.array([6, 3, 3]) * CELL
+    return {"sides": sides, "gravity": GRAVITY, "material": SOFT, "time": time, "solver": solver} | tables
+
+
+def pressed(preset: str, **tables) -> dict:
+    """It falls on the ground, slides there and is pressed."""
+    mesh, start = {"source": "scene.ply", "base": [0, 0, 0.01]}, {"velocity": [1.0, 0.0, -1.5]}
+    return scene(preset, mesh=mesh, start=start, obstacle=PRESSING) | tables
+
+
+CASES = {
+    "held": scene("newton-multigrid", pin=HELD),
+    "pressed": pressed("newton-multigrid"),
+    "led and let go": scene("newton-multigrid", pin=HELD, anchor=LED),
+    "bdf2, pressed": pressed(
+        "newton-multigrid", time={"step": 0.02, "duration": 0.02 * STEPS, "integrator": "bdf2"}
+    ),
+    "stiffening, pressed": pressed("newton-multigrid", material=SOFT | {"law": "stiffening"}),
+    "switched, held": scene("newton", pin=HELD),
+    "switched, pressed": pressed("newton"),
+    "switched, led and let go": scene("newton", pin=HELD, anchor=LED),
+    "substep": pressed("newton-multigrid", safety={"on_failure": "substep"}),
+    "fallback": pressed(
+        "fast-msm", safety={"on_failure": "fallback"}, start={"velocity": [0.1, 0, -10.0]},
+        solver={"preset": "fast-msm", "error": 1e-6},
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several coarse levels; hierarchies that are given up soon; newton that changes over after a few steps."""
+    monkeypatch.setattr(cycle, "COARSEST", 10)
+    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.FEW", 0)
+    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.WORSE", 1.05)
+    monkeypatch.setattr(preconditioning, "LONG", 4)
+    monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
+
+
+def assert_equal(found: dict, expected: dict) -> None:
+    assert found.keys() == expected.keys()
+    for name in expected.keys() - {"wall_time"}:
+        assert np.array_equal(found[name], expected[name], equal_nan=True) if expected[name] is not None else True, name
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, case: str, monkeypatch):
+    """Of runs that build hierarchies in some steps and keep them in others, or change over in the midst of a step."""
+    built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose
+    monkeypatch.setattr(LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1])
+    monkeypatch.setattr(StepPreconditioner, "_choose", lambda *given: (chosen.append(1), choose(*given))[1])
+    read = load_scene(block_scene(tmp_path, **CASES[case]))
+    model, frames, saved, counts = build_model(COMM, read), [], [], []
+    with Simulation(COMM, read, model) as simulation:
+        for frame in simulation.advance():
+            frames.append(frame)
+            counts.append(len(built))
+            saved.append(copy.deepcopy(simulation.saved()))
+    if case.startswith("switched"):
+        assert chosen
+    if case == "fallback":
+        assert sum(frame.fallbacks for frame in frames) > 0
+    assert counts[-1] > 0
+    if "pressed" in case:
+        assert any(saved[step].rows.get("hierarchy_contact", np.zeros(1)).any() for step in range(1, STEPS)), (
+            "nothing touched"
+        )
+    for begin in range(1, len(saved) - 1):
+        with Simulation(COMM, read, model) as simulation:
+            simulation.restore(saved[begin])
+            for frame, index in zip(simulation.advance(), range(begin + 1, begin + 3), strict=False):
+                after = simulation.saved()
+                assert_equal(after.rows, saved[index].rows)
+                assert_equal(after.numbers, saved[index].numbers)
+                assert_equal(vars(frame), vars(frames[index]))
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+@pytest.mark.parametrize("name", ["pressed", "chosen, led and let go"])
+def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, name: str, ranks: int):
+    """By the command line, on several coarse levels."""
+    stiff = {"young_modulus": 1e9, "density": 1000.0}
+    chosen = scene("newton", pin=HELD, anchor=LED, material=stiff)
+    path = block_scene(tmp_path, **(pressed("newton-multigrid") if name == "pressed" else chosen))
+    for step, file in ((6, "x.h5"), (-1, "whole.h5")):
+        done = on_ranks(ranks, WORKERS / "stop_worker.py", step, "run", path, "-o", tmp_path / file, "-pc_mg_levels", 3)
+        assert done.returncode == 0, done.stderr
+    assert on_ranks(ranks, WORKERS / "stop_worker.py", -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
+    assert_same(tmp_path / "x.h5", tmp_path / "whole.h5")

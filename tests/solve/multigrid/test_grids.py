@@ -1,0 +1,72 @@
+"""The coarse grids, and how values pass between them."""
+
+import numpy as np
+import pytest
+from conftest import WORKERS
+from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
+
+from msmpetsc.geometry.grid import decode_morton
+from msmpetsc.solve.multigrid.grids import grid_indices, grids, parents_of
+
+
+@pytest.mark.parametrize("pins", [False, True])
+@pytest.mark.parametrize("name", LATTICES)
+def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
+    """On every level; a constant among it: the weights of a node sum to 1."""
+    slopes, at_origin = np.array([[2.0, -3, 5], [0.5, 7, 1], [-1, 1, 4]]), np.array([11.0, -2, 3])
+    with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
+        nodes, free = case.lattice.nodes, case.unknowns.free
+        fine = np.rint((nodes - ORIGIN) / CELL).astype(int)[free]
+        for level, coarse in enumerate(case.multigrid.levels):
+            p = case.interpolation(level)
+            assert p.shape == (3 * len(fine), 3 * coarse.grid.table.total)
+            assert p.min() >= 0 and set(np.unique(p)) <= {0, 1 / 8, 1 / 4, 1 / 2, 1}
+            np.testing.assert_allclose(p.sum(axis=1), 1, rtol=1e-15)
+            ijk = decode_morton(coarse.grid.table.keys)
+            values = 2 * ijk @ slopes + at_origin
+            np.testing.assert_allclose((p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12)
+            assert (p != 0).any(axis=0).all()  # no coarse node without fine ones
+            fine = ijk
+
+
+def test_a_node_has_the_parents_around_it():
+    keys, needed = parents_of(np.array([[2, 4, 6], [3, 4, 6], [3, 5, 6], [3, 5, 7]]))
+    np.testing.assert_array_equal(needed.sum(axis=1), [1, 2, 4, 8])
+    parents = decode_morton(keys[3][needed[3]])
+    np.testing.assert_array_equal(np.unique(parents, axis=0), 1 + np.array([0, 1, 2]) + np.argwhere(np.ones((2, 2, 2))))
+    np.testing.assert_array_equal(decode_morton(keys[0][needed[0]]), [[1, 2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("name", "coarsest", "count"), [("block", 800, 1), ("block", 10, 3), ("thin sheet", 800, 1), ("rod", 10, 4)]
+)
+def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(name: str, coarsest: int, count: int):
+    corners = np.argwhere(np.ones((2, 2, 2)))
+    with hierarchy(COMM, build(COMM, LATTICES[name]), coarsest=coarsest) as case:
+        ijk = decode_morton(case.lattice.table.keys)
+        for level in case.multigrid.levels:
+            ijk = np.unique(((ijk[:, None] + corners) // 2).reshape(-1, 3), axis=0)
+            found = decode_morton(level.grid.table.keys)
+            np.testing.assert_array_equal(np.unique(found, axis=0), ijk)
+            assert len(found) == len(ijk)
+        assert len(case.multigrid.levels) == count
+
+
+def test_a_grid_that_is_not_much_smaller_is_none():
+    """Bodies far from each other: each keeps a node, however coarse the grid."""
+    ijk = 64 * np.argwhere(np.ones((3, 3, 3)))
+    assert [grid.table.total for grid in grids(COMM, ijk, 27, coarsest=1)] == [27]
+    assert len(grids(COMM, ijk, 27, coarsest=800)) == 1  # a coarse level there always is
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_grid_indices_are_those_of_the_keys(name: str):
+    with hierarchy(COMM, build(COMM, LATTICES[name])) as case:
+        np.testing.assert_array_equal(grid_indices(case.unknowns), decode_morton(case.lattice.table.keys))
+
+
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_hierarchies_of_several_ranks_are_those_of_one(on_ranks, ranks: int):
+    """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
+    done = on_ranks(ranks, WORKERS / "multigrid_worker.py", "hierarchy")
+    assert done.returncode == 0 and done.stdout.count("same") == ranks, done.stdout + done.stderr

@@ -1,0 +1,52 @@
+"""Multigrid on as many ranks as mpiexec gives, against that of one: multigrid_worker.py hierarchy | counts."""
+
+import sys
+
+import numpy as np
+from hierarchies import COMM, LATTICES, SHAPES, block, build, figure, hierarchy
+from mpi4py import MPI
+
+WORLD = MPI.COMM_WORLD
+CASES = {  # lattice, shape, contact, more
+    "block": ("twisted", True, {"pins": True, "contrast": 1e6}),
+    "two bodies": ("crushed", False, {}),
+    "thin sheet": ("crushed", True, {"stiffening": 2.0, "pins": True}),
+    "limbs": ("rest", False, {"pins": True}),
+    "rod": ("twisted", False, {"stiffening": 2.0}),
+    "a cell": ("rest", False, {}),
+}
+
+
+def compare_hierarchies() -> None:
+    for name, (shape, contact, more) in CASES.items():
+        found = []
+        for comm in (WORLD, COMM):
+            lattice = build(comm, LATTICES[name], **more)
+            with hierarchy(comm, lattice, SHAPES[shape], contact=contact, coarsest=10) as case:
+                levels = range(len(case.multigrid.levels))
+                keys = [np.concatenate(comm.allgather(level.grid.table.keys)) for level in case.multigrid.levels]
+                matrices = [matrix(i) for i in levels for matrix in (case.interpolation, case.level)]
+                found.append((keys, [*matrices, case.hessian(), case.cycle()]))
+        for one, several in zip(found[1][0], found[0][0], strict=True):
+            np.testing.assert_array_equal(several, one)
+        for one, several in zip(found[1][1], found[0][1], strict=True):
+            *_, cycle = found[1][1]
+            accuracy = 1e-4 if one is cycle else 1e-11
+            np.testing.assert_allclose(several, one, rtol=0, atol=accuracy * np.abs(one).max(), err_msg=name)
+
+
+def compare_counts() -> None:
+    """On three levels, to three digits: within one."""
+    for cells, pins in ((block(20, 4, 4), True), (block(9, 9, 9), False), (block(20, 20, 1), True), (figure(), False)):
+        for step in (1e-3, 1 / 60, 1.0):
+            found = []
+            for comm in (WORLD, COMM):
+                with hierarchy(comm, build(comm, cells, pins=pins), SHAPES["turned"], step, coarsest=60) as case:
+                    assert len(case.multigrid.levels) > 1
+                    found.append([case.iterations(1e-3, rough) for rough in (False, True)])
+            assert np.abs(np.subtract(*found)).max() <= 1, (step, found)
+
+
+if __name__ == "__main__":
+    {"hierarchy": compare_hierarchies, "counts": compare_counts}[sys.argv[1]]()
+    print("same", flush=True)

@@ -30,8 +30,9 @@ def gradient(q: np.ndarray, elastic: tuple = HOOKE) -> np.ndarray:
 
 
 def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False, elastic: tuple = HOOKE) -> np.ndarray:
-    product = np.zeros_like(q)
-    add_elastic_product(elastic[0], elastic_hessian(q, *elastic, projected), v, product)
+    product, blocks = np.zeros_like(q), np.empty((len(elastic[0]), 4))
+    elastic_hessian(q, *elastic, projected, blocks)
+    add_elastic_product(elastic[0], blocks, v, product)
     return product
 
 

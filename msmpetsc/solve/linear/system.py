@@ -66,7 +66,7 @@ def assembly_bytes(
     They are those of A with one column: row of each node; weight, ends and kept of each spring; of each nonzero rows,
     nodes, values, the last two again, COO's two indices, then CSR's index and value.
     """
-    return 8 * nodes + (8 + 4 * 8 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
+    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (5 * 8 + 2 * 4 + 4 + 8) * nonzeros
 
 
 def _check_memory(matrix: PETSc.Mat, unknowns: Unknowns) -> None:

@@ -55,7 +55,8 @@ class Jacobian:
         self.diagonal = diagonal_of(unknowns, time_step)
         self.hessian = TrueHessian(unknowns, elasticity, time_step, self._contact_blocks())
         self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
-        kind = options.value("pc_type")
+        chooses = chooses and options.is_default("pc_type")
+        kind = MULTIGRID if chooses and options.users_of("mg_", "pc_mg_") else options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; of A there is gamg")
         context = self.hessian if true_hessian else ThreeColumns(self.matrix, unknowns, self.blocks)
@@ -63,7 +64,7 @@ class Jacobian:
         owned.callback(self.operator.destroy)
         of_lattice = partial(LatticePreconditioner, comm, unknowns, elasticity, time_step, options.prefix)
         ratio, is_held = self._stiffness_ratio(), unknowns.total < unknowns.lattice.table.total
-        chooses = chooses and options.is_default("pc_type") and (is_held or ratio < MASSLESS)
+        chooses = chooses and (is_held or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio)
         self.pmat = python_matrix(unknowns, Preconditioned(self.preconditioner), comm)
         owned.callback(self.pmat.destroy)

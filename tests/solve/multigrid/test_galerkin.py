@@ -42,7 +42,7 @@ def test_levels_are_galerkin_products(name: str):
     """And positive definite, at whatever positions."""
     lattice, shape, contact, more = CASES[name]
     with hierarchy(COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10) as case:
-        assert len(case.multigrid.levels) > 1
+        assert len(case.multigrid.levels) > 1 or name == "many"  # of one cell each: no grid is coarser
         if "stiffening" in more:
             assert len(case.elasticity.cells.resisting(case.q)) > 10
         check_levels(case)

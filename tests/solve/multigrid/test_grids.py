@@ -16,7 +16,9 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
     slopes, at_origin = np.array([[2.0, -3, 5], [0.5, 7, 1], [-1, 1, 4]]), np.array([11.0, -2, 3])
     with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
         nodes, free = case.lattice.nodes, case.unknowns.free
-        fine = np.rint((nodes - ORIGIN) / CELL).astype(int)[free]
+        fine = np.rint((nodes - ORIGIN) / CELL).astype(int)
+        fine[:, 0] += case.multigrid.bodies.apart(COMM, fine)  # each body has coarse nodes of its own
+        fine = fine[free]
         for level, coarse in enumerate(case.multigrid.levels):
             p = case.interpolation(level)
             assert p.shape == (3 * len(fine), 3 * coarse.grid.table.total)

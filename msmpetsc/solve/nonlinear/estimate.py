@@ -63,8 +63,6 @@ class ErrorEstimate:
         with ESTIMATE:
             self.linearise(iterate.q)
             self.ksp.solve(iterate.f, self.correction)
-            if self.preconditioner.is_uniform:
-                self.residual = self.ksp.buildResidual(self.residual)
             self.length = self._length() if self.ksp.reason > 0 else np.inf
         return self.length
 
@@ -106,7 +104,7 @@ class ErrorEstimate:
         close = UNIFORMLY_CLOSE if self.preconditioner.is_uniform else CLOSE
         if not (min(least, energy) > 0 and residual < close * np.sqrt(self.lowest * least * energy)):
             return False
-        return self.preconditioner.is_uniform or self._left() < LEFT * self.lengths[ksp.its]
+        return self._left() < LEFT * self.lengths[ksp.its]
 
     def _left(self) -> float:
         """Bound on what is missing of |e|_M, where H is no less than ``lowest`` M: |r_k|_(M^-1) over that."""

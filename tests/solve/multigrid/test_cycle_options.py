@@ -41,9 +41,7 @@ def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
         done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split())
         assert done.returncode == 0, options + done.stderr
         assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV")), options
-        shown = {"-ksp_view": "MULTIPLICATIVE, levels=2", "-pc_mg_log -log_view": "MGSmooth Level 1"}.get(
-            options, ""
-        )
+        shown = {"-ksp_view": "MULTIPLICATIVE, levels=2", "-pc_mg_log -log_view": "MGSmooth Level 1"}.get(options, "")
         assert shown in done.stdout, options
 
 

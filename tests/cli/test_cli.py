@@ -138,7 +138,7 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     [
         ("anderson", "", ""),
         ("newton", "", ""),
-        ("newton-multigrid", "-ksp_view", "type: gamg"),
+        ("newton-multigrid", "-ksp_view", "type: mg"),
         ("fast-msm", "", ""),
         ("fast-msm-kronecker", "", ""),
         ("paper", "", ""),

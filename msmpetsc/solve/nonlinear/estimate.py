@@ -101,7 +101,7 @@ class ErrorEstimate:
         """Whether e is near in the norm of H, as far as CG can show."""
         least = ksp.computeExtremeSingularValues()[1]
         energy = ksp.getSolution().dot(self.right_side)
-        close = UNIFORMLY_CLOSE if self.preconditioner.is_uniform else CLOSE
+        close = UNIFORMLY_CLOSE if self.preconditioner.is_uniform and self.lowest == 1.0 else CLOSE
         if not (min(least, energy) > 0 and residual < close * np.sqrt(self.lowest * least * energy)):
             return False
         return self._left() < LEFT * self.lengths[ksp.its]

@@ -21,7 +21,7 @@ FEW = 3  # iterations more than that: of a count so low nothing can be said
 class LatticePreconditioner:
     """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
 
-    translations : of bodies that nothing holds, kept exactly; None where all are held
+    translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     q        : positions (l, 3) [m] of that; None before the first
     contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
     first    : iterations a digit, and in all, of the first solve with it; None before that
@@ -37,7 +37,7 @@ class LatticePreconditioner:
         self.q: np.ndarray | None = None
         self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
         self.first: tuple[float, int] | None = None
-        self.is_stale, self.built = True, 0
+        self.is_stale, self.built, self.is_free = True, 0, False
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -47,14 +47,15 @@ class LatticePreconditioner:
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
         due = self.is_stale
+        self.is_free = self._is_free(q, contact)
         if due:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
-    def balance(self, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies that nothing holds as wholes, from x where F is f, to where their forces balance: linear solves
-        leave them there."""
-        if self.translations:
+    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
+        their forces balance: linear solves leave them there."""
+        if self.translations and self._is_free(q, contact):
             columns = self.unknowns.columns_to_write(x)
             columns -= self.translations.of(self.unknowns.columns(f))
 
@@ -74,6 +75,13 @@ class LatticePreconditioner:
         self.q, self.contact, self.first, self.is_stale = q, contact, None, False
         self.built += 1
 
+    def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
+        if self.translations is None or contact is None:
+            return self.translations is not None
+        pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
+        return not self.comm.allreduce(pressed, MPI.LOR)
+
     def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
         """The Hessian of contact (owned, 9) at q; (0, 9) where there is none."""
         lattice = self.unknowns.lattice
@@ -90,7 +98,7 @@ class LatticePreconditioner:
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         with CYCLE:
-            if self.translations:
+            if self.translations and self.is_free:
                 self.translations.around(self.multigrid.pc, x, y)
             else:
                 self.multigrid.pc.apply(x, y)

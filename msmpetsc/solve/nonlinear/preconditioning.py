@@ -88,10 +88,11 @@ class StepPreconditioner:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes, from x where F is f, to where their forces balance, where linear solves would not."""
+    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
+        where linear solves would not."""
         if self.multigrid:
-            self.multigrid.balance(f, x)
+            self.multigrid.balance(q, contact, f, x)
 
     @property
     def has_to_balance(self) -> bool:

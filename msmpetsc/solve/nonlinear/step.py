@@ -174,7 +174,8 @@ class Stepper:
             self.base[:] = problem.fixed
             self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
             if start is None and self.jacobian.preconditioner.has_to_balance:
-                self.jacobian.preconditioner.balance(self._evaluate(self.x).f, self.x)
+                iterate = self._evaluate(self.x)
+                self.jacobian.preconditioner.balance(iterate.q, problem.contact, iterate.f, self.x)
             iterations, is_done = 0, False
             while not is_done:
                 for _ in self._solves():

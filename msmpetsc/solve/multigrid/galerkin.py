@@ -107,7 +107,7 @@ class GalerkinSum:
         keys, self.springs, self.nodes, self.cells = _by_cell(unknowns, elasticity, ijk, apart)
         self.law = tuple(like(lattice.nodes, a) for a in (lattice.springs, lattice.rest_length, lattice.stiffness))
         self.of_springs, self.of_nodes = (tuple(like(lattice.nodes, a) for a in t) for t in (OF_SPRINGS, OF_NODES))
-        self.weights = like(lattice.nodes, WEIGHTS)
+        self.weights, self.full = (like(lattice.nodes, a) for a in (WEIGHTS, SYMMETRIC))
         first, second, places = self._pairs(grid, keys)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         diagonal = np.flatnonzero((first == second) & (first >= 0))
@@ -150,7 +150,7 @@ class GalerkinSum:
         law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.lattice.mass
         add_springs(count, q, *self.springs.arrays, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes.arrays, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
-        values = symmetric[:, SYMMETRIC]
+        values = symmetric[:, self.full]
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells.arrays, *law, self.t2, self.weights, self.places, values)

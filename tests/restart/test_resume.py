@@ -130,11 +130,12 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
 
     followed = {"lowest_mode"}  # whether a step is at a minimum is asked of every implicit one
     guesses = followed | {"correction", "correction_before"}
-    assert rows(swing(solver=LOOSE)) == guesses
+    hierarchy = {"hierarchy_q"}  # which newton may come to build
+    assert rows(swing(solver=LOOSE)) == guesses | hierarchy
     assert rows(swing(solver={"preset": "fast-msm"})) == followed
     assert rows(by("verlet", swing())) == {"mode"}
-    history = {"history_q", "history_v"}
-    assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == guesses | history | {"contact_bound"}
+    history, touching = {"history_q", "history_v"}, {"contact_bound", "hierarchy_contact"}
+    assert rows(by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))) == guesses | history | hierarchy | touching
     assert rows(by("verlet", fall(obstacle=[THIN]))) == {"mode", "sides"}
 
 

@@ -21,6 +21,7 @@ FEW = 3  # iterations more than that: of a count so low nothing can be said
 class LatticePreconditioner:
     """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
 
+    touches  : steps may have a ``contact``
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     q        : positions (l, 3) [m] of that; None before the first
     contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
@@ -28,8 +29,16 @@ class LatticePreconditioner:
     is_stale : a new one is due
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
-        self.comm, self.unknowns = comm, unknowns
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        unknowns: Unknowns,
+        elasticity: Elasticity,
+        time_step: float,
+        prefix: str,
+        touches: bool,
+    ):
+        self.comm, self.unknowns, self.touches = comm, unknowns, touches
         with GRIDS:
             self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
         bodies = self.multigrid.bodies
@@ -108,20 +117,18 @@ class LatticePreconditioner:
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store where the hierarchy was built."""
-        lattice = self.unknowns.lattice
-        q = lattice.nodes if self.q is None else self.q
-        contact = np.zeros((lattice.owned, 9), like=lattice.nodes)
+        contact = np.zeros((self.unknowns.lattice.owned, 9), like=self.contact)
         contact[: len(self.contact)] = self.contact
-        pace, its = self.first or (0.0, 0)
-        numbers = {"hierarchy_pace": pace, "hierarchy_its": its, "hierarchy_serves": not self.is_stale}
-        checkpoint.keep({"hierarchy_q": q[: lattice.owned], "hierarchy_contact": contact}, numbers)
+        q = self.unknowns.lattice.nodes if self.q is None else self.q
+        store(checkpoint, self.unknowns, q, contact if self.touches else None, self.first, not self.is_stale)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint; from an empty one as if no step had been taken."""
         self.is_stale, lattice = True, self.unknowns.lattice
         if not checkpoint.count("hierarchy_serves", 1):
             return
-        contact = like(lattice.nodes, checkpoint.row("hierarchy_contact"))
+        stored = checkpoint.rows.get("hierarchy_contact", np.zeros((lattice.owned, 9)))
+        contact = like(lattice.nodes, stored)
         touched = self.comm.allreduce(bool(contact.any()), MPI.LOR)
         self._build(with_ghosts(self.comm, lattice, checkpoint.row("hierarchy_q")), contact if touched else contact[:0])
         its = checkpoint.count("hierarchy_its")
@@ -129,3 +136,25 @@ class LatticePreconditioner:
 
     def destroy(self) -> None:
         self.multigrid.destroy()
+
+
+def store(
+    checkpoint: Checkpoint,
+    unknowns: Unknowns,
+    q: np.ndarray,
+    contact: np.ndarray | None,
+    first: tuple[float, int] | None,
+    serves: bool,
+) -> None:
+    """Store where a hierarchy was built, and whether it serves; a solver that may yet make one stores that it does not,
+    for all checkpoints of a run are of the same parts."""
+    pace, its = first or (0.0, 0)
+    rows = {"hierarchy_q": q[: unknowns.lattice.owned]} | ({} if contact is None else {"hierarchy_contact": contact})
+    checkpoint.keep(rows, {"hierarchy_pace": pace, "hierarchy_its": its, "hierarchy_serves": serves})
+
+
+def store_none(checkpoint: Checkpoint, unknowns: Unknowns, touches: bool) -> None:
+    """Store that no hierarchy was built yet."""
+    nodes = unknowns.lattice.nodes
+    contact = np.zeros((unknowns.lattice.owned, 9), like=nodes) if touches else None
+    store(checkpoint, unknowns, nodes, contact, None, False)

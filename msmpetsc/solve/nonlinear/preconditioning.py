@@ -41,6 +41,7 @@ class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
+    reserve : stores that there is no hierarchy yet
     kind    : -pc_type; multigrid is taken where that is mg
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
     """
@@ -49,11 +50,12 @@ class StepPreconditioner:
         self,
         make_of_matrix: Callable[[], Preconditioner],
         make_multigrid: Callable[[], LatticePreconditioner],
+        reserve: Callable[[Checkpoint], None],
         kind: str,
         chooses: bool,
         ratio: float,
     ):
-        self.make_multigrid, self.chooses = make_multigrid, chooses
+        self.make_multigrid, self.reserve, self.chooses = make_multigrid, reserve, chooses
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
         expected = expected_iterations(ratio)
@@ -121,7 +123,12 @@ class StepPreconditioner:
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on."""
         checkpoint.keep(numbers={"multigrid": self.multigrid is not None})
-        self.in_use.save(checkpoint)
+        if self.multigrid:
+            self.multigrid.save(checkpoint)
+        elif self.chooses:
+            self.reserve(checkpoint)
+        if self.of_matrix:
+            self.of_matrix.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint; from an empty one as if no step had been taken."""
@@ -131,7 +138,9 @@ class StepPreconditioner:
         elif self.multigrid and self.of_matrix and not chosen:  # which it was changed for since
             self.multigrid.destroy()
             self.multigrid = None
-        self.in_use.restore(checkpoint)
+        for part in (self.of_matrix, self.multigrid):
+            if part:
+                part.restore(checkpoint)
 
     def destroy(self, _: PETSc.PC) -> None:
         for owned in (self.of_matrix, self.multigrid):

@@ -32,7 +32,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = {"held", "touching"}  # each takes some ten seconds
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_frames_are_those_by_jacobi(msmpetsc, tmp_path: Path, case: str):
     """On one rank and on two, with several coarse levels. Errors of N steps add up to N (N + 1) / 2 of the greatest."""
     base = {"sides": np.array([8, 3, 3]) * CELL, "material": SOFT, "time": TIME}

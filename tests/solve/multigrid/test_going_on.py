@@ -109,7 +109,7 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
                 assert_equal(vars(frame), vars(frames[index]))
 
 
-@pytest.mark.parametrize("ranks", [1, 3])
+@pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["pressed", "chosen, led and let go"])
 def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, name: str, ranks: int):
     """By the command line, on several coarse levels."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest, like, to_host
@@ -162,7 +163,7 @@ class LowestCurvature:
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
-            residuals /= np.maximum(np.abs(residuals).max(axis=1, initial=TINY), TINY)[:, None]  # for single precision
+            residuals /= self._greatest(residuals)  # which single precision can hold
             w = self._unit(self._without_rigid(self._preconditioned(residuals)))
             blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
@@ -238,6 +239,13 @@ class LowestCurvature:
     def _unit(self, directions: np.ndarray) -> np.ndarray:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
+
+    def _greatest(self, directions: np.ndarray) -> np.ndarray:
+        """Greatest number (k, 1) of each of some directions (k, n)."""
+        own = np.array([greatest(np.abs(direction)) for direction in directions])
+        most = np.empty_like(own)
+        self.comm.Allreduce(own, most, MPI.MAX)
+        return like(directions, np.maximum(most, TINY)[:, None])
 
     def _lengths(self, directions: np.ndarray) -> np.ndarray:
         return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))

@@ -29,7 +29,7 @@ def counts(name: str, fineness: int, shape: str) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("shape", ["rest", "turned"])
+@pytest.mark.parametrize("shape", ["rest", pytest.param("turned", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMED)
 def test_few_iterations_at_any_step_and_fineness(name: str, shape: str):
     found = [counts(name, fineness, shape) for fineness in NAMED[name][2]]

@@ -21,7 +21,7 @@ def check(case: Case, least: float, beyond: float = BEYOND) -> None:
     assert least < values.min() and values.max() < 1 + beyond, values[[0, -1]]
 
 
-@pytest.mark.parametrize("coarsest", [800, 10])
+@pytest.mark.parametrize("coarsest", [pytest.param(800, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles(name: str, shape: str, coarsest: int):
@@ -30,7 +30,7 @@ def test_cycles(name: str, shape: str, coarsest: int):
         check(case, {"many bodies": 0.07, "two bodies in one coarse cell": 0.18}.get(name, 0.3))
 
 
-@pytest.mark.parametrize("coarsest", [800, 10])
+@pytest.mark.parametrize("coarsest", [pytest.param(800, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
 def test_cycles_with_contact_resistance_and_pins(name: str, coarsest: int):
     """Of cells pressed to a fifth the cycle has less: their curvature is along few directions that it cannot smooth."""
@@ -39,7 +39,7 @@ def test_cycles_with_contact_resistance_and_pins(name: str, coarsest: int):
         check(case, 0.002)
 
 
-@pytest.mark.parametrize("mass", [1e-9, 1e9])
+@pytest.mark.parametrize("mass", [1e-9, pytest.param(1e9, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("shape", ["twisted", "crushed"])
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):

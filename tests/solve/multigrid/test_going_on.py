@@ -77,7 +77,12 @@ def assert_equal(found: dict, expected: dict) -> None:
         assert np.array_equal(found[name], expected[name], equal_nan=True) if expected[name] is not None else True, name
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = {"pressed", "stiffening, pressed", "switched, pressed", "fallback"}  # each takes some five seconds
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, case: str, monkeypatch):
     """Of runs that build hierarchies in some steps and keep them in others, or change over in the midst of a step."""
     built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose

@@ -67,7 +67,7 @@ def test_grid_indices_are_those_of_the_keys(name: str):
         np.testing.assert_array_equal(grid_indices(case.unknowns), decode_morton(case.lattice.table.keys))
 
 
-@pytest.mark.parametrize("ranks", [2, 3])
+@pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_hierarchies_of_several_ranks_are_those_of_one(on_ranks, ranks: int):
     """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
     done = on_ranks(ranks, WORKERS / "multigrid_worker.py", "hierarchy")

@@ -23,7 +23,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import bodies_of
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
-from msmpetsc.solve.multigrid.grids import Grid, grid_indices, grids, interpolation
+from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
@@ -37,7 +37,7 @@ ITERATIONS = 10  # of these
 class Level:
     """A coarse level: its grid, P from it to the next finer one, and its matrix (AIJ, block size 3)."""
 
-    grid: Grid
+    grid: CoarseGrid
     interpolation: PETSc.Mat
     matrix: PETSc.Mat
 

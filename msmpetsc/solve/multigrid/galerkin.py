@@ -21,7 +21,7 @@ from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges,
 from msmpetsc.model.lattice import CORNERS
 from msmpetsc.model.springs import spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.grids import Grid
+from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
 
@@ -98,7 +98,7 @@ class GalerkinSum:
         unknowns: Unknowns,
         elasticity: Elasticity,
         t2: float,
-        grid: Grid,
+        grid: CoarseGrid,
         ijk: np.ndarray,
         apart: np.ndarray,
     ):
@@ -115,7 +115,7 @@ class GalerkinSum:
         self.diagonal, self.upper = (like(lattice.nodes, a) for a in (diagonal, upper))
         self.matrix = self._create_matrix(comm, grid, first, second, upper)
 
-    def _pairs(self, grid: Grid, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _pairs(self, grid: CoarseGrid, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Global numbers (b,), (b,) of the pairs of nodes that have a block; which a cell adds to, (c, 36), -1 none."""
         number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
@@ -128,7 +128,7 @@ class GalerkinSum:
         return pairs // grid.table.total, pairs % grid.table.total, places
 
     def _create_matrix(
-        self, comm: MPI.Comm, grid: Grid, first: np.ndarray, second: np.ndarray, upper: np.ndarray
+        self, comm: MPI.Comm, grid: CoarseGrid, first: np.ndarray, second: np.ndarray, upper: np.ndarray
     ) -> PETSc.Mat:
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)

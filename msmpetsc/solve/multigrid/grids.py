@@ -22,7 +22,7 @@ SHRINK = 0.7  # a grid with more nodes than this share of the finer one's is no 
 
 
 @dataclass(frozen=True)
-class Grid:
+class CoarseGrid:
     """Nodes of one level; ``table`` has their Morton keys, in whose order they are numbered over all ranks."""
 
     table: SortedKeys
@@ -49,24 +49,24 @@ def parents_of(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
 
 
-def coarse_grid(comm: MPI.Comm, ijk: np.ndarray) -> Grid:
+def coarse_grid(comm: MPI.Comm, ijk: np.ndarray) -> CoarseGrid:
     """Return the nodes that the unknown ones at grid indices (n, 3) are interpolated from (collective).
 
     Raises InputError for more of them than PETSc can number.
     """
     keys, needed = parents_of(ijk)
-    grid = Grid(SortedKeys(comm, keys[needed]))
+    grid = CoarseGrid(SortedKeys(comm, keys[needed]))
     refuse_unknowns(grid.table.total)
     return grid
 
 
-def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int | None = None) -> list[Grid]:
+def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
     """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
 
     There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a coarser one would
     not be much smaller.
     """
-    levels: list[Grid] = []
+    levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
         grid = coarse_grid(comm, ijk)
         if levels and grid.table.total > SHRINK * total:
@@ -77,7 +77,7 @@ def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int
 
 
 def interpolation(
-    comm: MPI.Comm, ijk: np.ndarray, rows: np.ndarray, row_sizes: tuple[int, int], grid: Grid, mat_type: str
+    comm: MPI.Comm, ijk: np.ndarray, rows: np.ndarray, row_sizes: tuple[int, int], grid: CoarseGrid, mat_type: str
 ) -> PETSc.Mat:
     """Return P (AIJ), from the values at a grid to those at finer nodes (collective).
 

@@ -348,7 +348,7 @@ class CellScatter:
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add the gradient [N] to ``gradient`` (l, 3)."""
-        add_resistance_gradient(q, self.cells, self.resistance, self.volume, gradient)
+        add_resistance_gradient(q, *self.law, gradient)
 
     def resisting(self, q: np.ndarray) -> np.ndarray:
         """Return which cells (r,) resist at q: few, so that products with the Hessian need not visit the others."""
@@ -423,7 +423,7 @@ class CellGather:
 
     @property
     def _all(self) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray]:
-        return self.cells, self.resistance, self.volume, self.around, self.corner
+        return *self.law, self.around, self.corner
 
 
 @kernel

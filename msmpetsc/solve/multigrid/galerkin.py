@@ -157,9 +157,6 @@ class GalerkinSum:
         values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
-    def destroy(self) -> None:
-        self.matrix.destroy()
-
 
 def set_block_size(matrix: PETSc.Mat) -> None:
     """Give a matrix of three rows a node this block size, its diagonal part, which pbjacobi inverts, too: PETSc makes

@@ -46,7 +46,7 @@ class LatticePreconditioner:
         self.q: np.ndarray | None = None
         self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
         self.first: tuple[float, int] | None = None
-        self.is_stale, self.built, self.is_free = True, 0, False
+        self.is_stale, self.is_free = True, False
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -82,7 +82,6 @@ class LatticePreconditioner:
         with HIERARCHY:
             self.multigrid.update(q, contact)
         self.q, self.contact, self.first, self.is_stale = q, contact, None, False
-        self.built += 1
 
     def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""

@@ -7,6 +7,8 @@ low faces, so a face of the body that lies in a grid plane marks one layer of ce
 import numba
 import numpy as np
 
+from msmpetsc.geometry.clipping import clip_to_layer, extent, grown
+
 SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolated one, below anything that matters
 
 
@@ -29,55 +31,9 @@ def sampled_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 
 @numba.njit(cache=True)
-def _grown(rows, used):
-    if used < len(rows):
-        return rows
-    larger = np.empty((2 * len(rows), 3), np.int64)
-    larger[:used] = rows
-    return larger
-
-
-@numba.njit(cache=True)
-def _clip(polygon, n, axis, plane, side, out):
-    """Sutherland-Hodgman: the part of the polygon with side * (x[axis] - plane) >= 0. Returns its size."""
-    m = 0
-    for a in range(n):
-        p, q = polygon[a], polygon[(a + 1) % n]
-        dp, dq = side * (p[axis] - plane), side * (q[axis] - plane)
-        if dp >= 0:
-            out[m] = p
-            m += 1
-        if (dp > 0 and dq < 0) or (dp < 0 and dq > 0):
-            s = dp / (dp - dq)
-            for c in range(3):
-                # p + s (q - p) and not a weighted sum: equal coordinates stay exactly equal
-                out[m, c] = p[c] + s * (q[c] - p[c])
-            out[m, axis] = plane
-            m += 1
-    return m
-
-
-@numba.njit(cache=True)
-def _slab(polygon, n, axis, index, slack, work, out):
-    """Cut the polygon to between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
-    m = _clip(polygon, n, axis, index - slack, 1.0, work)
-    return _clip(work, m, axis, index + 1 + slack, -1.0, out)
-
-
-@numba.njit(cache=True)
-def _extent(polygon, n, axis):
-    """Return the smallest and largest coordinate along an axis."""
-    smallest, largest = polygon[0, axis], polygon[0, axis]
-    for a in range(1, n):
-        smallest = min(smallest, polygon[a, axis])
-        largest = max(largest, polygon[a, axis])
-    return smallest, largest
-
-
-@numba.njit(cache=True)
 def _slack(triangle, axis):
     """Return more than the rounding of a coordinate interpolated between corners of the triangle."""
-    smallest, largest = _extent(triangle, 3, axis)
+    smallest, largest = extent(triangle, 3, axis)
     return SLACK * (1.0 + max(abs(smallest), abs(largest)))
 
 
@@ -88,8 +44,8 @@ def _index_range(triangle, part, n, axis, low, high, slack):
     Slack widens the part, whose points may be interpolated, but never past the triangle's own
     corners: those are exact, so a triangle that ends in a grid plane does not mark the layer behind.
     """
-    smallest, largest = _extent(part, n, axis)
-    first, last = _extent(triangle, 3, axis)
+    smallest, largest = extent(part, n, axis)
+    first, last = extent(triangle, 3, axis)
     smallest, largest = max(smallest - slack, first), min(largest + slack, last)
     return max(int(np.floor(smallest)), low), min(int(np.floor(largest)), high - 1)
 
@@ -115,7 +71,7 @@ def _touched(corners, low, high):
     work, across, along = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
     for triangle in corners:
         if _within_a_cell(triangle):
-            cells = _grown(cells, used)
+            cells = grown(cells, used)
             for c in range(3):
                 cells[used, c] = int(np.floor(triangle[0, c]))
             used += _within(cells[used], low, high)
@@ -123,15 +79,15 @@ def _touched(corners, low, high):
         slack_j, slack_k = _slack(triangle, 1), _slack(triangle, 2)
         i0, i1 = _index_range(triangle, triangle, 3, 0, low[0], high[0], 0.0)
         for i in range(i0, i1 + 1):
-            n = _slab(triangle, 3, 0, i, 0.0, work, across)  # never empty: corners are exact, so is i's range
+            n = clip_to_layer(triangle, 3, 0, i, 0.0, work, across)  # never empty: corners are exact, so is i's range
             j0, j1 = _index_range(triangle, across, n, 1, low[1], high[1], slack_j)
             for j in range(j0, j1 + 1):
-                m = _slab(across, n, 1, j, slack_j, work, along)
+                m = clip_to_layer(across, n, 1, j, slack_j, work, along)
                 if m == 0:
                     continue
                 k0, k1 = _index_range(triangle, along, m, 2, low[2], high[2], slack_k)
                 for k in range(k0, k1 + 1):
-                    cells = _grown(cells, used)
+                    cells = grown(cells, used)
                     cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
                     used += 1
     return cells[:used]
@@ -150,7 +106,7 @@ def _sampled(corners, low, high):
                 point = v3 + (i / n) * (v1 - v3) + (j / n) * (v2 - v3)
                 if i == n or j == n:
                     point = v1 if i == n else v2  # not rounded: a corner's own cell must be marked
-                cells = _grown(cells, used)
+                cells = grown(cells, used)
                 inside = True
                 for c in range(3):
                     cells[used, c] = int(np.floor(point[c]))

@@ -1,0 +1,51 @@
+"""Clipping of polygons to the layers of a grid, in cell units: what boundary cells and their shares need."""
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def grown(rows, used):
+    """Return the rows (r, n), of which so many are used, in an array that has room for one more."""
+    if used < len(rows):
+        return rows
+    larger = np.empty((2 * len(rows), rows.shape[1]), rows.dtype)
+    larger[:used] = rows
+    return larger
+
+
+@numba.njit(cache=True)
+def _clip(polygon, n, axis, plane, side, out):
+    """Sutherland-Hodgman: the part of the polygon with side * (x[axis] - plane) >= 0. Returns its size."""
+    m = 0
+    for a in range(n):
+        p, q = polygon[a], polygon[(a + 1) % n]
+        dp, dq = side * (p[axis] - plane), side * (q[axis] - plane)
+        if dp >= 0:
+            out[m] = p
+            m += 1
+        if (dp > 0 and dq < 0) or (dp < 0 and dq > 0):
+            s = dp / (dp - dq)
+            for c in range(3):
+                # p + s (q - p) and not a weighted sum: equal coordinates stay exactly equal
+                out[m, c] = p[c] + s * (q[c] - p[c])
+            out[m, axis] = plane
+            m += 1
+    return m
+
+
+@numba.njit(cache=True)
+def clip_to_layer(polygon, n, axis, index, slack, work, out):
+    """Cut the polygon to between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
+    m = _clip(polygon, n, axis, index - slack, 1.0, work)
+    return _clip(work, m, axis, index + 1 + slack, -1.0, out)
+
+
+@numba.njit(cache=True)
+def extent(polygon, n, axis):
+    """Return the smallest and largest coordinate along an axis."""
+    smallest, largest = polygon[0, axis], polygon[0, axis]
+    for a in range(1, n):
+        smallest = min(smallest, polygon[a, axis])
+        largest = max(largest, polygon[a, axis])
+    return smallest, largest

@@ -143,6 +143,11 @@ class SortedKeys:
         index = route.answer(self._index(route.send(wanted)))
         return index[inverse].reshape(np.shape(keys))
 
+    def rows_of(self, keys: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the row of each key (k,), all of which there are; ``rows`` go with this rank's keys (collective)."""
+        route = Route(self.comm, self.owner(keys))
+        return route.answer(rows[self._index(route.send(keys)) - self.first])
+
     def _index(self, keys: np.ndarray) -> np.ndarray:
         if len(self.keys) == 0:
             return np.full(len(keys), -1, np.int64)

@@ -244,6 +244,7 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     file.write("lattice/nodes", lattice.nodes[:owned])
     file.write("lattice/cells", lattice.cells)
     file.write("lattice/cell_kind", lattice.cell_kind)
+    file.write("lattice/cell_share", lattice.cell_share)
     file.write("lattice/springs", numbers[lattice.springs[springs]])
     file.write("lattice/rest_length", lattice.rest_length[springs])
     file.write("lattice/stiffness", lattice.stiffness[springs])
@@ -306,9 +307,9 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
     lattice, body = model.lattice, model.body
     assert body is not None  # as in every model that build_model makes
     held = int(lattice.pinned[: lattice.owned].sum())
-    own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum())
-    cells, springs, pinned, mass = (comm.allreduce(number) for number in own)
-    volume, enclosed = cells * lattice.cell_size**3, abs(body.report.volume)
+    own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum()), float(lattice.cell_share.sum())
+    cells, springs, pinned, mass, share = (comm.allreduce(number) for number in own)
+    volume, enclosed = share * lattice.cell_size**3, abs(body.report.volume)
     mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
     if body.report.closed:
         mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"

@@ -14,13 +14,14 @@ from mpi4py import MPI
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.grid import LIMIT, Grid, decode_morton, encode_morton
+from msmpetsc.geometry.grid import CHUNK, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
+from msmpetsc.geometry.share import LEAK, OUTSIDE, Columns, sampled_shares
 from msmpetsc.geometry.surface import Surface, SurfaceReport
 
 BOUNDARY, INTERIOR = 1, 2
-CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
-PACK = np.array([LIMIT**2, LIMIT, 1])  # one key a cell that sorts as (i, j, k) does
+LEAST_SHARE = 1e-3  # of a corner that the inside is far from
+WHOLE = 1 - 1e-9  # a share above this is rounding away from 1
 LEAST_OF_A_CELL = 1000  # [byte] of the lattice: a run takes four times that
 TOLERANCE = 0.01  # of a wanted number of cells
 SEARCH_LIMIT = 30  # sizes tried; a real model needs three to six
@@ -46,56 +47,110 @@ class Cages:
 
     table : keys of the cells (geometry.grid)
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
+    share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.share) [-]; None where all are whole
     """
 
     grid: Grid
     table: SortedKeys
     kind: np.ndarray
+    share: np.ndarray | None = None
 
     @property
     def ijk(self) -> np.ndarray:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
+    def share_of(self, ijk: np.ndarray) -> np.ndarray | None:
+        """Return the shares (c, 2, 2, 2) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
+        return None if self.share is None else self.table.rows_of(encode_morton(ijk), self.share)
 
-def fill(body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000) -> Cages:
+
+@dataclass(frozen=True)
+class SlabCells:
+    """What a rank finds in its slab of the grid, axes cycled, the longest first.
+
+    boundary : (b, 3) cells that the surface touches
+    gaps     : (g, 4) interior cells (geometry.interior)
+    columns  : what the triangles cut out of cells; None where that was not asked for or the surface does not tell
+    """
+
+    boundary: np.ndarray
+    gaps: np.ndarray
+    columns: Columns | None
+
+    def count(self, comm: MPI.Comm) -> int:
+        """Return the number of valid cells on all ranks (collective)."""
+        return comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum()))
+
+
+def fill(
+    body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+) -> Cages:
     """Return the valid cells of side ``cell_size`` [m] (collective).
 
-    method : "exact", or "sample" for the paper's sample points
-    raises : InputError if there would be more than ``max_cells``
+    method   : "exact", or "sample" for the paper's sample points
+    boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
+    raises   : InputError if there would be more than ``max_cells``
     """
     grid = Grid.covering(body.bounds, cell_size)
-    boundary, gaps = slab_cells(body, grid, method, max_cells)
-    refuse_beyond_memory(body.comm, count_cells(body.comm, boundary, gaps))
-    interior = cells_of_gaps(gaps)
-    ijk = np.concatenate([boundary, interior])[:, np.argsort(_axes(body))]
-    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(boundary), len(interior)])
+    cells = slab_cells(body, grid, method, max_cells, boundary)
+    refuse_beyond_memory(body.comm, cells.count(body.comm))
+    interior = cells_of_gaps(cells.gaps)
+    ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
+    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
+    share = _share(body, grid, cells) if boundary == "fill" else None
     keys = encode_morton(ijk)
     table = SortedKeys(body.comm, keys)
     route = Route(body.comm, table.owner(keys))
     order = np.argsort(route.send(keys))
-    return Cages(grid, table, route.send(kind)[order])
+    if share is not None:
+        share = route.send(np.concatenate([share, np.ones((len(interior), 2, 2, 2))]))[order]
+    return Cages(grid, table, route.send(kind)[order], share)
 
 
-def count_cells(comm: MPI.Comm, boundary: np.ndarray, gaps: np.ndarray) -> int:
-    """Return the number of valid cells on all ranks (collective)."""
-    return comm.allreduce(len(boundary) + int((gaps[:, 3] - gaps[:, 2] + 1).sum()))
+def _share(body: Body, grid: Grid, cells: SlabCells) -> np.ndarray | None:
+    """Return the shares (b, 2, 2, 2) of boundary cells; None, with a warning, if the surface does not tell."""
+    axes = np.argsort(_axes(body))
+    if cells.columns is not None:
+        share = cells.columns.corner_shares(cells.boundary).transpose(0, *(1 + axes))
+    elif body.report.closed:
+        log.warning('triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]')
+        return None
+    else:
+        share = sampled_shares(body.comm.bcast(body.surface), grid, cells.boundary[:, axes])
+    return np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
 
 
-def slab_cells(body: Body, grid: Grid, method: str, max_cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return boundary cells (b, 3) and interior gaps (g, 4) of this rank's slab, axes cycled, the longest first."""
+def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: str) -> SlabCells:
+    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     _refuse_above(max_cells, _least_cells(body, grid), grid)
     refuse_beyond_memory(body.comm, _least_cells(body, grid))
     corners = _slab_triangles(body, grid, axes)
-    boundary = _mark(corners, grid.shape[axes], slab, method)
+    touched = _mark(corners, grid.shape[axes], slab, method)
     if body.report.closed:
-        gaps = enclosed_gaps(body.comm, boundary, slab)
+        gaps = enclosed_gaps(body.comm, touched, slab)
     else:
-        gaps = _gaps_by_winding(body, grid, axes, slab, boundary)
-    _refuse_above(max_cells, count_cells(body.comm, boundary, gaps), grid)
-    return boundary, gaps
+        gaps = _gaps_by_winding(body, grid, axes, slab, touched)
+    columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" and body.report.closed else None
+    if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
+        gaps = gaps[columns.corner_shares(gaps[:, [0, 1, 3]])[:, 0, 0, 0] > OUTSIDE]
+    cells = SlabCells(touched, gaps, columns)
+    _refuse_above(max_cells, cells.count(body.comm), grid)
+    return cells
+
+
+def _columns(body: Body, corners: np.ndarray, shape: np.ndarray, slab: Slab) -> Columns | None:
+    """Return what the triangles cut out of this rank's cells, None if they are not wound one way (collective)."""
+    outwards = corners if body.report.volume > 0 else corners[:, ::-1]
+    columns = Columns.crossed(outwards, *_limits(shape, slab))
+    return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
+
+
+def _limits(shape: np.ndarray, slab: Slab) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first cell of a slab, and the one after its last, along each axis."""
+    return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
 
 
 def _least_cells(body: Body, grid: Grid) -> float:
@@ -144,13 +199,11 @@ def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np
     The paper's samples of a triangle may lie in another slab than its rank's, but then the
     triangle was sent there too.
     """
-    low, high = np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
     keys = [np.empty(0, np.int64)]
     for start in range(0, len(corners), CHUNK):
-        cells = MARK[method](corners[start : start + CHUNK], low, high)
-        keys.append(np.unique(cells @ PACK))
-    packed = np.unique(np.concatenate(keys))
-    return np.stack([packed // PACK[0], packed // PACK[1] % LIMIT, packed % LIMIT], axis=1)
+        cells = MARK[method](corners[start : start + CHUNK], *_limits(shape, slab))
+        keys.append(np.unique(packed(cells)))
+    return unpacked(np.unique(np.concatenate(keys)))
 
 
 def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
@@ -163,12 +216,12 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
 
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
-    marked = boundary @ PACK
+    marked = packed(boundary)
     first, last = slab.first * shape[1] * shape[2], slab.last * shape[1] * shape[2]
     gaps = [np.empty((0, 4), np.int64)]
     for start in range(first, last, CHUNK):
         cells = np.stack(np.unravel_index(np.arange(start, min(start + CHUNK, last)), shape), axis=1)
-        cells = cells[~np.isin(cells @ PACK, marked)]
+        cells = cells[~np.isin(packed(cells), marked)]
         centres = np.empty(cells.shape)
         centres[:, axes] = cells + 0.5
         winding = igl.fast_winding_number(surface.points, surface.triangles, grid.node_positions(centres))
@@ -177,7 +230,9 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
     return np.concatenate(gaps)
 
 
-def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000) -> float:
+def choose_cell_size(
+    body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+) -> float:
     """Return the cell size [m] that gives ``count`` cells within 1%, or the nearest with a warning (collective).
 
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
@@ -191,14 +246,14 @@ def choose_cell_size(body: Body, count: int, method: str = "exact", max_cells: i
     excess = {}  # log(size) -> log(cells / count)
     guess = np.log(_first_guess(body, count))
     for _ in range(SEARCH_LIMIT):
-        boundary, gaps = slab_cells(body, Grid.covering(body.bounds, np.exp(guess)), method, 20 * max_cells)
-        excess[guess] = np.log(count_cells(body.comm, boundary, gaps) / count)
+        cells = slab_cells(body, Grid.covering(body.bounds, np.exp(guess)), method, 20 * max_cells, boundary)
+        excess[guess] = np.log(cells.count(body.comm) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)
-    cells = round(count * np.exp(excess[nearest]))
-    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, cells)
+    taken = round(count * np.exp(excess[nearest]))
+    log.warning("cages.count: no cell size was found that gives %d cells within 1%%; taking %d", count, taken)
     return float(np.exp(nearest))
 
 

@@ -12,6 +12,8 @@ from msmpetsc.errors import InputError
 
 BITS = 21  # an axis: three of them fill 63 bits of a key
 LIMIT = 1 << BITS
+PACK = np.array([LIMIT**2, LIMIT, 1])
+CHUNK = 1 << 17  # triangles or cells handled at once: bounds the memory of one pass
 SAME = 1e-9  # cells: a body that is this close to a whole number of cells long has that number
 
 
@@ -85,6 +87,16 @@ def _encode(ijk, keys):
 def _decode(keys, ijk):
     for n in range(len(keys)):
         ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)
+
+
+def packed(ijk: np.ndarray) -> np.ndarray:
+    """Return one key (n,) for each grid index (n, 3), which sorts as (i, j, k) does."""
+    return ijk @ PACK
+
+
+def unpacked(keys: np.ndarray) -> np.ndarray:
+    """Return the grid index (n, 3) of each key of ``packed``."""
+    return np.stack([keys // PACK[0], keys // PACK[1] % LIMIT, keys % LIMIT], axis=1)
 
 
 def encode_morton(ijk: np.ndarray) -> np.ndarray:

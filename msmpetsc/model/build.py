@@ -15,6 +15,7 @@ from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.model.contact.obstacle import Obstacle
+from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.initial_state import InitialState, initial_state
@@ -65,14 +66,15 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
+    outside = distance_outside(body, cages, lattice) if scene.obstacle and cages.share is not None else None
     return Model(
         surface=body.surface,
         lattice=lattice,
         embedding=_embedding(scene, body, cages, lattice),
         loads=_loads(comm, scene, lattice, masks),
         anchors=anchors,
-        reflections=_reflections(scene),
-        penalties=_penalties(comm, scene, lattice, body),
+        reflections=_reflections(scene, outside),
+        penalties=_penalties(comm, scene, lattice, body, outside),
         start=initial_state(comm, scene.start, lattice, fixed, body.bounds),
         body=body,
         reaches=reaches,
@@ -86,7 +88,8 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
     """
 
     def sent(obstacle: Obstacle) -> Obstacle:
-        return replace(obstacle, points=send(obstacle.points), normals=send(obstacle.normals))
+        outside = None if obstacle.outside is None else send(obstacle.outside)
+        return replace(obstacle, points=send(obstacle.points), normals=send(obstacle.normals), outside=outside)
 
     lattice, (positions, velocities) = model.lattice, model.start
     return replace(
@@ -148,9 +151,9 @@ def fill_cages(body: Body, scene: Scene) -> Cages:
     cages = scene.cages
     cell_size = cages.cell_size
     if cages.count is not None:
-        cell_size = choose_cell_size(body, cages.count, cages.method, cages.max_cells)
+        cell_size = choose_cell_size(body, cages.count, cages.method, cages.max_cells, cages.boundary)
     assert cell_size is not None  # the schema has one of the two
-    return fill(body, cell_size, cages.method, cages.max_cells)
+    return fill(body, cell_size, cages.method, cages.max_cells, cages.boundary)
 
 
 def _lattice(scene: Scene, cages: Cages, finder: Finder) -> Lattice:
@@ -203,17 +206,21 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
     return loads
 
 
-def _reflections(scene: Scene) -> list[Reflection]:
+def _reflections(scene: Scene, outside: np.ndarray | None) -> list[Reflection]:
     return [
-        Reflection(Obstacle.of(o, f"obstacle.{number}"), 1.0 if o.restitution is None else o.restitution)
+        Reflection(Obstacle.of(o, f"obstacle.{number}", outside), 1.0 if o.restitution is None else o.restitution)
         for number, o in enumerate(scene.obstacle)
         if o.response == "reflect"
     ]
 
 
-def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body) -> list[Penalty]:
+def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body, outside: np.ndarray | None) -> list[Penalty]:
     pressing = [(f"obstacle.{number}", o) for number, o in enumerate(scene.obstacle) if o.response == "penalty"]
     if not pressing:
         return []
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * (body.bounds[1] - body.bounds[0]).max()
-    return [Penalty(Obstacle.of(o, key), o.stiffness or usual, o.friction or 0.0, stick) for key, o in pressing]
+    obstacles = [Obstacle.of(o, key, outside) for key, o in pressing]
+    return [
+        Penalty(obstacle, o.stiffness or usual, o.friction or 0.0, stick)
+        for obstacle, (_, o) in zip(obstacles, pressing, strict=True)
+    ]

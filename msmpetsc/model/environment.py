@@ -141,7 +141,7 @@ class Environment:
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
                 way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
                 reach = 2 * (speed * (time - start) + np.linalg.norm(way))
-                inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals)
+                inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals, outside=p.obstacle.outside)
                 stiffness += p.stiffness * ((inside > -reach) | (side > 0))
         return stiffness
 

@@ -90,6 +90,7 @@ LATTICE = {
     "nodes": Field("f8", ("n", 3), "m", "node positions at rest"),
     "cells": Field("i8", ("c", 8), "1", "corner nodes in VTK's order"),
     "cell_kind": Field("u1", ("c",), "1", "1 boundary, 2 interior"),
+    "cell_share": Field("f8", ("c",), "1", "share of a cell that counts"),
     "springs": Field("i8", ("s", 2), "1", "nodes that a spring joins"),
     "rest_length": Field("f8", ("s",), "m", "rest length of a spring"),
     "stiffness": Field("f8", ("s",), "N/m", "stiffness of a spring"),

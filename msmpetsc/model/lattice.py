@@ -15,10 +15,9 @@ from mpi4py import MPI
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.model.boundary_cells import CORNERS, shares_of_mass, shares_of_pairs
 from msmpetsc.model.material import CellMaterial, calibrated_stiffness, edge_stiffness
 
-# corners of a cell in VTK's hexahedron order, which is also the order in the file
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 # the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
@@ -44,6 +43,7 @@ class Lattice:
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
                   first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
     cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
+    cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
     """
 
     table: SortedKeys
@@ -62,6 +62,7 @@ class Lattice:
     local_cells: np.ndarray = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
     cell_stiffness: np.ndarray = field(default_factory=lambda: np.empty(0))
+    cell_share: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     @property
     def owned(self) -> int:
@@ -92,7 +93,9 @@ def build_lattice(
 ) -> Lattice:
     """Build the masses and springs of the valid cells (collective).
 
-    density       : [kg/m^3]; each cell gives an eighth of its mass to each corner
+    A boundary cell has the share of its mass and stiffness that is inside the surface (model.boundary_cells).
+
+    density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
     stiffening    : of the springs' law (model.springs) [-]
@@ -115,6 +118,7 @@ def build_lattice(
         mass=mass,
         cells=table.find(corner_keys),
         cell_kind=cages.kind,
+        cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(net.kind),
@@ -133,6 +137,7 @@ class _Network(NamedTuple):
     ijk     : (l, 3) grid index of the nodes, owned and ghosts
     octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
     cells   : (c, 8) local corner nodes of all cells around the owned nodes
+    share   : (c, 8) of the corners of these cells; None where all are whole
     kind    : (s,) of the springs, their squared lengths in cells
     sharing : (s,) number of cells that share each spring
     """
@@ -141,6 +146,7 @@ class _Network(NamedTuple):
     octants: np.ndarray
     ghosts: np.ndarray
     cells: np.ndarray
+    share: np.ndarray | None
     springs: np.ndarray
     springs_owned: int
     kind: np.ndarray
@@ -152,28 +158,32 @@ def _network(cages: Cages, table: SortedKeys) -> _Network:
     owned = len(table.keys)
     ijk, cells, octants = _local_cells(cages, table)
     ghosts = table.find(encode_morton(ijk[owned:]))
+    share = cages.share_of(ijk[cells[:, 0]])
+    share = None if share is None else share[:, *CORNERS.T]
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return _Network(ijk, octants, ghosts, cells, *_springs(cells, numbers, owned))
+    return _Network(ijk, octants, ghosts, cells, share, *_springs(cells, numbers, owned))
 
 
 def _sums(
-    net: _Network,
-    h: float,
-    density: float,
-    given: float | None,
-    of_cells: Callable[[np.ndarray], CellMaterial] | None,
+    net: _Network, h: float, density: float, given: float | None, of_cells: Callable[[np.ndarray], CellMaterial] | None
 ) -> tuple[np.ndarray, float | np.ndarray, float | np.ndarray]:
     """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
 
     given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
     """
     assert given is not None
-    if of_cells is None:
+    if of_cells is None and net.share is None:
         return density * h**3 / 8 * net.octants.sum(axis=1), given, given
-    owned, made_of = len(net.octants), of_cells(net.ijk[net.cells[:, 0]])
-    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density, owned)
-    of_spring = _sums_of_springs(net.cells, made_of.spring, net.ijk, net.springs, owned) / net.sharing
-    return mass, of_spring, made_of.spring
+    owned, cells = len(net.octants), len(net.cells)
+    if of_cells is None:
+        made_of = CellMaterial(np.full(cells, density), np.full(cells, given))
+    else:
+        made_of = of_cells(net.ijk[net.cells[:, 0]])
+    share = np.ones((cells, 8)) if net.share is None else net.share
+    of_pairs = shares_of_pairs(share)
+    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density[:, None] * shares_of_mass(of_pairs), owned)
+    of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
+    return mass, of_spring, share.mean(axis=1) * made_of.spring
 
 
 def _kept_cells(local_cells: np.ndarray, owned: int, stiffening: float) -> tuple[np.ndarray, int]:
@@ -205,29 +215,30 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarra
 
 
 def _sums_of_nodes(cells: np.ndarray, values: np.ndarray, owned: int) -> np.ndarray:
-    """Return the sum (owned,) of the ``values`` (c,) of the cells (c, 8) around each owned node."""
-    return np.bincount(cells.ravel(), np.repeat(values, 8), owned)[:owned]
+    """Return the sum (owned,) of the ``values`` (c, 8) of the corners of cells (c, 8) that are each owned node."""
+    return np.bincount(cells.ravel(), values.ravel(), owned)[:owned]
 
 
 def _sums_of_springs(
-    cells: np.ndarray, values: np.ndarray, ijk: np.ndarray, springs: np.ndarray, owned: int
+    cells: np.ndarray, values: np.ndarray, share: np.ndarray, ijk: np.ndarray, springs: np.ndarray, owned: int
 ) -> np.ndarray:
     """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
 
-    ijk : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
+    share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
+    ijk   : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
     """
     direction = (ijk[springs[:, 1]] - ijk[springs[:, 0]] + 1) @ np.array([9, 3, 1])
-    return _sums_by_direction(cells, values, owned)[springs[:, 0], direction]
+    return _sums_by_direction(cells, values, share, owned)[springs[:, 0], direction]
 
 
 @numba.njit(cache=True)
-def _sums_by_direction(cells, values, owned):
+def _sums_by_direction(cells, values, share, owned):
     sums = np.zeros((owned, 27))
     for i in range(len(cells)):
         for a in range(8):
             if cells[i, a] < owned:
                 for b in range(8):
-                    sums[cells[i, a], DIRECTION[a, b]] += values[i]
+                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * share[i, a, b]
     return sums
 
 
@@ -275,7 +286,7 @@ def _springs(cells, numbers, owned):
 
 
 # bytes of each array of a Lattice, for one cell, node (ghosts too) or spring: a forecast of memory asks for them
-BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "local_cells": 8 * 8, "cell_stiffness": 8}
+BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "cell_share": 8, "local_cells": 8 * 8, "cell_stiffness": 8}
 BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
 BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
 

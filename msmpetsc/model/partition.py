@@ -93,8 +93,11 @@ def partition_of(body: Body, wanted: CagesTable, ranks: int, most: int) -> tuple
     else:
         assert h is not None  # the schema has one of the two
         guess = _cells(abs(report.volume), 3 / 4 * report.area, h)  # as choose_cell_size does
-    size = h if h and guess <= most else choose_cell_size(body, min(wanted.count or most, most), wanted.method, MOST)
-    cages = fill(body, size, wanted.method, MOST)
+    if h and guess <= most:
+        size = h
+    else:
+        size = choose_cell_size(body, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
+    cages = fill(body, size, wanted.method, MOST, wanted.boundary)
     partition = count_partition(body, cages, build_lattice(cages, 1.0, 1.0), ranks)
     counted = int(partition.cells.sum())
     if guess > most:

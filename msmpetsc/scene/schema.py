@@ -178,6 +178,10 @@ class CagesTable(Table):
     count: Count | None = Field(None, description="number of valid cells aimed at [-]")
     cell_size: Positive | None = Field(None, description="edge of a cell [m]")
     method: Literal["exact", "sample"] = Field("exact", description="triangle-box test, or the paper's sample points")
+    boundary: Literal["fill", "whole"] = Field(
+        "fill",
+        description="boundary cells weigh and resist by the share of them that is inside, or whole, as the paper's",
+    )
     embedding: Literal["affine", "cages", "mvc"] = Field("affine", description="how the surface follows the nodes")
     smoothing: float = Field(1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]')
     max_cells: Count = Field(5_000_000, description="refuse a lattice of more cells than this [-]")

@@ -196,10 +196,14 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
 def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
     """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half the density."""
     half = {"region": {"box": [[0, 0, 0], [0.25, 1, 1]]}, "density": 500.0}
-    scene = load_scene(block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half]))
-    log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
-    told = "body of 0.45 x 0.45 x 0.2 m; closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg"
-    assert heard()[0] == ("INFO", told)
+    path = block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half])
+    for boundary, told in {
+        "whole": "closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg",
+        "fill": "closed mesh of 0.0405 m^3, 29.25 kg; lattice of 0.0405 m^3, 29.25 kg",  # 0.25 m of 0.45 m are light
+    }.items():
+        scene = load_scene(path, [f'cages.boundary="{boundary}"'])
+        log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
+        assert heard()[0] == ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}")
 
 
 def test_of_many_tables_the_first_are_named():
@@ -247,7 +251,7 @@ log.addHandler(logging.StreamHandler(sys.stdout))
 log.setLevel(logging.INFO)
 with compilation_logged(empty):
     for kind in sys.argv[1:]:
-        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0)
+        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0, 0.0)
 """
 
 

@@ -51,11 +51,11 @@ def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
     """Writes all cells in the order of the ranks beside the mesh."""
     cages = fill(body_of(mesh), cell_size, method)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
-    parts = comm.gather((cages.table.first, cages.ijk, cages.kind))
+    parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.share))
     if comm.rank == 0:
         assert [part[0] for part in parts] == sorted(part[0] for part in parts)
-        ijk, kind = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
-        np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind)
+        ijk, kind, share = (np.concatenate([part[column] for part in parts]) for column in (1, 2, 3))
+        np.savez(mesh.with_suffix(".cells.npz"), ijk=ijk, kind=kind, share=share)
 
 
 def check_force() -> None:

@@ -26,6 +26,8 @@ class Obstacle:
     path            : how it moves
     start, stop     : it is there while start <= time < stop [s]; None: to the end
     key             : of its table in the scene, for messages
+    outside         : (l,) how far nodes stick out of the surface at rest [m] (contact.outside): they go so much deeper
+        before the surface meets the obstacle. None: they are the surface
     """
 
     points: np.ndarray
@@ -34,16 +36,17 @@ class Obstacle:
     start: float = 0.0
     stop: float | None = None
     key: str = "obstacle"
+    outside: np.ndarray | None = None
 
     @classmethod
-    def of(cls, table: ObstacleTable, key: str = "obstacle") -> "Obstacle":
-        """Return the obstacle of a scene's table."""
+    def of(cls, table: ObstacleTable, key: str = "obstacle", outside: np.ndarray | None = None) -> "Obstacle":
+        """Return the obstacle of a scene's table, for nodes that stick out so far."""
         if table.shape == "box":
             points = np.repeat(np.array(table.box), 3, axis=0)  # the faces that meet at each of the two corners
             normals = np.concatenate([-np.eye(3), np.eye(3)])
         else:
             points, normals = np.array([table.point]), np.array([table.normal])
-        return cls(points, normals, Motion.through(table.path), table.start, table.stop, key)
+        return cls(points, normals, Motion.through(table.path), table.start, table.stop, key, outside)
 
     def acts_at(self, time: float) -> bool:
         """Return whether the obstacle is there at a time [s]."""
@@ -88,34 +91,45 @@ def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 
 
 @numba.njit(cache=True)
-def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> tuple[float, int]:
-    """Return how deep x (3,) lies behind the face of its ``side`` [m], and that face.
+def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int, outside: float) -> tuple[float, int]:
+    """Return how deep the surface at x (3,) lies behind the face of its ``side`` [m], and that face.
 
     Without a side: how deep in the solid, not positive outside, and the nearest face.
+
+    outside : how far the node at x sticks out of the surface [m]
     """
     if side > 0:
-        return behind(x, points, normals, side - 1), side - 1
+        return behind(x, points, normals, side - 1) - outside, side - 1
     least, face = np.inf, 0
     for f in range(len(points)):
         distance = behind(x, points, normals, f)
         if distance < least:
             least, face = distance, f
-    return least, face
+    return least - outside, face
 
 
 @kernel
-def _depth_of(first, count, step, q, points, normals, sides, least, face):
+def _depth_of(first, count, step, q, points, normals, sides, outside, least, face):
     for i in range(first, count, step):
-        least[i], face[i] = depth(q[i], points, normals, sides[i])
+        least[i], face[i] = depth(q[i], points, normals, sides[i], outside[i])
 
 
 def depths(
-    q: np.ndarray, points: np.ndarray, normals: np.ndarray, sides: np.ndarray | None = None
+    q: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    sides: np.ndarray | None = None,
+    outside: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``depth`` of positions (n, 3) with their ``sides`` (n,): depths (n,) [m] and faces (n,)."""
+    """Return ``depth`` of positions (n, 3), with sides and outside (n or more,): depths (n,) [m], faces (n,)."""
     least, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
-    _depth_of(len(q), q, points, normals, no_sides(q) if sides is None else sides, least, face)
+    _depth_of(len(q), q, points, normals, no_sides(q) if sides is None else sides, of_nodes(outside, q), least, face)
     return least, face
+
+
+def of_nodes(outside: np.ndarray | None, q: np.ndarray) -> np.ndarray:
+    """Return how far the nodes at q (n, 3) stick out of the surface, (n or more,) [m]; by default not at all."""
+    return np.zeros(len(q), like=q) if outside is None else outside
 
 
 def no_sides(q: np.ndarray) -> np.ndarray:
@@ -148,10 +162,13 @@ def side_of(
 
     points, points_end : (f, 3) where the faces are meanwhile; as seen from the solid, too, the way is straight
     side               : by which it was before: it keeps that until it is out of the solid
+
+    It is the node that counts here, however far it sticks out of the surface: with a side, but no depth yet, it is on
+    its way in, or out again.
     """
     if side > 0 and _stays(x, points, normals, side - 1):
         return side
-    inside, face = depth(x, points, normals, 0)
+    inside, face = depth(x, points, normals, 0, 0.0)
     if inside > 0.0:
         return face + 1
     enter, leave, side = -1.0, 1.0, 0  # fractions of the way
@@ -184,7 +201,7 @@ def describe_overlap(
     q, held : (l, 3) [m]; (l,) bool, the nodes that are not free
     """
     owned = slice(lattice.owned)
-    inside, _ = depths(q[owned], obstacle.points_at(time), obstacle.normals)
+    inside, _ = depths(q[owned], obstacle.points_at(time), obstacle.normals, outside=obstacle.outside)
     rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~held[owned])
     count = comm.allreduce(len(rows))
     if not count:

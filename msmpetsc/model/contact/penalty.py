@@ -18,7 +18,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides
+from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides, of_nodes
 
 
 @dataclass(frozen=True)
@@ -32,20 +32,21 @@ class Penalty:
 
     def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
-        return ContactState(self.obstacle.points_at(time), self.obstacle.normals, self.stiffness, None, sides)
+        points, normals, outside = self.obstacle.points_at(time), self.obstacle.normals, self.obstacle.outside
+        return ContactState(points, normals, self.stiffness, None, sides, outside)
 
     def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m]."""
         if self.friction == 0:
             return self.at(time, sides)
-        points, normals = self.obstacle.points_at(time), self.obstacle.normals
+        points, normals, outside = self.obstacle.points_at(time), self.obstacle.normals, self.obstacle.outside
         before = self.obstacle.points_at(time - time_step)
-        inside, face = depths(q, before, normals, sides)
+        inside, face = depths(q, before, normals, sides, outside)
         nodes = np.flatnonzero(inside > 0)
         carried = q[nodes] + (points - before)[0]
         limit = self.friction * self.stiffness * inside[nodes]
         friction = Friction(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
-        return ContactState(points, normals, self.stiffness, friction, sides)
+        return ContactState(points, normals, self.stiffness, friction, sides, outside)
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ class ContactState:
     stiffness       : [N/m] on each node
     friction        : of the step, if any
     sides           : (owned or more,) by which face each node came in (obstacle.side_of); None: the nearest
+    outside         : (owned or more,) how far nodes stick out of the surface [m]; None: they do not
     """
 
     points: np.ndarray
@@ -120,14 +122,15 @@ class ContactState:
     stiffness: float
     friction: Friction | None
     sides: np.ndarray | None = None
+    outside: np.ndarray | None = None
 
     def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
-        return depths(q, self.points, self.normals, self.sides)
+        return depths(q, self.points, self.normals, self.sides, self.outside)
 
-    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what kernels take: points, normals and the sides of positions (n, 3)."""
-        return self.points, self.normals, no_sides(q) if self.sides is None else self.sides
+    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return what kernels take: points, normals, and of positions (n, 3) the sides and how far they stick out."""
+        return self.points, self.normals, no_sides(q) if self.sides is None else self.sides, of_nodes(self.outside, q)
 
 
 class Contact:
@@ -196,10 +199,10 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _change_of(first, count, step, q, base, points, normals, sides, stiffness, parts):
+def _change_of(first, count, step, q, base, points, normals, sides, outside, stiffness, parts):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i])
-        d_base, face_base = depth(base[i], points, normals, sides[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i])
+        d_base, face_base = depth(base[i], points, normals, sides[i], outside[i])
         parts[i] = 0.0
         if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
             deeper = 0.0
@@ -212,19 +215,19 @@ def _change_of(first, count, step, q, base, points, normals, sides, stiffness, p
 
 
 @kernel
-def _add_gradient_of(first, count, step, q, points, normals, sides, stiffness, gradient):
+def _add_gradient_of(first, count, step, q, points, normals, sides, outside, stiffness, gradient):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i])
         if d > 0.0:
             for c in range(3):
                 gradient[i, c] -= stiffness * d * normals[face, c]
 
 
 @kernel
-def _friction_of(first, count, step, rows, q, points, normals, sides, carried, impulse, per_mass, v):
+def _friction_of(first, count, step, rows, q, points, normals, sides, outside, carried, impulse, per_mass, v):
     for row in range(first, count, step):
         i = rows[row]
-        d, face = depth(q[i], points, normals, sides[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i])
         if d > 0.0:
             along, speed = 0.0, 0.0
             for c in range(3):

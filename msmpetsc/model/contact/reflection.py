@@ -82,7 +82,7 @@ class Reflection:
     def _behind(self, q: np.ndarray, time: float, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes (k,) on or behind the faces of their ``sides``, and these faces' normals (k, 3)."""
         obstacle = self.obstacle
-        inside, face = depths(q, obstacle.points_at(time), obstacle.normals, sides)
+        inside, face = depths(q, obstacle.points_at(time), obstacle.normals, sides, obstacle.outside)
         behind = inside >= 0
         if sides is not None and obstacle.has_sides:
             behind &= sides > 0

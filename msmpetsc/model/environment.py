@@ -58,6 +58,16 @@ class Environment:
             q = np.where(anchor.where[:, None], target, q)
         return q
 
+    def is_same(self, begin: float, end: float) -> bool:
+        """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
+
+        def at(time: float) -> list:
+            loads = [load.acts_at(time) for load in self.loads]
+            anchors = [anchor.holds_at(time) and tuple(anchor.path.at(time)) for anchor in self.anchors]
+            return [*loads, *anchors, *(o.acts_at(time) and tuple(o.path.at(time)) for o in self.obstacles)]
+
+        return at(begin) == at(end)
+
     def contact_faces(
         self,
         q: np.ndarray,

@@ -74,6 +74,7 @@ CASES = {
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
     "anchor, verlet": by("verlet", swing(anchor=LED)),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
+    "static": by("static", swing(solver=LOOSE, anchor=LED)),
     "bdf2, reflected": by("bdf2", fall(solver=LOOSE, obstacle=[GROUND])),
     "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
     "bdf2, a thin plate": by("bdf2", fall(solver=LOOSE, obstacle=[THIN | {"restitution": 0.5}])),

@@ -21,7 +21,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails
 
 from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
-from msmpetsc.scene.statics import no_impact, no_motion
+from msmpetsc.scene.statics import no_impact, no_motion, no_wait
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -220,7 +220,12 @@ class Time(Table):
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
     )
 
+    until: Literal["duration", "rest"] = Field(
+        "duration", description="when the run ends: or as soon as all is at rest"
+    )
+
     _has_a_use = field_validator("substep")(_only_for("integrator", "verlet"))
+    _moves = field_validator("until")(no_wait)
 
     @field_validator("duration")
     @classmethod

@@ -13,6 +13,13 @@ def _is_static(info: ValidationInfo) -> bool:
     return getattr(info.data.get("time"), "integrator", None) == STATIC
 
 
+def no_wait(cls: Any, until: str, info: ValidationInfo) -> str:
+    """Refuse to wait for rest where there is nothing else (a validator of ``time.until``)."""
+    if until == "rest" and info.data.get("integrator") == STATIC:
+        raise rule(f'has no meaning for integrator = "{STATIC}": each state is at rest', "integrator")
+    return until
+
+
 def no_motion(cls: Any, start: Any, info: ValidationInfo) -> Any:
     """Refuse a start in motion (a validator of ``start``)."""
     if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):

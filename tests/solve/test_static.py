@@ -172,7 +172,7 @@ def test_a_load_comes_on_in_steps_and_ends_the_same(tmp_path: Path, monkeypatch:
 
 
 def start_with_an_eighth(steps: LoadSteps) -> None:
-    steps.reached, steps.size, steps.count = 0.0, 1 / 8, 0
+    steps.reached, steps.size, steps.count, steps.failures = 0.0, 1 / 8, 0, 0
 
 
 def test_shares_of_a_load():

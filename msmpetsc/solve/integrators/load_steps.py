@@ -19,6 +19,7 @@ from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 
 SMALLEST = 2.0**-10  # of the load
+MOST_FAILURES = 50  # of the load steps of one state
 SMALL = 2.0**-4  # of it: not refused any more for what a smaller one may avoid
 
 
@@ -30,7 +31,7 @@ class LoadSteps:
     """
 
     def __init__(self) -> None:
-        self.reached, self.size, self.count = 0.0, 1.0, 0
+        self.reached, self.size, self.count, self.failures = 0.0, 1.0, 0, 0
 
     @property
     def share(self) -> float:
@@ -51,9 +52,9 @@ class LoadSteps:
         self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
 
     def halve(self, failure: StepFailed) -> None:
-        """Know that the share failed. Raises StepFailed where it was of the smallest."""
-        self.size = 0.5 * (self.share - self.reached)
-        if self.size < SMALLEST:
+        """Know that the share failed. Raises StepFailed where it was of the smallest, or one of very many."""
+        self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
+        if self.size < SMALLEST or self.failures > MOST_FAILURES:
             raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None
 
 

@@ -129,6 +129,7 @@ class ImplicitEuler:
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
             self.destroy()
+            self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
             self.stepper, self.reference = self._new_stepper(time), None
             self.set_up()
 

@@ -8,9 +8,7 @@ that of a step, its F
 M only weighs errors. tau scales F, so that M^(-1) tau^2 (Hessian of E) has no eigenvalue below about 1 where the body
 is at rest: as a step's Hessian has none for its M, from which bounds on errors follow.
 
-Where the whole load cannot be brought on at once it is in load steps, from what keeps x_0 where it is: a share s of it
-is the equilibrium under  f_ext + (1 - s) F(x_0) / tau^2,  with obstacles where they will be and anchors a share s of
-their way.
+Where the whole load cannot be brought on at once it comes on in load steps (solve.integrators.load_steps).
 """
 
 from collections.abc import Iterator
@@ -41,10 +39,16 @@ class Static(ImplicitEuler):
     """States of equilibrium (an Integrator): that at ``time``, from the one a step before.
 
     Forces, anchors and obstacles are taken as they are then.
+
+    error    : of the last state
+    made_for : time [s] whose nodes the stepper has for its unknowns
     """
 
     STATIC = True
-    error = 0.0  # of the last state
+
+    def __init__(self, *arguments, **settings):
+        self.error = self.made_for = 0.0
+        super().__init__(*arguments, **settings)
 
     def _first_tau(self) -> float:
         return SLENDER * transit_time(self.comm, self.model.lattice)

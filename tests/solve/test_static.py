@@ -11,9 +11,9 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.integrators.load_steps import LoadSteps
+from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 COLUMN = np.array([0.25, 0.25, 2.0])  # [m]: 2 x 2 x 16 cells
@@ -192,6 +192,26 @@ def test_a_load_that_no_share_can_be_found_of_fails():
     with pytest.raises(StepFailed, match=r"and failed with 0\.001 of the load"):
         for _ in range(20):
             steps.halve(StepFailed("went astray"))
+
+
+@pytest.mark.parametrize("on_failure", ["fallback", "substep"])
+def test_a_state_that_fails_is_found_another_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str):
+    """By the robust preset, or by way of states at times between, which are states, too: anchors go there in parts."""
+    anchor = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.05, 0.0]}]}]
+    tables = {"pin": [{"region": BOTTOM}], "anchor": anchor}
+    _, usual = play(column(tmp_path, **tables))
+    try_share = LoadPath.try_share
+
+    def fails_at_first(path: LoadPath, steps: LoadSteps) -> StepResult:
+        if path.time_step == STATE["step"] and path.stepper.preset is find_preset("newton"):
+            raise StepFailed("failed")
+        return try_share(path, steps)
+
+    monkeypatch.setattr(LoadPath, "try_share", fails_at_first)
+    _, frames = play(column(tmp_path, **tables, safety={"on_failure": on_failure}))
+    assert (frames[-1].fallbacks if on_failure == "fallback" else frames[-1].substeps) > 0
+    assert np.abs(frames[-1].position - usual[-1].position).max() < 1e-7
+    assert frames[-1].kinetic == 0
 
 
 def test_ranks_and_resuming(tmp_path: Path, msmpetsc):

@@ -153,7 +153,11 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, outcome: Outcome, started: float)
 def tell_done(comm: MPI.Intracomm, plan: RunPlan) -> int:
     """Finish the files of a run that has all its frames; return the exit status (collective)."""
     on_root(comm, lambda: write_companions(plan.request, whole=True))
-    log.info("%s has all its %d frames: nothing left to do", plan.request.path, plan.scene.stored)
+    earlier = plan.resumed.earlier if plan.resumed else None
+    if earlier and earlier.finished < plan.scene.stored:
+        log.info("%s came to rest after step %d: nothing left to do", plan.request.path, earlier.step)
+    else:
+        log.info("%s has all its %d frames: nothing left to do", plan.request.path, plan.scene.stored)
     return 0
 
 

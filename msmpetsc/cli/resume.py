@@ -93,8 +93,8 @@ class Resumed:
 
     @property
     def is_done(self) -> bool:
-        """Whether the file has all frames already."""
-        return self.earlier.finished >= self.stored
+        """Whether the file has all frames already, or those until rest."""
+        return self.earlier.finished >= self.stored or (self.earlier.at_rest and not self.differs)
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier

@@ -13,6 +13,8 @@ from mpi4py import MPI
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
+AT_REST = "at_rest"  # number of a run that ends at rest (time.until): whether it has come there
+
 
 @dataclass
 class Checkpoint:

@@ -58,6 +58,23 @@ class Environment:
             q = np.where(anchor.where[:, None], target, q)
         return q
 
+    def is_same(self, begin: float, end: float) -> bool:
+        """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
+
+        def at(time: float) -> list:
+            loads = [load.acts_at(time) for load in self.loads]
+            anchors = [anchor.holds_at(time) and tuple(anchor.path.at(time)) for anchor in self.anchors]
+            return [*loads, *anchors, *(o.acts_at(time) and tuple(o.path.at(time)) for o in self.obstacles)]
+
+        return at(begin) == at(end)
+
+    def last_change(self, until: float) -> float:
+        """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
+        times = [time for load in self.loads for time in (load.start, load.stop)]
+        times += [time for anchor in self.anchors for time in (*anchor.path.times.tolist(), anchor.stop)]
+        times += [time for o in self.obstacles for time in (*o.path.times.tolist(), o.start, o.stop)]
+        return max((time for time in times if time is not None and time <= until), default=0.0)
+
     def contact_faces(
         self,
         q: np.ndarray,

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError, printable
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import AT_REST, Checkpoint
 from msmpetsc.model.fields import FRAME_FIELDS
 from msmpetsc.output.compare import rows_agree
 from msmpetsc.output.reader import (
@@ -38,6 +38,7 @@ class Earlier:
     finished   : frames that it has
     planned    : frames that it has room for
     exact      : whether a checkpoint has all that a run goes on from
+    at_rest    : whether it ended there (time.until)
     """
 
     path: Path
@@ -47,6 +48,7 @@ class Earlier:
     finished: int
     planned: int
     exact: bool
+    at_rest: bool
 
     @classmethod
     def read(cls, path: Path) -> "Earlier":
@@ -57,9 +59,16 @@ class Earlier:
             names = _checked_numbers(path, result.file)
             _refuse_foreign_series(result)
             count, planned = len(result.frames.time), result.frames.time.planned[0]
+            at_rest = bool(count) and _is_at_rest(result, names or [])
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, bool(names))
+        return cls(path, texts, true_error, step, count, planned, bool(names), at_rest)
+
+
+def _is_at_rest(result: Result, names: list[str]) -> bool:
+    """Return whether the newest checkpoint, with numbers of these names, is of a run at rest."""
+    slot = newest_slot(result["checkpoint/step"][:]) if AT_REST in names else None
+    return slot is not None and bool(result["checkpoint/numbers"][slot][names.index(AT_REST)] == 1)
 
 
 def _refuse_foreign_series(result: Result) -> None:

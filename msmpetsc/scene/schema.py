@@ -21,6 +21,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails
 
 from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
+from msmpetsc.scene.statics import no_impact, no_motion, no_wait
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -97,7 +98,7 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
 
 
 FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
-Integrator = Literal["implicit-euler", "bdf2", "verlet"]
+Integrator = Literal["implicit-euler", "bdf2", "verlet", "static"]
 Preset = Annotated[str, AfterValidator(_known_preset)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
@@ -216,13 +217,19 @@ class Time(Table):
     duration: Positive = Field(description="simulated time [s]")
     integrator: Integrator = Field(
         "implicit-euler",
-        description="how a step is taken: solved at once, of first or second order; or in explicit substeps",
+        description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
+        "state of equilibrium",
     )
     substep: Positive | None = Field(
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
     )
 
+    until: Literal["duration", "rest"] = Field(
+        "duration", description="when the run ends: or as soon as all is at rest"
+    )
+
     _has_a_use = field_validator("substep")(_only_for("integrator", "verlet"))
+    _moves = field_validator("until")(no_wait)
 
     @field_validator("duration")
     @classmethod
@@ -480,6 +487,8 @@ class SceneFile(Table):
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
     _of_one_kind = field_validator("part")(_as_the_material)
+    _starts_at_rest = field_validator("start")(no_motion)
+    _only_presses = field_validator("obstacle")(no_impact)
 
     @property
     def stored(self) -> int:

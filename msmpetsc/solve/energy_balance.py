@@ -139,6 +139,9 @@ class EnergyBalance:
         solved = ended = self._energies(result.position, v, time, after.sides)
         if not np.isfinite(solved.kinetic + solved.inner):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
+        if result.static:  # which owes nothing to the state before
+            self.energies = solved
+            return
         bounces = self._bounces(result, after)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)

@@ -141,9 +141,11 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or Verlet's where that is the scene's and its steps become shorter."""
+        """Another integrator: implicit Euler's, or the scene's own where that is static, or Verlet whose steps become
+        shorter."""
         is_fallback = self.on_failure == "fallback"
-        name = "verlet" if self.time.integrator == "verlet" and not is_fallback else "implicit-euler"
+        kept = ("static",) if is_fallback else ("static", "verlet")
+        name = self.time.integrator if self.time.integrator in kept else "implicit-euler"
         time = self.time.model_copy(update={"step": short, "integrator": name})
         if is_fallback:
             return self.make(time, Solver(preset=ROBUST, error=self.solver.error, max_iterations=None), PREFIX)

@@ -33,6 +33,7 @@ from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery, StepCost
+from msmpetsc.solve.rest import Rest
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
@@ -101,7 +102,7 @@ class Simulation:
 
     state         : that goes with the last frame, or the last step
     step          : steps taken
-    steps         : steps of the whole run
+    steps         : steps of the whole run; those taken, once that is at rest
     trace         : of the step that the probes follow, once it was taken
     stored        : number of frames of the whole run; ``stored_until(step)`` of a part
     """
@@ -119,6 +120,7 @@ class Simulation:
         self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings)
         self.recovery = Recovery(scene, lambda time, solver, prefix: make(time, solver, prefix=prefix), self.balance)
         self.monitors = Monitors(comm, model.lattice)
+        self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
@@ -137,9 +139,9 @@ class Simulation:
             self._overlaps(0, 0.0)
             self.balance.start(self.state, self.time_step)
             yield self._frame(0, self.state.q)
-        for index in range(self.step + 1, self.steps + 1):
+        while self.step < self.steps:
             with STEPS:
-                frame = self._advance(index)
+                frame = self._advance(self.step + 1)
             yield frame
         self.monitors.sum_up()
         self.recovery.sum_up()
@@ -159,7 +161,7 @@ class Simulation:
                 self.balance.examine(self.state, result, after, time, self.time_step)
         except StepFailed as failure:
             result, after, cost = self._recovered(index, time, failure)
-        self.state = after
+        before, self.state = self.state, after
         self.cost.add(result, cost, perf_counter() - begin)
         if self.probes.asks(index) and cost is None:
             errors, trace = self.integrator.true_errors(index, result)
@@ -167,6 +169,8 @@ class Simulation:
             self.trace = trace or self.trace
         self.monitors.gain(index, time, self.balance.ledger)
         self.step = index
+        if self.rest and self.rest.look(index, time, before, after):
+            self.steps = index
         return self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State, StepCost]:
@@ -201,8 +205,8 @@ class Simulation:
         for part in self._remembering():
             part.restore(checkpoint)
 
-    def _remembering(self) -> tuple[EnergyBalance, Recovery, Monitors, FrameCost]:
-        return self.balance, self.recovery, self.monitors, self.cost
+    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest]:
+        return [self.balance, self.recovery, self.monitors, self.cost, *([self.rest] if self.rest else [])]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""

@@ -9,6 +9,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Integrator
+from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import Case, study_cases
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import ReferenceRun, Study, StudyScene, Sweep
@@ -167,6 +168,8 @@ class Planner:
     ):
         self.scene, self.bench, self.presets, self.ranks, self.report = scene, bench, presets, ranks, report
         self.as_given = load_scene(scene, (), presets)
+        if self.as_given.time.integrator == STATIC:
+            raise InputError(f'{scene}: a plan is of a motion, and its integrator is "{STATIC}"')
         self.step = self.as_given.time.step
         self.duration = min(frames * self.step, self.as_given.time.duration)
         self.reference: ReferenceRun | None = None

@@ -44,7 +44,7 @@ COLUMNS = {
     "map": Column(str, "", "the map that it is a point of"),
     "x": Column(str, "", "place on the map's horizontal axis"),
     "y": Column(str, "", "place on the map's vertical axis, or the name of its case"),
-    "integrator": Column(str, "", "implicit-euler, bdf2 or verlet"),
+    "integrator": Column(str, "", "implicit-euler, bdf2, verlet or static"),
     "preset": Column(str, "", "solver preset"),
     "options": Column(str, "", "PETSc options"),
     "label": Column(str, "", "what its curve is called"),

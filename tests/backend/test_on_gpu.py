@@ -65,6 +65,11 @@ CASES = {
         "obstacle": [{**THIN, "response": "penalty", "path": [{"time": 1.0, "by": [0, 0, 1.0]}]}],
     },
     "bdf2": {**FALL, **HELD, "time": {**FALL["time"], "integrator": "bdf2"}},
+    "static": {
+        "time": {**FALL["time"], "integrator": "static"}, "gravity": GRAVITY, **HELD, **LED, **STIFFENING,
+        "obstacle": [{**PLATE, "friction": 0.0}],
+    },
+    "until rest": {**FALL, **HELD, "time": {"step": 0.3, "duration": 6.0, "until": "rest"}},
     "verlet": {
         **FALL, **LED, "time": {**FALL["time"], "integrator": "verlet"},
         "obstacle": [{**FLOOR, "response": "reflect"}, PLATE],

@@ -34,6 +34,7 @@ GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
 SIDE = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
 FAR = {"box": [[0.49, -1, -1], [0.51, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.05, "by": [0.05, 0, 0.05]}], "stop": 0.08}]
+PUSHED = [{"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}]  # and let go later
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}]
 THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
@@ -74,6 +75,7 @@ CASES = {
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
     "anchor, verlet": by("verlet", swing(anchor=LED)),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
+    "static": by("static", swing(solver=LOOSE, anchor=[LED[0] | {"stop": 0.05}, *PUSHED])),
     "bdf2, reflected": by("bdf2", fall(solver=LOOSE, obstacle=[GROUND])),
     "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
     "bdf2, a thin plate": by("bdf2", fall(solver=LOOSE, obstacle=[THIN | {"restitution": 0.5}])),

@@ -357,7 +357,10 @@ def test_petsc_options_of_a_solver_that_is_not_there_are_refused(tmp_path: Path,
 @pytest.mark.parametrize(
     ("time", "message"),
     [
-        ({"integrator": "leapfrog"}, 'time.integrator: unknown value "leapfrog", valid: implicit-euler, bdf2, verlet'),
+        (
+            {"integrator": "leapfrog"},
+            'time.integrator: unknown value "leapfrog", valid: implicit-euler, bdf2, verlet, static',
+        ),
         ({"substep": 1e-4}, 'time.substep: is for integrator = "verlet" only'),
         ({"substep": 0.0} | EXPLICIT, "time.substep: must be > 0"),
     ],

@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from block_scene import block_scene
 from study_files import own_log  # noqa: F401 (fixtures)
 
 from msmpetsc.cli import plan
@@ -178,3 +179,9 @@ def test_a_plan_refuses_with_status_2_and_one_line(tmp_path: Path, capsys, own_l
     assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("msmpetsc: error: ") and words in line
+
+
+def test_a_plan_of_statics_is_refused(tmp_path: Path, capsys, own_log):
+    path = block_scene(tmp_path, time={"step": 1.0, "duration": 1.0, "integrator": "static"})
+    assert main(["plan", str(path), "--error", "0.1"]) == 2
+    assert "a plan is of a motion" in capsys.readouterr().err

@@ -8,10 +8,11 @@ from msmpetsc.scene.schema import Solver, Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
 
 Integrators = dict[str, type[ImplicitEuler] | type[Verlet]]
-INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet}
+INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verlet": Verlet, "static": Static}
 
 
 def make_integrator(

@@ -32,6 +32,7 @@ class ImplicitEuler:
     """
 
     SHARE = 1.0  # tau / t
+    STATIC = False  # M is no part of F
     looks_back = False
 
     def __init__(
@@ -45,13 +46,17 @@ class ImplicitEuler:
         prefix: str = "",
     ):
         self.comm, self.model, self.environment, self.prefix = comm, model, environment, prefix
-        self.time_step, self.tau = time.step, self.SHARE * time.step
+        self.time_step = time.step
+        self.tau = self._first_tau()
         self.solver, self.probes = solver, probes
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
         self.problem: StepProblem | None = None  # of the step taken last
         self.reference: Reference | None = None
         self.trace: Trace | None = None
+
+    def _first_tau(self) -> float:
+        return self.SHARE * self.time_step
 
     @property
     def unknowns(self) -> int:
@@ -94,7 +99,9 @@ class ImplicitEuler:
     def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
         if self.reference is None:
             lattice = self.stepper.lattice
-            self.reference = Reference(self.comm, lattice, self.tau, touches=bool(self.model.penalties))
+            self.reference = Reference(
+                self.comm, lattice, self.tau, touches=bool(self.model.penalties), static=self.STATIC
+            )
         trace, self.trace, self.stepper.observer = self.trace, None, None
         assert self.problem is not None, "no step was taken"
         positions = [*(trace.positions if trace else []), result.position]
@@ -113,6 +120,7 @@ class ImplicitEuler:
             solver.max_iterations,
             touches=bool(self.model.penalties),
             prefix=self.prefix,
+            static=self.STATIC,
         )
 
     def _let_go(self, time: float) -> None:
@@ -121,8 +129,9 @@ class ImplicitEuler:
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
             self.destroy()
+            self.tau = self._first_tau()  # whatever came before: a resumed run has not seen it
             self.stepper, self.reference = self._new_stepper(time), None
-            self.stepper.set_up()
+            self.set_up()
 
     def save(self, checkpoint: Checkpoint, _: State) -> None:
         self.stepper.save(checkpoint)

@@ -55,7 +55,7 @@ def diagonal_of(unknowns: Unknowns, time_step: float) -> np.ndarray:
     stiffness = np.zeros(len(lattice.nodes))
     for end in (0, 1):
         stiffness += np.bincount(lattice.springs[:, end], lattice.stiffness, len(stiffness))
-    return like(unknowns.free, to_host(lattice.mass)[free] + time_step**2 * stiffness[free])
+    return like(unknowns.free, to_host(unknowns.inertia)[free] + time_step**2 * stiffness[free])
 
 
 def assembly_bytes(

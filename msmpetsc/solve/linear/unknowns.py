@@ -17,6 +17,7 @@ from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
+BALLAST = 1e-6  # of the mass
 BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node: a forecast of memory asks for them
 
 
@@ -27,13 +28,19 @@ class Unknowns:
     numbers : (l,) global number of each local node among the free ones, -1 where pinned
     indices : (l, 3) of its x, y and z in a vector of unknowns, of no meaning where pinned
     total   : number of free nodes on all ranks
+    inertia : (owned,) [kg] by which a node resists being moved: its mass; nothing where an equilibrium is looked for
+    ballast : (owned,) [kg] the same in multigrid, never nothing: a cell squashed flat has a singular block of its own
+    static  : whether it is an equilibrium
     memory  : where PETSc's vectors have their numbers
 
     Raises InputError for more of them than PETSc can number.
     """
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, static: bool = False):
         self.lattice, self.memory = lattice, memory_of(lattice.nodes)
+        self.static = static
+        self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
+        self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
         self.size = len(self.free)
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]  # an Intracomm
@@ -93,7 +100,7 @@ class Unknowns:
 
     def scaled_sum(self, a: np.ndarray, t2: float, b: np.ndarray, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
-        _scaled_sum(self.size, self.lattice.mass, a, t2, b, self.free, self.columns_to_write(vector))
+        _scaled_sum(self.size, self.inertia, a, t2, b, self.free, self.columns_to_write(vector))
 
     def destroy(self) -> None:
         """Collective."""

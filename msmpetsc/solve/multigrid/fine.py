@@ -35,13 +35,13 @@ class ProjectedHessian(Viewable):
         """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
         unknowns, blocks = self.unknowns, self._half_bound()
-        invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.lattice.mass, contact, self.t2, self.inverse)
+        invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
 
     def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         """Write that of D, for -mg_levels_pc_type jacobi."""
         unknowns, (blocks, contact) = self.unknowns, (self._half_bound(), self.contact)
         acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
-        own = unknowns.lattice.mass[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
+        own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
         unknowns.columns_to_write(diagonal)[:] = own
 
     def _half_bound(self) -> np.ndarray:

@@ -147,7 +147,7 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
         (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.lattice.mass
+        law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.ballast
         add_springs(count, q, *self.springs.arrays, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes.arrays, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]

@@ -50,11 +50,15 @@ UNIFORM_EFFORT = Effort(2, 3, 1)  # with multigrid smooth modes come at once; bu
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists."""
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists.
+
+    inertia : M is part of H, which outweighs what is not positive in the rest
+    """
 
     greatest: float
     total: float
     resists: bool
+    inertia: bool = True
 
     @property
     def is_harmless(self) -> bool:
@@ -64,7 +68,7 @@ class Compression:
     @property
     def least_curvature(self) -> float:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
-        return max(1 - self.greatest, 0.0) if not self.resists else 0.0
+        return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
 
     def exceeds(self, searched: "Compression") -> bool:
         """Whether modes may have come since another compression was searched."""
@@ -101,7 +105,7 @@ class LowestCurvature:
         ratios = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
-        return Compression(max(most), sum(sums), any(resist))
+        return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
 
     def lowest(
         self, q: np.ndarray, compression: Compression, alarmed: bool, hint: PETSc.Vec | None

@@ -116,8 +116,8 @@ class StepFunctional:
         return change, squared
 
     def _inner(self, a: np.ndarray, b: np.ndarray) -> float:
-        """a^T M b of this rank's (owned, 3)."""
-        return float(np.vdot(self.lattice.mass[:, None] * a, b))
+        """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""
+        return float(np.vdot(self.unknowns.inertia[:, None] * a, b))
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """|v|_M = sqrt(v^T M v)."""

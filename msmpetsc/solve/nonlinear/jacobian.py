@@ -97,8 +97,8 @@ class Jacobian:
 
     def _stiffness_ratio(self) -> float:
         """Return the greatest t^2 k / m of a free node (collective)."""
-        mass = self.unknowns.lattice.mass[self.unknowns.free]
-        return self.comm.allreduce(greatest(self.diagonal / mass - 1), MPI.MAX)
+        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
+        return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
 
     def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool, known: bool = False) -> None:
         """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.

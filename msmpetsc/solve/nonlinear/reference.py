@@ -19,9 +19,11 @@ PREFIX = "reference_"  # of its PETSc options
 class Reference:
     """The solver, its options under PREFIX; not timed with the run."""
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool):
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool, static: bool = False):
         with REFERENCE:
-            self.stepper = Stepper(comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX)
+            self.stepper = Stepper(
+                comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX, static=static
+            )
             self.stepper.set_up()
 
     def errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:

@@ -47,6 +47,7 @@ class StepResult:
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
     products   : with the Hessian, of all of it; those at multigrid's finest level are counted, too
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
+    static     : a state of equilibrium, not a motion
     """
 
     position: np.ndarray
@@ -58,6 +59,7 @@ class StepResult:
     explicit: bool = False
     swing: float = 0.0
     products: int = 0
+    static: bool = False
 
 
 class Stepper:
@@ -67,6 +69,7 @@ class Stepper:
     max_iterations : a budget instead of a promise: the step is taken as it is then
     touches        : whether steps may have a ``contact``
     prefix         : of its PETSc options
+    static         : what is looked for is an equilibrium: M weighs errors and nothing else
     observer       : called with the positions (l, 3) [m] of each iterate, when its error is known
 
     Raises InputError for PETSc options that do not go together (collective).
@@ -82,6 +85,7 @@ class Stepper:
         max_iterations: int | None = None,
         touches: bool = False,
         prefix: str = "",
+        static: bool = False,
     ):
         self.lattice, self.preset = lattice, preset
         self.budget = max_iterations or (preset.iterations if error is None else None) or 0
@@ -91,7 +95,7 @@ class Stepper:
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
         self.owned = ExitStack()
-        self.unknowns = Unknowns(comm, lattice)
+        self.unknowns = Unknowns(comm, lattice, static)
         self.owned.callback(self.unknowns.destroy)
         self.functional = StepFunctional(comm, self.unknowns, Elasticity(comm, lattice), time_step)
         self.first_guess = FirstGuess(self.functional, preset.extrapolate)

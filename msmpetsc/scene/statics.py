@@ -1,0 +1,45 @@
+"""Rules of a scene whose integrator is "static": what has no meaning where nothing moves is refused."""
+
+from typing import Any
+
+from pydantic import ValidationInfo
+
+from msmpetsc.scene.problems import rule
+
+STATIC = "static"  # time.integrator
+
+
+def _is_static(info: ValidationInfo) -> bool:
+    return getattr(info.data.get("time"), "integrator", None) == STATIC
+
+
+def no_wait(cls: Any, until: str, info: ValidationInfo) -> str:
+    """Refuse to wait for rest where there is nothing else (a validator of ``time.until``)."""
+    if until == "rest" and info.data.get("integrator") == STATIC:
+        raise rule(f'has no meaning for integrator = "{STATIC}": each state is at rest', "integrator")
+    return until
+
+
+def no_motion(cls: Any, start: Any, info: ValidationInfo) -> Any:
+    """Refuse a start in motion (a validator of ``start``)."""
+    if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):
+        raise rule(f'may have no velocity or spin where time.integrator = "{STATIC}": there is no inertia', "time")
+    return start
+
+
+def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
+    """Refuse obstacles that reflect or rub (a validator of ``obstacle``)."""
+    for number, obstacle in enumerate(obstacles if _is_static(info) else ()):
+        if obstacle.response == "reflect":
+            raise rule(
+                f'may not reflect where time.integrator = "{STATIC}", as obstacle.{number} does: nothing strikes it; '
+                'response = "penalty" presses',
+                "time",
+            )
+        if obstacle.friction:
+            raise rule(
+                f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on the '
+                'way there; time.until = "rest" ends a run in motion there',
+                "time",
+            )
+    return obstacles

@@ -1,0 +1,111 @@
+"""Rest: when a run in motion may end, for nothing would move any more (time.until = "rest").
+
+A standstill is no rest: a swing stands still where it turns, under forces that do not balance; and forces balance where
+it is fastest. So two lengths must be small, in the norm of M, relative to the farthest the body was from its start:
+how far it is from the equilibrium near by, and how far its velocity would carry it from there,
+
+    |e|_M,  H e = T^2 (grad E(q) - f_ext),    and    sqrt(v^T M w),  H w = T^2 M v,    H = M + T^2 (Hessian of E).
+
+T is all of the run's time: so of a swing of frequency omega the second is its amplitude |v| / omega, and of a body
+that nothing holds the way |v| T. They are estimated as errors of steps are, once a step has moved little.
+"""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import log
+from msmpetsc.model.build import Model
+from msmpetsc.model.checkpoint import AT_REST, Checkpoint
+from msmpetsc.model.environment import Environment
+from msmpetsc.scene.schema import Scene
+from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR
+from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
+
+PRESET, PREFIX = "newton-multigrid", "rest_"
+LONGEST_WAIT = 8  # steps between two looks
+LEAST = 1e-10  # of a cell: what a body moves less than that is rounding
+
+
+class Rest:
+    """Looks after each step whether the body has come to rest. All methods are collective.
+
+    has_come : whether it has
+    """
+
+    def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, environment: Environment):
+        self.comm, self.model, self.environment = comm, model, environment
+        self.time_step, self.duration = scene.time.step, scene.time.duration
+        self.error = scene.solver.error or DEFAULT_ERROR
+        self.last_change = environment.last_change(scene.time.duration)
+        self.farthest = 0.0  # from the start [m sqrt(kg)]
+        self.least = LEAST * model.lattice.cell_size * np.sqrt(comm.allreduce(float(model.lattice.mass.sum())))
+        self.next, self.wait = 0, 1  # step to look at next, steps until the one after that
+        self.has_come = False
+
+    def look(self, index: int, time: float, before: State, after: State) -> bool:
+        """Whether the body is at rest after step ``index``, which ended at ``time`` [s]."""
+        self.farthest = max(self.farthest, self._norm(after.q - self.model.start[0]))
+        limit = max(self.error * self.farthest, self.least)
+        moved = max(self._norm(after.q - before.q), self._norm(after.q - after.q_previous))
+        if time < self.last_change or index < self.next or moved > limit:
+            return False
+        self.has_come = self._is_at_rest(after, time, limit)
+        self.next, self.wait = index + self.wait, min(2 * self.wait, LONGEST_WAIT)
+        if self.has_come:
+            log.info(
+                "at rest after step %d (t = %.6g s): nothing would move by more than %.2g of the farthest it was",
+                index, time, self.error,
+            )  # fmt: skip
+        return self.has_come
+
+    def _norm(self, moved: np.ndarray) -> float:
+        """|v|_M of displacements (l, 3) [m]."""
+        own = moved[: self.model.lattice.owned]
+        return float(np.sqrt(self.comm.allreduce(float(self.model.lattice.mass @ (own**2).sum(axis=1)))))
+
+    def _is_at_rest(self, state: State, time: float, limit: float) -> bool:
+        """Whether both lengths are within the limit [m sqrt(kg)]."""
+        lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), bool(self.model.penalties)
+        preset = find_preset(PRESET)
+        stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
+        try:
+            sides = self.environment.no_sides if state.sides is None else state.sides
+            contact = self.environment.contact(state.q, time, self.time_step, sides)
+            stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
+            if not distance(stepper, state.q, limit) <= limit:
+                return False
+            return amplitude(stepper, state.q, state.velocity(self.time_step)) <= limit
+        finally:
+            stepper.destroy()
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next look depends on."""
+        numbers = {"farthest": self.farthest, "next_look": self.next, "look_wait": self.wait, AT_REST: self.has_come}
+        checkpoint.keep(numbers=numbers)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
+        self.farthest = checkpoint.number("farthest", 0.0, 0)
+        self.next, self.wait = checkpoint.count("next_look"), max(checkpoint.count("look_wait", LONGEST_WAIT), 1)
+
+
+def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:
+    """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there is no minimum
+    (collective)."""
+    functional = stepper.functional
+    stepper.unknowns.from_nodes(q, stepper.x)
+    iterate = functional.evaluate(stepper.x, stepper.work)
+    return stepper.control.estimate(iterate, functional.dual_norm(iterate.f), enough)
+
+
+def amplitude(stepper: Stepper, q: np.ndarray, v: np.ndarray) -> float:
+    """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in the norm of M;
+    infinite where there is none (collective)."""
+    functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
+    stepper.unknowns.from_nodes(v, f)
+    functional.memory.write(f)[:] *= functional.t2 * functional.mass
+    length = estimate(Iterate(q, f), functional.dual_norm(f), np.inf)
+    return float(np.sqrt(max(estimate.correction.dot(f), 0.0) / functional.t2)) if np.isfinite(length) else np.inf

@@ -1,0 +1,228 @@
+"""Statics: equilibria against closed forms and against motions that have come to rest, what is refused, load steps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import DENSITY, YOUNG, G, block_scene, play
+from lattices import COMM, one_spring
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.output.reader import Result
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
+from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.presets import PRESETS, find_preset
+
+COLUMN = np.array([0.25, 0.25, 2.0])  # [m]: 2 x 2 x 16 cells
+TOP = {"box": [[-9, -9, 1.99], [9, 9, 9]]}
+BOTTOM = {"box": [[-9, -9, -9], [9, 9, 0.01]]}
+STATE = {"step": 1.0, "duration": 1.0, "integrator": "static"}
+TIGHT = {"preset": "newton", "error": 1e-8}
+GRAVITY = {"acceleration": [0.0, 0.0, -G]}
+BEAM = {"pin": [{"region": BOTTOM}], "gravity": {"acceleration": [0.0, 1.0, -0.5]}}
+SWITCHED = [  # to one side, to the other, gone
+    {"region": TOP, "total": [1.0, 0.0, 0.0], "stop": 3.0},
+    {"region": TOP, "total": [-1.0, 0.0, 0.0], "start": 3.0, "stop": 5.0},
+]
+EULER = np.pi**2 / 4 * YOUNG * COLUMN[0] ** 4 / 12 / COLUMN[2] ** 2  # [N] that a clamped column buckles at
+
+
+def column(folder: Path, time: dict = STATE, **tables) -> Path:
+    return block_scene(folder, COLUMN, time=time, solver=TIGHT, **tables)
+
+
+def moved(model, frame) -> np.ndarray:
+    """Mean displacement (3,) [m] of the top."""
+    top = model.lattice.nodes[:, 2] > COLUMN[2] - 0.01
+    return (frame.position - model.lattice.nodes)[top].mean(axis=0)
+
+
+@pytest.mark.parametrize("preset", ["newton", "newton-multigrid", "lbfgs", "fast-msm"])
+def test_a_mass_hangs_on_a_spring(preset: str):
+    """x = r + m g / k: M, which would hold it back, has no part."""
+    m, k, r = 2.0, 300.0, 0.5
+    stepper = Stepper(COMM, one_spring(m, k, r), 0.3, find_preset(preset), 1e-9, static=True)
+    stepper.set_up()
+    nodes = stepper.lattice.nodes
+    load = np.array([[0.0, 0, 0], [0, 0, m * G]])
+    end = stepper.step(StepProblem(nodes, nodes, load), nodes).position[1, 2]
+    stepper.destroy()
+    assert end == pytest.approx(r + m * G / k, rel=1e-9)
+
+
+def test_a_hanging_bar(tmp_path: Path):
+    """rho g L^2 / (2 E) longer, but for the layer that the pins keep from narrowing: less than 2% here."""
+    scene = column(tmp_path, pin=[{"region": TOP}], gravity={"acceleration": [0.0, 0.0, -0.1]})
+    model, frames = play(scene)
+    bottom = model.lattice.nodes[:, 2] < 0.01
+    longer = -(frames[-1].position - model.lattice.nodes)[bottom, 2].mean()
+    assert longer == pytest.approx(DENSITY * 0.1 * COLUMN[2] ** 2 / (2 * YOUNG), rel=0.02)
+
+
+def test_ends_where_a_motion_comes_to_rest(tmp_path: Path):
+    """Long implicit Euler steps, each of which leaves 1 / (1 + (w t)^2) of a mode."""
+    model, frames = play(column(tmp_path, **BEAM))
+    _, motion = play(column(tmp_path, {"step": 1e3, "duration": 4e3}, **BEAM))
+    bent = np.abs(frames[-1].position - model.lattice.nodes).max()
+    assert bent > 0.5
+    assert np.abs(frames[-1].position - motion[-1].position).max() < 1e-7 * bent
+    assert frames[-1].kinetic == 0 and frames[-1].energy_gained == 0
+
+
+def test_states_under_forces_that_come_and_go(tmp_path: Path):
+    """A state for each time; those under the same loads are the same, and cost nothing."""
+    states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
+    model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED))
+    there, back, rest = (moved(model, frames[n]) for n in (1, 3, 5))
+    assert there[0] > 0.05 and back * [1, 1, 1] == pytest.approx(there * [-1, 1, 1], abs=1e-7)
+    assert np.abs(rest).max() < 1e-7
+    for first, second in ((1, 2), (3, 4), (5, 6)):
+        assert np.array_equal(frames[first].position, frames[second].position)
+        assert frames[first].iterations > 0 == frames[second].iterations == frames[second].products
+
+
+def test_anchors_lead_from_state_to_state_and_let_go(tmp_path: Path):
+    anchor = {"region": TOP, "path": [{"time": 2.0, "by": [0.0, 0.8, -0.4]}], "stop": 3.0}
+    states = {"step": 1.0, "duration": 3.0, "integrator": "static"}
+    model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], anchor=[anchor]))
+    assert moved(model, frames[1]) == pytest.approx([0, 0.4, -0.2])
+    assert moved(model, frames[2]) == pytest.approx([0, 0.8, -0.4])
+    assert np.abs(frames[3].position - model.lattice.nodes).max() < 1e-6
+
+
+def test_an_obstacle_presses(tmp_path: Path):
+    """k d of all nodes that it holds is the weight, where the body is but guided from the side."""
+    plane = {"shape": "plane", "point": [0, 0, 0.01], "normal": [0, 0, 1], "response": "penalty", "stiffness": 1e3}
+    guide = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.0, 0.0]}]}]
+    model, frames = play(column(tmp_path, anchor=guide, obstacle=[plane]))
+    bottom = model.lattice.nodes[:, 2] < 0.01
+    depth = 0.01 - frames[-1].position[bottom, 2]
+    along = YOUNG * COLUMN[0] ** 2 / COLUMN[2]  # [N/m]
+    assert (depth > 0).all()
+    assert 1e3 * depth.sum() == pytest.approx(along * (0.01 - depth.mean()), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "tables, words",
+    [
+        ({}, "held by nothing"),
+        ({"pin": [{"region": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]]}}]}, "held at a point"),
+        ({"pin": [{"region": {"box": [[-0.01, -1, -0.01], [0.01, 1, 0.01]]}}]}, "held along a line"),
+        ({"pin": [{"region": {"box": [[-1, -1, 0.99], [1, 1, 1.01]]}}]}, None),
+        ({"pin": [{"region": {"box": [[-1, -1, 0.99], [1, 0.01, 1.01]]}}]}, "held along a line"),
+    ],
+)
+def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, words: str | None):
+    scene = column(tmp_path, gravity={"acceleration": [0.0, 0.0, -0.1]}, **tables)
+    if words is None:
+        assert len(play(scene)[1]) == 2
+        return
+    with pytest.raises(InputError, match=words) as refused:
+        play(scene)
+    assert "\n" not in str(refused.value)
+
+
+def test_one_line_and_status_2(tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert main(["run", str(column(tmp_path)), "-o", str(tmp_path / "out.h5")]) == 2
+    assert [line for line in capsys.readouterr().err.splitlines() if "no equilibrium" in line][1:] == []
+
+
+@pytest.mark.parametrize(
+    "tables, words",
+    [
+        ({"start": {"velocity": [0.0, 0.0, 1.0]}}, "no velocity"),
+        ({"obstacle": [{"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}]}, "may not reflect"),
+        (
+            {
+                "obstacle": [
+                    {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.1}
+                ]
+            },
+            "no friction",
+        ),
+    ],
+)
+def test_what_only_motion_has_is_refused(tmp_path: Path, tables: dict, words: str):
+    with pytest.raises(InputError, match=words):
+        load_scene(column(tmp_path, pin=[{"region": BOTTOM}], **tables), (), PRESETS)
+
+
+@pytest.mark.parametrize("sideways", [0.0, 1e-3])
+@pytest.mark.parametrize("share, buckles", [(0.8, False), (2.0, True)])
+def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles: bool):
+    """Under more than Euler's load (its own bending is stiffer by 169/140 (h/b)^2) it is no longer straight, even
+    where nothing pushes it aside: the straight state is a saddle."""
+    force = [{"region": TOP, "total": [sideways * EULER, 0.0, -share * EULER]}]
+    model, frames = play(column(tmp_path, pin=[{"region": BOTTOM}], force=force))
+    aside = np.hypot(*moved(model, frames[-1])[:2])
+    assert (aside > 0.5) == buckles
+    assert frames[-1].step_error < 1e-7
+
+
+def test_a_load_comes_on_in_steps_and_ends_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Brought on at once or in parts: the equilibrium is but one."""
+    _, at_once = play(column(tmp_path, **BEAM))
+    monkeypatch.setattr(LoadSteps, "__init__", start_with_an_eighth)
+    _, in_parts = play(column(tmp_path, **BEAM))
+    assert np.abs(at_once[-1].position - in_parts[-1].position).max() < 1e-7
+    assert in_parts[-1].iterations > at_once[-1].iterations
+
+
+def start_with_an_eighth(steps: LoadSteps) -> None:
+    steps.reached, steps.size, steps.count, steps.failures = 0.0, 1 / 8, 0, 0
+
+
+def test_shares_of_a_load():
+    steps, tried = LoadSteps(), []
+    for succeeds in (False, False, True, True, False, True, True):
+        tried.append(steps.share)
+        if succeeds:
+            steps.take()
+        else:
+            steps.halve(StepFailed("failed"))
+    assert tried == [1.0, 0.5, 0.25, 0.75, 1.0, 0.875, 1.0]
+    assert steps.is_done and steps.count == 4
+
+
+def test_a_load_that_no_share_can_be_found_of_fails():
+    steps = LoadSteps()
+    with pytest.raises(StepFailed, match=r"and failed with 0\.001 of the load"):
+        for _ in range(20):
+            steps.halve(StepFailed("went astray"))
+
+
+@pytest.mark.parametrize("on_failure", ["fallback", "substep"])
+def test_a_state_that_fails_is_found_another_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str):
+    """By the robust preset, or by way of states at times between, which are states, too: anchors go there in parts."""
+    anchor = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.05, 0.0]}]}]
+    tables = {"pin": [{"region": BOTTOM}], "anchor": anchor}
+    _, usual = play(column(tmp_path, **tables))
+    try_share = LoadPath.try_share
+
+    def fails_at_first(path: LoadPath, steps: LoadSteps) -> StepResult:
+        if path.time_step == STATE["step"] and path.stepper.preset is find_preset("newton"):
+            raise StepFailed("failed")
+        return try_share(path, steps)
+
+    monkeypatch.setattr(LoadPath, "try_share", fails_at_first)
+    _, frames = play(column(tmp_path, **tables, safety={"on_failure": on_failure}))
+    assert (frames[-1].fallbacks if on_failure == "fallback" else frames[-1].substeps) > 0
+    assert np.abs(frames[-1].position - usual[-1].position).max() < 1e-7
+    assert frames[-1].kinetic == 0
+
+
+def test_ranks_and_resuming(tmp_path: Path, msmpetsc):
+    """Three ranks come to the same states as one, and a run that was stopped goes on to the same bits."""
+    states = {"step": 1.0, "duration": 4.0, "integrator": "static"}
+    scene = column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED)
+    names = [str(tmp_path / name) for name in ("one.h5", "three.h5", "two.h5")]
+    assert main(["run", str(scene), "-o", names[0]]) == 0
+    assert msmpetsc(3, "run", scene, "-o", names[1]).returncode == 0
+    assert main(["run", str(scene), "-o", names[2], "--frames", "2"]) == 0
+    assert main(["run", str(scene), "--resume", names[2], "--force"]) == 0
+    with Result(names[0]) as one, Result(names[1]) as three, Result(names[2]) as two:
+        assert np.abs(one.frames.position[:] - three.frames.position[:]).max() < 1e-7
+        assert np.array_equal(one.frames.position[:], two.frames.position[:])

@@ -31,6 +31,13 @@ class Environment:
         self._acting: list[bool] = []
         self._load = np.zeros((self.lattice.owned, 3), like=nodes)
 
+    def events(self) -> list[float]:
+        """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
+        parts = [*self.loads, *self.anchors, *self.obstacles]
+        edges = [getattr(part, name, None) for part in parts for name in ("start", "stop")]
+        turns = [time for part in (*self.anchors, *self.obstacles) for time in part.path.times.tolist()]
+        return [float(time) for time in (*edges, *turns) if time is not None]
+
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
         acting = [load.acts_at(time) for load in self.loads]

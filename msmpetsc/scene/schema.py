@@ -218,6 +218,12 @@ class Time(Table):
         None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
     )
 
+    error: float | None = Field(
+        None, gt=0, lt=1, description="error of the motion that steps are chosen for, relative; all of one length if absent"
+    )
+    shortest: Positive | None = Field(None, description="of these steps; step / 1024 if absent [s]")
+    longest: Positive | None = Field(None, description="of these steps; 64 step if absent [s]")
+
     _has_a_use = field_validator("substep")(_only_for("integrator", "verlet"))
 
     @field_validator("duration")

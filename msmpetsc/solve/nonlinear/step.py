@@ -47,6 +47,8 @@ class StepResult:
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
     products   : with the Hessian, of all of it; those at multigrid's finest level are counted, too
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
+    steps      : that it stands for
+    time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
     position: np.ndarray
@@ -58,6 +60,8 @@ class StepResult:
     explicit: bool = False
     swing: float = 0.0
     products: int = 0
+    steps: int = 1
+    time_error: float = np.nan
 
 
 class Stepper:

@@ -33,10 +33,11 @@ class Environment:
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
-        parts = [*self.loads, *self.anchors, *self.obstacles]
-        edges = [getattr(part, name, None) for part in parts for name in ("start", "stop")]
-        turns = [time for part in (*self.anchors, *self.obstacles) for time in part.path.times.tolist()]
-        return [float(time) for time in (*edges, *turns) if time is not None]
+        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
+        times = [time for path in paths for time in path.times.tolist()]
+        times += [time for load in self.loads for time in (load.start, load.stop) if time is not None]
+        times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
+        return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
 
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""

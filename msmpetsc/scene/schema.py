@@ -219,7 +219,10 @@ class Time(Table):
     )
 
     error: float | None = Field(
-        None, gt=0, lt=1, description="error of the motion that steps are chosen for, relative; all of one length if absent"
+        None,
+        gt=0,
+        lt=1,
+        description="error of the motion that steps are chosen for, relative; all of one length if absent",
     )
     shortest: Positive | None = Field(None, description="of these steps; step / 1024 if absent [s]")
     longest: Positive | None = Field(None, description="of these steps; 64 step if absent [s]")

@@ -26,10 +26,9 @@ from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.schema import Scene, Solver, Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.integrators.step_control import Grid, Measure, StepControl
+from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.nonlinear.step import StepResult
 
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
@@ -54,7 +53,7 @@ def refuse_bad_steps(time: Time) -> None:
     """Raise InputError for bounds and integrators that steps of many lengths cannot have."""
     if time.error is None:
         if time.shortest is not None or time.longest is not None:
-            raise InputError("time.shortest and time.longest are bounds of the steps that time.error chooses: give it too")
+            raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
         return
     if time.integrator not in METHODS:
         raise InputError(
@@ -108,7 +107,7 @@ class Adaptive:
 
     make    : makes an integrator of steps of one length
     balance : examines the steps that stand
-    tick    : of the state's time (step_control.Grid)
+    tick    : of the state's time (step_control.Ticks)
     last    : level of the step taken last
     """
 
@@ -130,7 +129,7 @@ class Adaptive:
         self.order, self.local_error = METHODS[scene.time.integrator]
         self.levels, steps = levels_of(scene.time), scene.time.steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
-        self.grid = Grid(self.time_step, steps, self.levels[0], environment.events())
+        self.ticks = Ticks(self.time_step, steps, self.levels[0], environment.events())
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
         self.tick, self.last, self.taken = 0, 0, Taken()
         self.mass = comm.allreduce(float(lattice.mass.sum()))
@@ -138,7 +137,7 @@ class Adaptive:
     @property
     def unknowns(self) -> int:
         """Free nodes of this rank."""
-        return self._integrator(self.control.level).unknowns
+        return self._integrator_last().unknowns
 
     def set_up(self) -> None:
         """Make ready the integrator of the first step, and say what is to come."""
@@ -166,14 +165,14 @@ class Adaptive:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
         frame = round(time / self.time_step)
-        wanted, total = frame * self.grid.length(0), StepResult(state.q, state.q_previous, 0.0, 0, 0, steps=0)
-        if self.tick < wanted - self.grid.length(0):  # Recovery has taken a step meanwhile
-            self.tick = wanted - self.grid.length(0)
+        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, 0.0, 0, 0, steps=0)
+        if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
+            self.tick = wanted - self.ticks.length(0)
         while self.tick < wanted:
             result, state = self._step(state)
             total = sum_of(total, result)
         if self.tick > wanted or not total.steps:
-            total = self._within(total, state, (self.tick - wanted) / self.grid.length(self.last), time)
+            total = self._within(total, state, (self.tick - wanted) / self.ticks.length(self.last), time)
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
@@ -188,7 +187,7 @@ class Adaptive:
 
     def _step(self, state: State) -> tuple[StepResult, State]:
         """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
-        restarts = self.grid.is_event(self.tick)
+        restarts = self.ticks.is_event(self.tick)
         wasted = StepResult(state.q, state.q_previous, 0.0, 0, 0)
         while True:
             level = self._next_level(state)
@@ -211,7 +210,7 @@ class Adaptive:
     def _next_level(self, state: State) -> int:
         """Of the step to be tried: no more than twice as long as the last, whose history it needs."""
         most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
-        return self.grid.fitting(self.tick, most)
+        return self.ticks.fitting(self.tick, most)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
         """The state for a step of a level, with the history that it looks back to."""
@@ -223,8 +222,8 @@ class Adaptive:
 
     def _end(self, level: int) -> float:
         """Time at which a step ends [s]: just before what begins or ends there."""
-        tick = self.tick + self.grid.length(level)
-        return self.grid.time(tick) * (JUST_BEFORE if self.grid.is_event(tick) else 1.0)
+        tick = self.tick + self.ticks.length(level)
+        return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
 
     def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
         """A step of a level, and what it shows."""
@@ -243,7 +242,7 @@ class Adaptive:
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
-        sums += [mass @ (coming**2).sum(axis=1), 0.5 * t * (free @ np.sqrt((struck**2).sum(axis=1)))]
+        sums += [mass @ (coming**2).sum(axis=1), t * (free @ np.sqrt((struck**2).sum(axis=1)))]
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 
@@ -252,7 +251,7 @@ class Adaptive:
     ) -> tuple[StepResult, State]:
         """A step that stands, as the scene's step has it, with the work of those that did not."""
         t, T = self._length(level), self.time_step
-        self.tick += self.grid.length(level)
+        self.tick += self.ticks.length(level)
         self.last = level
         self.taken.add(level)
         history = after.history or (before.q, before.velocity(t))
@@ -272,7 +271,8 @@ class Adaptive:
     def save(self, checkpoint: Checkpoint, state: State) -> None:
         """Store the account, and what the integrator used last depends on."""
         self.control.save(checkpoint)
-        checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | vars(self.taken))
+        counts = {f"taken_{name}": count for name, count in vars(self.taken).items()}
+        checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | counts)
         self._integrator_last().save(checkpoint, state)
         if self.environment.penalties:  # as not every level's has it
             checkpoint.rows.setdefault("contact_bound", np.zeros(self.lattice.owned))
@@ -283,10 +283,10 @@ class Adaptive:
     def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
         self.control.restore(checkpoint)
         lowest, highest = self.levels
-        self.tick = int(checkpoint.number("tick", 0, 0, self.grid.ticks))
+        self.tick = int(checkpoint.number("tick", 0, 0, self.ticks.ticks))
         self.last = int(checkpoint.number("last_level", 0, lowest, highest))
-        most = 2**53
-        self.taken = Taken(**{name: int(checkpoint.number(name, value, -99, most)) for name, value in vars(Taken()).items()})
+        counts = {name: checkpoint.number(f"taken_{name}", value, -99, 2**53) for name, value in vars(Taken()).items()}
+        self.taken = Taken(**{name: int(count) for name, count in counts.items()})
         self._integrator(self.last).restore(checkpoint, state, time)
 
     def forget(self) -> None:
@@ -302,7 +302,7 @@ class Adaptive:
         if taken.steps:
             shortest, longest = self._length(taken.shortest), self._length(taken.longest)
             log.info(
-                "%d steps of %.3g to %.3g s, %d more taken again; the motion is off by some %.2g of it, asked were %.2g",
+                "%d steps of %.3g to %.3g s, %d taken again; the motion is off by some %.2g of its size (time.error = %g)",
                 taken.steps, shortest, longest, taken.again, control.estimate, control.asked,
             )  # fmt: skip
 

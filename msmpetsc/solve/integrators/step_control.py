@@ -109,7 +109,7 @@ class StepControl:
         self.spent = checkpoint.number("error_spent", 0.0, 0.0, most)
 
 
-class Grid:
+class Ticks:
     """Times of steps, counted in ticks: the shortest step. A step of a level starts at a multiple of its own length,
     so that frames lie at ends of steps or within one; none goes beyond a known event, nor the end of the run.
 

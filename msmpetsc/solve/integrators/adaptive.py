@@ -1,12 +1,8 @@
 """Steps as long as the motion allows: an integrator of steps of many lengths, powers of two apart.
 
-A step's local error is, from positions q and velocities v at its two ends,
-
-    implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
-    BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
-
-and of nodes that bounce off in it, which do so at its end and not when they touch, half a step times the velocity that
-they changed by, as the mean by mass: they push the rest of the body late. step_control adds them up.
+What a step adds to the error of the trajectory is its local error (local_error), and of nodes that bounce off in it,
+which do so at its end and not when they touch, a step times the velocity that they changed by, as the mean by mass:
+they push the rest of the body late. step_control adds both up and chooses the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
 that BDF2 needs where the length changes. All methods are collective.
@@ -26,6 +22,7 @@ from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.schema import Scene, Solver, Time
 from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
@@ -34,19 +31,6 @@ from msmpetsc.solve.nonlinear.step import StepResult
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
 JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
-
-
-def euler_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
-    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
-    return 0.5 * time_step * (w - v)
-
-
-def bdf2_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
-    """The same of BDF2."""
-    return 1.6 * (x - q - 0.5 * time_step * (v + w))
-
-
-METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
 
 
 def refuse_bad_steps(time: Time) -> None:
@@ -130,6 +114,7 @@ class Adaptive:
         self.levels, steps = levels_of(scene.time), scene.time.steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
         self.ticks = Ticks(self.time_step, steps, self.levels[0], environment.events())
+        self.mean = NeighbourMean(comm, lattice)
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
         self.tick, self.last, self.taken = 0, 0, Taken()
         self.mass = comm.allreduce(float(lattice.mass.sum()))
@@ -221,8 +206,11 @@ class Adaptive:
         return replace(state, q_previous=state.q - length * v, history=history)
 
     def _end(self, level: int) -> float:
-        """Time at which a step ends [s]: just before what begins or ends there."""
-        tick = self.tick + self.ticks.length(level)
+        """Time at which a step ends [s]."""
+        return self._reached(self.tick + self.ticks.length(level))
+
+    def _reached(self, tick: int) -> float:
+        """Time of a step that ends at a tick [s]: just before what begins or ends there."""
         return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
 
     def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
@@ -237,8 +225,8 @@ class Adaptive:
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
         free = mass * ~self.environment.fixed_at(self._end(level))[owned]
         struck = after.velocity(t)[owned] - w
-        local = self.local_error(q, v, x, w, t)
-        sums = [free @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
+        local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
+        sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
@@ -287,7 +275,7 @@ class Adaptive:
         self.last = int(checkpoint.number("last_level", 0, lowest, highest))
         counts = {name: checkpoint.number(f"taken_{name}", value, -99, 2**53) for name, value in vars(Taken()).items()}
         self.taken = Taken(**{name: int(count) for name, count in counts.items()})
-        self._integrator(self.last).restore(checkpoint, state, time)
+        self._integrator(self.last).restore(checkpoint, state, self._reached(self.tick))
 
     def forget(self) -> None:
         for integrator in self.kept.values():
@@ -302,11 +290,12 @@ class Adaptive:
         if taken.steps:
             shortest, longest = self._length(taken.shortest), self._length(taken.longest)
             log.info(
-                "%d steps of %.3g to %.3g s, %d taken again; the motion is off by some %.2g of its size (time.error = %g)",
+                "%d steps of %.3g to %.3g s, %d taken again; the motion is some %.2g of its size off (time.error = %g)",
                 taken.steps, shortest, longest, taken.again, control.estimate, control.asked,
             )  # fmt: skip
 
     def destroy(self) -> None:
+        self.mean.destroy()
         for integrator in self.kept.values():
             integrator.destroy()
 

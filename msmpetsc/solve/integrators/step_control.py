@@ -6,7 +6,9 @@ errors, from a credit that grows as the motion does, and with time:
     credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
 
 A step may spend what it earns itself and a share of what was saved: what was saved in an even flight is there for the
-impact that ends it. Steps are 2^level times as long as the scene's.
+impact that ends it. Where nothing is left it may still spend a part of what each step could, were all as long as those
+so far: to keep one moment much better than all others takes more steps than it is worth. Steps are 2^level times as
+long as the scene's.
 """
 
 import math
@@ -17,9 +19,10 @@ from dataclasses import dataclass
 from msmpetsc.model.checkpoint import Checkpoint
 
 SHARE = 1 / 8  # of what was saved, that a step may spend
+FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case
 EXCESS = 2.0  # times what a step may spend: it is taken all the same, the next one is shorter
 EASE = 1.0  # of what a step twice as long may spend: what it would take, before it is tried
-CALM = 4  # steps that would have let the next be twice as long, before it is
+CALM = 2  # steps that would have let the next be twice as long, before it is
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,8 @@ class StepControl:
     step, duration  : a step of level 0, and the whole run [s]
     lowest, highest : levels
     level           : wanted next
-    spent           : [m], the sum of local errors
+    spent           : sum of local errors [m]
+    steps, time     : number of the steps that they are of, and their length [s]
     """
 
     def __init__(self, order: int, error: float, step: float, duration: float, levels: tuple[int, int]):
@@ -46,6 +50,7 @@ class StepControl:
         self.lowest, self.highest = levels
         self.level, self.calm = min(0, self.highest), 0
         self.motion = self.passed = self.spent = 0.0  # [m], [m] mean over the duration, [m]
+        self.steps, self.time = 0, 0.0
 
     @property
     def estimate(self) -> float:
@@ -56,7 +61,8 @@ class StepControl:
         """What a step of a level may spend [m]."""
         motion, part = max(self.motion, measure.motion), self.step * 2.0**level / self.duration
         saved = 0.5 * self.asked * (motion + self.passed) - self.spent
-        return 0.5 * self.asked * motion * part + SHARE * max(saved, 0.0)
+        fair = self.asked * motion * self.time / self.duration / max(self.steps, 1)
+        return max(0.5 * self.asked * motion * part + SHARE * max(saved, 0.0), FAIR * fair)
 
     def judge(self, level: int, measure: Measure) -> bool:
         """Whether a step of a level stands as it was taken; else the level for another try is set."""
@@ -84,7 +90,8 @@ class StepControl:
         is_calm = measure.error * growth <= EASE * self.allowed(longer, measure)
         self.motion = max(self.motion, measure.motion)
         self.passed += self.motion * self.step * 2.0**level / self.duration
-        self.spent += measure.error
+        self.spent, self.steps = self.spent + measure.error, self.steps + 1
+        self.time += self.step * 2.0**level
         if measure.error > allowed:
             self.shorten(level)
             return
@@ -94,7 +101,7 @@ class StepControl:
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the account."""
-        numbers = {"step_level": self.level, "step_calm": self.calm}
+        numbers = {"step_level": self.level, "step_calm": self.calm, "steps_paid": self.steps, "time_paid": self.time}
         checkpoint.keep(
             numbers=numbers | {"motion": self.motion, "motion_passed": self.passed, "error_spent": self.spent}
         )
@@ -104,6 +111,7 @@ class StepControl:
         most = sys.float_info.max
         self.level = int(checkpoint.number("step_level", min(0, self.highest), self.lowest, self.highest))
         self.calm = checkpoint.count("step_calm", CALM)
+        self.steps, self.time = checkpoint.count("steps_paid"), checkpoint.number("time_paid", 0.0, 0.0, most)
         self.motion = checkpoint.number("motion", 0.0, 0.0, most)
         self.passed = checkpoint.number("motion_passed", 0.0, 0.0, most)
         self.spent = checkpoint.number("error_spent", 0.0, 0.0, most)

@@ -21,7 +21,9 @@ def march(control: StepControl, rate: Callable[[float], float], until: float = 1
     while tick < until * ticks.ticks:
         level, start = ticks.fitting(tick, control.level), ticks.time(tick)
         hardest = max(rate(start), rate(ticks.time(tick + ticks.length(level))))
-        if control.judge(level, Measure(hardest * (STEP * 2.0**level) ** (control.order + 1), 1.0)):
+        measure = Measure(hardest * (STEP * 2.0**level) ** (control.order + 1), 1.0)
+        if control.accepts(level, measure):
+            control.pay(level, measure)
             taken.append((start, level))
             tick += ticks.length(level)
     return taken
@@ -66,16 +68,19 @@ def test_rest_lengthens_steps():
 def test_a_step_too_far_off_is_taken_again_shorter_but_for_the_shortest():
     account = control(2, 1e-2, (-3, 0))
     far = Measure(1e-2, 1.0)
-    assert not account.judge(0, far) and account.level < 0 and account.spent == 0
-    assert not account.judge(-2, Measure(float("nan"), 1.0)) and account.level == -3
-    assert account.judge(-3, far) and account.spent == far.error
+    assert not account.accepts(0, far) and account.level < 0
+    assert not account.accepts(-2, Measure(float("nan"), 1.0)) and account.level == -3
+    assert account.accepts(-3, far) and account.spent == 0
+    account.pay(-3, far)
+    assert account.spent == far.error
     assert not account.shorten(-3)
 
 
 def test_nothing_that_moves_needs_no_short_steps():
     account = control(1, 1e-2)
     for _ in range(100):
-        assert account.judge(account.level, Measure(0.0, 0.0))
+        assert account.accepts(account.level, Measure(0.0, 0.0))
+        account.pay(account.level, Measure(0.0, 0.0))
     assert account.level == LEVELS[1] and account.estimate == 0
 
 

@@ -40,9 +40,7 @@ def refuse_bad_steps(time: Time) -> None:
             raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
         return
     if time.integrator not in METHODS:
-        raise InputError(
-            f'time.error is for integrator = "implicit-euler" or "bdf2": {time.integrator} keeps to its stability limit'
-        )
+        raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
     if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
         raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
 
@@ -179,7 +177,7 @@ class Adaptive:
             before = self._begun(state, level, restarts)
             try:
                 result, after, measure = self._try(before, level)
-                stands = self.control.judge(level, measure)
+                stands = self.control.accepts(level, measure)
                 if stands:
                     self.balance.examine(before, result, after, self._end(level), self._length(level))
             except StepFailed:
@@ -189,6 +187,7 @@ class Adaptive:
             else:
                 wasted = sum_of(wasted, result)
             if stands:
+                self.control.pay(level, measure)
                 return self._taken(wasted, result, before, after, level)
             self.taken.again += 1
 

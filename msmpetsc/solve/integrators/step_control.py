@@ -64,14 +64,13 @@ class StepControl:
         fair = self.asked * motion * self.time / self.duration / max(self.steps, 1)
         return max(0.5 * self.asked * motion * part + SHARE * max(saved, 0.0), FAIR * fair)
 
-    def judge(self, level: int, measure: Measure) -> bool:
+    def accepts(self, level: int, measure: Measure) -> bool:
         """Whether a step of a level stands as it was taken; else the level for another try is set."""
         allowed = self.allowed(level, measure)
-        if level > self.lowest and not measure.error <= EXCESS * allowed:
-            self.shorten(level, self._levels_down(measure.error / max(allowed, sys.float_info.min)))
-            return False
-        self._account(level, measure, allowed)
-        return True
+        if level == self.lowest or measure.error <= EXCESS * allowed:
+            return True
+        self.shorten(level, self._levels_down(measure.error / max(allowed, sys.float_info.min)))
+        return False
 
     def _levels_down(self, excess: float) -> int:
         """Halvings that bring an error down by so much; one at the least, as where it is not finite."""
@@ -84,8 +83,9 @@ class StepControl:
         self.level, self.calm = max(self.lowest, level - by), 0
         return level > self.lowest
 
-    def _account(self, level: int, measure: Measure, allowed: float) -> None:
+    def pay(self, level: int, measure: Measure) -> None:
         """Enter a step that stands, and choose the level that comes next."""
+        allowed = self.allowed(level, measure)
         longer, growth = self.level + 1, 2.0 ** ((self.order + 1) * (self.level + 1 - level))
         is_calm = measure.error * growth <= EASE * self.allowed(longer, measure)
         self.motion = max(self.motion, measure.motion)

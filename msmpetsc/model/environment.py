@@ -31,6 +31,14 @@ class Environment:
         self._acting: list[bool] = []
         self._load = np.zeros((self.lattice.owned, 3), like=nodes)
 
+    def events(self) -> list[float]:
+        """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
+        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
+        times = [time for path in paths for time in path.times.tolist()]
+        times += [time for load in self.loads for time in (load.start, load.stop) if time is not None]
+        times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
+        return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
+
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
         acting = [load.acts_at(time) for load in self.loads]

@@ -79,6 +79,8 @@ class Frame:
     substeps: Annotated[int, _number("i8", "1", "shorter steps taken in place of whole ones")] = 0
     fallbacks: Annotated[int, _number("i8", "1", "steps solved by the robust method")] = 0
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
+    steps: Annotated[int, _number("i8", "1", "time steps taken")] = 0
+    time_error: Annotated[float, _number("f8", "1", "estimated relative error of the motion so far")] = math.nan
 
 
 FRAME_FIELDS: dict[str, Field] = {

@@ -227,6 +227,11 @@ class Time(Table):
     until: Literal["duration", "rest"] = Field(
         "duration", description="when the run ends: or as soon as all is at rest"
     )
+    error: float | None = Field(
+        None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
+    )
+    shortest: Positive | None = Field(None, description="of the steps that error chooses; step / 1024 if absent [s]")
+    longest: Positive | None = Field(None, description="of them; 64 step if absent [s]")
 
     _has_a_use = field_validator("substep")(_only_for("integrator", "verlet"))
     _moves = field_validator("until")(no_wait)

@@ -111,6 +111,10 @@ class EnergyBalance:
         """Know the energies of the state that a run begins with (collective)."""
         self.energies = self._energies(state.q, state.velocity(time_step), 0.0, state.sides)
 
+    def show(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> None:
+        """Know the energies of a moment within a step, or at the end of one taken before (collective)."""
+        self.energies = self._energies(q, v, time, sides)
+
     def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> Energies:
         """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
         lattice, environment = self.lattice, self.environment

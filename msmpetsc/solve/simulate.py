@@ -20,6 +20,7 @@ from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
+from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
 from msmpetsc.solve.linear.surface import SurfaceMotion
@@ -51,6 +52,9 @@ def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
 def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
     """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
     solvers = solvers_of(scene, probes)
+    refuse_bad_steps(scene.time)
+    if scene.time.error and probes != Probes():
+        raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
     if "" not in solvers:
         refuse_unused(comm, set(), at_end=True, awaited=tuple(solvers))
     on_root(comm, lambda: refuse_bad_values(solvers))
@@ -69,6 +73,8 @@ class FrameCost:
     energy_error: float = np.nan
     substeps: int = 0
     fallbacks: int = 0
+    steps: int = 0
+    time_error: float = np.nan
 
     def measure(self, errors: np.ndarray) -> None:
         """Take note of a step whose true errors were measured."""
@@ -81,6 +87,7 @@ class FrameCost:
         self.ksp_its += result.ksp_its
         self.products += result.products
         self.wall_time += wall_time
+        self.steps, self.time_error = self.steps + result.steps, result.time_error
         if cost:
             self.substeps += cost.substeps
             self.fallbacks += cost.fallbacks
@@ -115,9 +122,12 @@ class Simulation:
         self.trace: dict | None = None
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
         make = partial(make_integrator, comm, model, self.environment)
-        self.integrator = make(scene.time, scene.solver, probes=probes)
         swings = scene.time.integrator != "implicit-euler"
         self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings)
+        self.adaptive: Adaptive | None = None
+        if scene.time.error:
+            self.adaptive = Adaptive(comm, model.lattice, self.environment, scene, make, self.balance)
+        self.integrator = self.adaptive or make(scene.time, scene.solver, probes=probes)
         self.recovery = Recovery(scene, lambda time, solver, prefix: make(time, solver, prefix=prefix), self.balance)
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
@@ -145,6 +155,8 @@ class Simulation:
             yield frame
         self.monitors.sum_up()
         self.recovery.sum_up()
+        if self.adaptive:
+            self.adaptive.sum_up()
 
     def _advance(self, index: int) -> Frame | None:
         """The next step (collective), as a frame if that is stored. Raises StepFailed, naming the step."""
@@ -158,7 +170,8 @@ class Simulation:
                 result, after, cost = self.recovery.step(self.state, time, None)
             else:
                 result, after = self.integrator.advance(self.state, time)
-                self.balance.examine(self.state, result, after, time, self.time_step)
+                if not self.adaptive:  # which has each of its own examined
+                    self.balance.examine(self.state, result, after, time, self.time_step)
         except StepFailed as failure:
             result, after, cost = self._recovered(index, time, failure)
         before, self.state = self.state, after

@@ -56,6 +56,10 @@ def by(integrator: str, scene: dict) -> dict:
     return scene | {"time": scene["time"] | {"integrator": integrator}}
 
 
+def by_error(error: float, scene: dict) -> dict:
+    return scene | {"time": scene["time"] | {"error": error}}
+
+
 def solver(preset: str) -> dict:
     return {"preset": preset} if PRESETS[preset].iterations else {"preset": preset, "error": 1e-3}
 
@@ -90,6 +94,20 @@ CASES = {
     ),
     "substep": fall(solver=solver("anderson"), obstacle=PRESSING, safety={"on_failure": "substep"}),
     "fallback": fall(solver=solver("anderson"), obstacle=PRESSING, safety={"on_failure": "fallback"}),
+    "by error": by_error(0.1, by("bdf2", swing(solver=LOOSE, anchor=LED))),
+    "by error, long steps": by_error(0.5, swing(solver=LOOSE, gravity={"acceleration": [0.0, 1e-3, -1e-2]})),
+    "by error, reflected": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=[GROUND]))),
+    "substep, by error": by_error(
+        0.3,
+        swing(
+            solver=solver("anderson"),
+            start={"scatter": 0.9},
+            safety={"on_failure": "substep"},
+            material=SOFT | {"young_modulus": 1e6},
+            time={"step": 0.02, "duration": 0.16, "shortest": 0.02},
+        ),
+    ),
+    "by error, pressed": by_error(0.3, fall(solver=LOOSE, obstacle=PRESSING)),
 }
 
 

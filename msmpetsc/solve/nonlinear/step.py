@@ -48,6 +48,8 @@ class StepResult:
     products   : with the Hessian, of all of it; those at multigrid's finest level are counted, too
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     static     : a state of equilibrium, not a motion
+    steps      : that it stands for
+    time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
     position: np.ndarray
@@ -60,6 +62,8 @@ class StepResult:
     swing: float = 0.0
     products: int = 0
     static: bool = False
+    steps: int = 1
+    time_error: float = np.nan
 
 
 class Stepper:

@@ -1,0 +1,311 @@
+"""Steps as long as the motion allows: an integrator of steps of many lengths, powers of two apart.
+
+What a step adds to the error of the trajectory is its local error (local_error), and of nodes that bounce off in it,
+which do so at its end and not when they touch, a step times the velocity that they changed by, as the mean by mass:
+they push the rest of the body late. step_control adds both up and chooses the next step.
+
+Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
+that BDF2 needs where the length changes. All methods are collective.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.environment import Environment
+from msmpetsc.model.lattice import Lattice
+from msmpetsc.scene.schema import Scene, Solver, Time
+from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
+from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
+from msmpetsc.solve.nonlinear.step import StepResult
+
+LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
+KEPT = 4  # integrators of as many lengths, those used last
+JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
+
+
+def refuse_bad_steps(time: Time) -> None:
+    """Raise InputError for bounds and integrators that steps of many lengths cannot have."""
+    if time.error is None:
+        if time.shortest is not None or time.longest is not None:
+            raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
+        return
+    if time.integrator not in METHODS:
+        raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
+    if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
+        raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
+
+
+def levels_of(time: Time) -> tuple[int, int]:
+    """The lowest and the highest level of a scene's steps."""
+    lowest = LOWEST if time.shortest is None else math.ceil(math.log2(time.shortest / time.step) - 1e-9)
+    highest = HIGHEST if time.longest is None else math.floor(math.log2(time.longest / time.step) + 1e-9)
+    return max(lowest, -40), min(highest, 40)
+
+
+def between(
+    q_0: np.ndarray, v_0: np.ndarray, q_1: np.ndarray, v_1: np.ndarray, time_step: float, s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities at a share s of a step, by the cubic through those at its ends; s may lie outside."""
+    t, r = time_step, 1 - s
+    q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0 + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1
+    v = 6 * s * r / t * (q_1 - q_0) + r * (1 - 3 * s) * v_0 + s * (3 * s - 2) * v_1
+    return q, v
+
+
+@dataclass
+class Taken:
+    """Steps taken so far.
+
+    steps, again      : that stand, and that were taken again shorter
+    shortest, longest : levels
+    """
+
+    steps: int = 0
+    again: int = 0
+    shortest: int = 99
+    longest: int = -99
+
+    def add(self, level: int) -> None:
+        """Count one that stands."""
+        self.steps += 1
+        self.shortest, self.longest = min(self.shortest, level), max(self.longest, level)
+
+
+class Adaptive:
+    """Takes the scene's steps (an Integrator) in steps of its own, shorter or longer ones.
+
+    States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time: the end of a step
+    longer than the scene's. Their history is where the last step began.
+
+    make    : makes an integrator of steps of one length
+    balance : examines the steps that stand
+    tick    : of the state's time (step_control.Ticks)
+    last    : level of the step taken last
+    """
+
+    looks_back = True
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        lattice: Lattice,
+        environment: Environment,
+        scene: Scene,
+        make: Callable[[Time, Solver], Integrator],
+        balance: EnergyBalance,
+    ):
+        refuse_bad_steps(scene.time)
+        assert scene.time.error is not None
+        self.comm, self.lattice, self.environment, self.balance = comm, lattice, environment, balance
+        self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
+        self.order, self.local_error = METHODS[scene.time.integrator]
+        self.levels, steps = levels_of(scene.time), scene.time.steps
+        self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
+        self.ticks = Ticks(self.time_step, steps, self.levels[0], environment.events())
+        self.mean = NeighbourMean(comm, lattice)
+        self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
+        self.tick, self.last, self.taken = 0, 0, Taken()
+        self.mass = comm.allreduce(float(lattice.mass.sum()))
+
+    @property
+    def unknowns(self) -> int:
+        """Free nodes of this rank."""
+        return self._integrator_last().unknowns
+
+    def set_up(self) -> None:
+        """Make ready the integrator of the first step, and say what is to come."""
+        self._integrator(self.control.level)
+        shortest, longest = (self.time_step * 2.0**level for level in self.levels)
+        log.info("steps of %.3g to %.3g s, for an error of %.2g of the motion", shortest, longest, self.control.asked)
+
+    def _integrator(self, level: int) -> Integrator:
+        """That of a level; one that was not used last has forgotten all that a checkpoint would have to know."""
+        if level not in self.kept:
+            time = self.time.model_copy(update={"step": self._length(level), "error": None})
+            self.kept[level] = self.make(time, self.solver)
+            self.kept[level].set_up()
+        elif level != next(reversed(self.kept)):
+            self.kept[level] = self.kept.pop(level)
+            self.kept[level].forget()
+        while len(self.kept) > KEPT:
+            self.kept.pop(next(iter(self.kept))).destroy()
+        return self.kept[level]
+
+    def _length(self, level: int) -> float:
+        """Of a step [s]."""
+        return self.time_step * 2.0**level
+
+    def advance(self, state: State, time: float) -> tuple[StepResult, State]:
+        """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
+        frame = round(time / self.time_step)
+        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, 0.0, 0, 0, steps=0)
+        if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
+            self.tick = wanted - self.ticks.length(0)
+        while self.tick < wanted:
+            result, state = self._step(state)
+            total = sum_of(total, result)
+        if self.tick > wanted or not total.steps:
+            total = self._within(total, state, (self.tick - wanted) / self.ticks.length(self.last), time)
+        return replace(total, time_error=self.control.estimate), state
+
+    def _within(self, total: StepResult, state: State, share: float, time: float) -> StepResult:
+        """What a frame shows that comes by a share of the last step before its end."""
+        q, v = state.q, state.velocity(self.time_step)
+        if share > 0 and state.history:
+            q, v = between(*state.history, q, v, self._length(self.last), 1 - share)
+            led = self.environment.prescribed(q, time)
+            q = q if led is None else led
+        self.balance.show(q, v, time, state.sides)
+        return replace(total, position=q, previous=q - self.time_step * v)
+
+    def _step(self, state: State) -> tuple[StepResult, State]:
+        """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
+        restarts = self.ticks.is_event(self.tick)
+        wasted = StepResult(state.q, state.q_previous, 0.0, 0, 0)
+        while True:
+            level = self._next_level(state)
+            before = self._begun(state, level, restarts)
+            try:
+                result, after, measure = self._try(before, level)
+                stands = self.control.accepts(level, measure)
+                if stands:
+                    self.balance.examine(before, result, after, self._end(level), self._length(level))
+            except StepFailed:
+                stands = False
+                if not self.control.shorten(level):
+                    raise
+            else:
+                wasted = sum_of(wasted, result)
+            if stands:
+                self.control.pay(level, measure)
+                return self._taken(wasted, result, before, after, level)
+            self.taken.again += 1
+
+    def _next_level(self, state: State) -> int:
+        """Of the step to be tried: no more than twice as long as the last, whose history it needs."""
+        most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
+        return self.ticks.fitting(self.tick, most)
+
+    def _begun(self, state: State, level: int, restarts: bool) -> State:
+        """The state for a step of a level, with the history that it looks back to."""
+        length, v = self._length(level), state.velocity(self.time_step)
+        history = None if restarts or self.order < 2 else state.history
+        if history and level != self.last:
+            history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
+        return replace(state, q_previous=state.q - length * v, history=history)
+
+    def _end(self, level: int) -> float:
+        """Time at which a step ends [s]."""
+        return self._reached(self.tick + self.ticks.length(level))
+
+    def _reached(self, tick: int) -> float:
+        """Time of a step that ends at a tick [s]: just before what begins or ends there."""
+        return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
+
+    def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
+        """A step of a level, and what it shows."""
+        result, after = self._integrator(level).advance(before, self._end(level))
+        return result, after, self._measure(before, result, after, level)
+
+    def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
+        """Of all ranks' nodes."""
+        owned, t = slice(self.lattice.owned), self._length(level)
+        mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
+        x, w = result.position[owned], (result.position - result.previous)[owned] / t
+        free = mass * ~self.environment.fixed_at(self._end(level))[owned]
+        struck = after.velocity(t)[owned] - w
+        local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
+        sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
+        coming = t * v
+        if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
+            coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
+        sums += [mass @ (coming**2).sum(axis=1), t * (free @ np.sqrt((struck**2).sum(axis=1)))]
+        error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
+        return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
+
+    def _taken(
+        self, wasted: StepResult, result: StepResult, before: State, after: State, level: int
+    ) -> tuple[StepResult, State]:
+        """A step that stands, as the scene's step has it, with the work of those that did not."""
+        t, T = self._length(level), self.time_step
+        self.tick += self.ticks.length(level)
+        self.last = level
+        self.taken.add(level)
+        history = after.history or (before.q, before.velocity(t))
+        previous = result.position - T / t * (result.position - result.previous)
+        result = replace(
+            result, previous=previous, iterations=wasted.iterations, ksp_its=wasted.ksp_its, products=wasted.products
+        )
+        return result, replace(after, q_previous=after.q - T * after.velocity(t), history=history)
+
+    def follow(self) -> None:
+        """Refused before."""
+
+    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
+        """Unknown (NaN): a frame is no single step."""
+        return np.full(2, np.nan), None
+
+    def save(self, checkpoint: Checkpoint, state: State) -> None:
+        """Store the account, and what the integrator used last depends on."""
+        self.control.save(checkpoint)
+        counts = {f"taken_{name}": count for name, count in vars(self.taken).items()}
+        checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | counts)
+        self._integrator_last().save(checkpoint, state)
+        if self.environment.penalties:  # as not every level's has it
+            checkpoint.rows.setdefault("contact_bound", np.zeros(self.lattice.owned))
+
+    def _integrator_last(self) -> Integrator:
+        return self.kept[next(reversed(self.kept))]
+
+    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
+        self.control.restore(checkpoint)
+        lowest, highest = self.levels
+        self.tick = int(checkpoint.number("tick", 0, 0, self.ticks.ticks))
+        self.last = int(checkpoint.number("last_level", 0, lowest, highest))
+        counts = {name: checkpoint.number(f"taken_{name}", value, -99, 2**53) for name, value in vars(Taken()).items()}
+        self.taken = Taken(**{name: int(count) for name, count in counts.items()})
+        self._integrator(self.last).restore(checkpoint, state, self._reached(self.tick))
+
+    def forget(self) -> None:
+        for integrator in self.kept.values():
+            integrator.forget()
+
+    def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
+        self._integrator_last().refuse_unused_options(at_end, awaited)
+
+    def sum_up(self) -> None:
+        """Say at the end of a run what steps were taken, and how far off the motion may be."""
+        taken, control = self.taken, self.control
+        if taken.steps:
+            shortest, longest = self._length(taken.shortest), self._length(taken.longest)
+            log.info(
+                "%d steps of %.3g to %.3g s, %d taken again; the motion is some %.2g of its size off (time.error = %g)",
+                taken.steps, shortest, longest, taken.again, control.estimate, control.asked,
+            )  # fmt: skip
+
+    def destroy(self) -> None:
+        self.mean.destroy()
+        for integrator in self.kept.values():
+            integrator.destroy()
+
+
+def sum_of(total: StepResult, result: StepResult) -> StepResult:
+    """A result with the work of another before it."""
+    return replace(
+        result,
+        error=max(total.error, result.error),
+        iterations=total.iterations + result.iterations,
+        ksp_its=total.ksp_its + result.ksp_its,
+        products=total.products + result.products,
+        steps=total.steps + result.steps,
+    )

@@ -1,0 +1,243 @@
+"""Steps as long as the motion allows: the error that is reached, and where steps become short or long."""
+
+import logging
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import CELL, block_scene, play
+from conftest import run
+from mpi4py import MPI
+
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model.build import build_model
+from msmpetsc.model.fields import Frame
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.integrators.adaptive import between
+from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.simulate import refuse_bad_options
+
+STEP, DURATION = 0.01, 0.96
+SOFT = {"young_modulus": 1e5, "density": 1000.0}
+CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
+GRAVITY = {"acceleration": [0, 0, -9.81]}
+LOOSE = {"preset": "newton", "error": 1e-4}
+
+
+def beam(folder: Path, integrator: str = "bdf2", step: float = STEP, duration: float = DURATION, **tables) -> Path:
+    """A clamped beam of 32 cells that swings under its weight, some periods in ``DURATION``."""
+    more = {key: tables.pop(key) for key in ("error", "shortest", "longest") if key in tables}
+    time = {"step": step, "duration": duration, "integrator": integrator} | more
+    scene = {"time": time, "pin": CLAMPED, "gravity": GRAVITY, "material": SOFT, "solver": LOOSE}
+    return block_scene(folder, np.array([1.0, 0.25, 0.25]), **scene | tables)
+
+
+def error_of(model, frames: list[Frame], exact: list[Frame]) -> float:
+    """Trajectory error (study.distances), of the frames of two runs at the same times."""
+    assert [frame.time for frame in frames] == pytest.approx([frame.time for frame in exact])
+    pairs = zip(frames, exact, strict=True)
+    mass, rest = model.lattice.mass, model.lattice.nodes
+    off = sum(mass @ ((a.position - b.position) ** 2).sum(axis=1) for a, b in pairs)
+    return float(np.sqrt(off / sum(mass @ ((b.position - rest) ** 2).sum(axis=1) for b in exact)))
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
+    """By BDF2 in steps of a 16th, which is off by less than 1e-3 (as steps of a 32nd show)."""
+    output = {"surface": False, "every": 16}
+    return play(beam(tmp_path_factory.mktemp("exact"), step=STEP / 16, output=output))[1]
+
+
+# ---- formulas
+
+
+@pytest.mark.parametrize("method, order", [("implicit-euler", 1), ("bdf2", 2)])
+def test_the_local_error_of_a_swing(method: str, order: int):
+    """Of x'' = -w^2 x from exact values, as the scheme itself steps; its leading part, so that the ratio tends to 1."""
+    ratios = []
+    for wt in (0.04, 0.02):
+        tau = wt if order == 1 else 2 / 3 * wt
+        x, v = np.cos, lambda t: -np.sin(t)
+        z = np.array([x(1.0), v(1.0)])
+        if order == 2:
+            z = (4 * z - np.array([x(1 - wt), v(1 - wt)])) / 3
+        after = np.linalg.solve(np.eye(2) - tau * np.array([[0, 1], [-1, 0]]), z)
+        local = METHODS[method][1](x(1.0), v(1.0), after[0], after[1], wt)
+        ratios.append(local / (after[0] - x(1 + wt)))
+    assert abs(ratios[1] - 1) < 0.6 * abs(ratios[0] - 1) < 0.1
+
+
+def test_frames_within_a_step_are_of_third_order_and_meet_its_ends():
+    q_0, v_0, q_1, v_1 = np.random.default_rng(1).normal(size=(4, 5, 3))
+    for s, q, v in ((0.0, q_0, v_0), (1.0, q_1, v_1)):
+        found = between(q_0, v_0, q_1, v_1, 0.3, s)
+        np.testing.assert_allclose(found[0], q, atol=1e-14)
+        np.testing.assert_allclose(found[1], v, atol=1e-13)
+    errors = []
+    for t in (0.1, 0.05):
+        q, v = between(np.sin(1.0), np.cos(1.0), np.sin(1 + t), np.cos(1 + t), t, 0.3)
+        errors.append([abs(q - np.sin(1 + 0.3 * t)), abs(v - np.cos(1 + 0.3 * t))])
+    slopes = np.log2(np.divide(*errors))
+    assert slopes[0] > 3.8 and slopes[1] > 2.8
+
+
+def test_means_over_neighbours_keep_what_is_smooth_and_take_what_is_rough(tmp_path: Path):
+    model = build_model(MPI.COMM_SELF, load_scene(beam(tmp_path)))
+    mean, nodes = NeighbourMean(MPI.COMM_SELF, model.lattice), model.lattice.nodes
+    even, rough = np.ones_like(nodes), np.cos(np.pi / CELL * nodes.sum(axis=1))[:, None] * np.ones(3)
+    np.testing.assert_allclose(mean(even), even, rtol=1e-13)
+    assert np.linalg.norm(mean(np.sin(3 * nodes))) > 0.7 * np.linalg.norm(np.sin(3 * nodes))
+    assert np.linalg.norm(mean(rough)) < 0.02 * np.linalg.norm(rough)
+    mean.destroy()
+
+
+# ---- the error reached
+
+
+@pytest.mark.parametrize("integrator, error", [("bdf2", 3e-2), ("bdf2", 1e-2), ("implicit-euler", 0.1)])
+def test_the_error_reached_is_the_error_asked(tmp_path: Path, exact: list[Frame], integrator: str, error: float):
+    """Within a factor of three, and so is the estimate of it."""
+    model, frames = play(beam(tmp_path, integrator, error=error))
+    reached = error_of(model, frames, exact)
+    assert error / 3 < reached < 3 * error
+    assert reached / 3 < frames[-1].time_error < 3 * reached
+    assert frames[0].steps == 0 and frames[-1].time_error > frames[1].time_error > 0
+
+
+def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact: list[Frame]):
+    """Frames 16 times as dense as the steps that 3e-2 needs: most lie within one, and are as good."""
+    dense = beam(tmp_path, step=STEP / 16, error=3e-2)
+    model, frames = play(dense)
+    steps = np.array([frame.steps for frame in frames])
+    assert (steps == 0).sum() > 2 * (steps > 0).sum()
+    assert 1e-2 < error_of(model, frames[::16], exact) < 9e-2
+    q = np.array([frame.position for frame in frames])
+    rough = np.abs(np.diff(q, 3, axis=0)).max()
+    assert rough < 0.02 * np.abs(np.diff(q, axis=0)).max()  # no kinks at frames within
+    energy = np.array([frame.kinetic + frame.elastic + frame.potential for frame in frames])
+    assert np.abs(np.diff(energy)).max() < 0.02 * max(frame.kinetic for frame in frames)
+
+
+# ---- where steps are short
+
+
+def ball(folder: Path, **tables) -> Path:
+    """A block that falls, and is thrown back by the ground after 0.1 s."""
+    ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "reflect"}
+    time = {"step": 0.01, "duration": 0.15, "integrator": "bdf2", "error": 2e-2}
+    return block_scene(folder, gravity=GRAVITY, obstacle=[ground], time=time, solver=LOOSE, **tables)
+
+
+def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path):
+    _, frames = play(ball(tmp_path))
+    steps = np.array([frame.steps for frame in frames])
+    assert steps[:9].max() <= 1 and steps[9:].max() >= 4
+    fallen = 0.5 * 9.81 * frames[8].time ** 2
+    assert frames[8].position[:, 2].min() == pytest.approx(-fallen, rel=1e-6)  # BDF2 is exact there
+    assert frames[-1].momentum[2] > 0
+
+
+def test_rest_lengthens_steps(tmp_path: Path):
+    """A hanging block that implicit Euler has brought to rest: four frames a step and more."""
+    _, frames = play(beam(tmp_path, "implicit-euler", step=0.1, duration=20.0, error=0.5))
+    steps = np.array([frame.steps for frame in frames])
+    assert steps[1:20].mean() > 4 * steps[-32:].mean()
+    assert steps[-32:].sum() < 8
+
+
+@pytest.mark.parametrize("stop", [0.1, 0.115])
+def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float):
+    """At that time the nodes are still where they were led; a step of one length lets them go as it begins."""
+    end = {"region": {"half_space": {"point": [0.99, 0, 0], "normal": [1, 0, 0]}}}
+    led = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
+    time = {"step": 0.005, "duration": 0.16}
+    model, frames = play(beam(tmp_path, **time, error=0.1, anchor=led, gravity={"acceleration": [0, 0, 0]}))
+    last = next(frame for frame in frames if frame.time == pytest.approx(stop))
+    tip = model.lattice.nodes[:, 0] > 0.99
+    assert last.position[tip, 2] - model.lattice.nodes[tip, 2] == pytest.approx(0.02, rel=1e-8)
+    assert (frames[-1].position[tip, 2] - model.lattice.nodes[tip, 2]).min() > 0.0201  # flung on
+
+
+def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    step, calls = Stepper.step, []
+
+    def failing(stepper: Stepper, *given, **named):
+        calls.append(stepper)
+        if len(calls) in (6, 7):
+            raise StepFailed("did not converge: as the test has it; try nothing", "line search")
+        return step(stepper, *given, **named)
+
+    monkeypatch.setattr(Stepper, "step", failing)
+    _, frames = play(beam(tmp_path, error=0.1, duration=0.4))
+    assert sum(frame.substeps for frame in frames) == 0  # nothing was left for [safety] to do
+    assert len(frames) == 41
+
+
+def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The scene's step is then taken in pieces, and steps are chosen again after it."""
+    step, calls = Stepper.step, []
+
+    def failing(stepper: Stepper, *given, **named):
+        calls.append(stepper)
+        if len(calls) == 6:
+            raise StepFailed("did not converge: as the test has it; try nothing", "line search")
+        return step(stepper, *given, **named)
+
+    monkeypatch.setattr(Stepper, "step", failing)
+    scene = beam(tmp_path, error=0.1, shortest=STEP, duration=0.4, safety={"on_failure": "substep"})
+    _, frames = play(scene)
+    assert len(frames) == 41 and sum(frame.substeps for frame in frames) == 2
+    assert sum(frame.steps for frame in frames[10:]) < 31
+
+
+def test_what_a_body_with_no_way_on_says_is_the_failure_of_the_shortest_step(tmp_path: Path, monkeypatch):
+    def failing(*given, **named):
+        raise StepFailed("did not converge: as the test has it; try nothing", "line search")
+
+    monkeypatch.setattr(Stepper, "step", failing)
+    with pytest.raises(StepFailed, match=r"^frame 1 "):
+        play(beam(tmp_path, error=0.1, duration=0.4))
+
+
+# ---- what is said and refused
+
+
+def test_a_run_says_its_steps_and_its_estimate(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.INFO, log.name):
+        log.propagate = True
+        play(beam(tmp_path, error=0.1, duration=0.4))
+    assert "steps of 9.77e-06 to 0.64 s, for an error of 0.1" in caplog.text
+    assert "of its size off" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "more, says",
+    [
+        ({"integrator": "verlet", "error": 0.1}, 'only, not "verlet"'),
+        ({"shortest": 0.001}, "time.error chooses"),
+        ({"error": 0.1, "shortest": 0.1}, "must lie between"),
+        ({"error": 0.1, "longest": 0.001}, "must lie between"),
+    ],
+)
+def test_what_has_no_meaning_is_refused_in_a_line(tmp_path: Path, more: dict, says: str):
+    scene = load_scene(beam(tmp_path, **more))
+    with pytest.raises(InputError, match=says) as refused:
+        refuse_bad_options(MPI.COMM_SELF, scene, Probes())
+    assert "\n" not in str(refused.value)
+
+
+def test_ranks_take_the_same_steps(tmp_path: Path):
+    scene, files = beam(tmp_path, error=3e-2, duration=0.4), {}
+    for ranks in (1, 3):
+        path = tmp_path / f"{ranks}.h5"
+        done = run(ranks, "-m", "msmpetsc", "run", scene, "-o", path, timeout=90)
+        assert done.returncode == 0, done.stderr
+        with h5py.File(path) as file:
+            files[ranks] = file["frames/steps"][:], file["frames/position"][:], file["frames/time_error"][:]
+    assert np.array_equal(files[1][0], files[3][0])
+    assert np.abs(files[1][1] - files[3][1]).max() < 1e-3 * np.abs(np.diff(files[1][1], axis=0)).max()
+    np.testing.assert_allclose(files[1][2][1:], files[3][2][1:], rtol=1e-2)

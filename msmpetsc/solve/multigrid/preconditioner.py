@@ -91,10 +91,10 @@ class LatticePreconditioner:
         return not self.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
-        """The Hessian of contact (owned, 9) at q; (0, 9) where there is none."""
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(q, True) if contact else ():
+        for nodes, added in contact.hessian(q, False) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 

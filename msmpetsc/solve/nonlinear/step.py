@@ -20,6 +20,7 @@ from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
+from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum
@@ -90,6 +91,7 @@ class Stepper:
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
+        self.kinks = FrictionKinks()
         self.owned = ExitStack()
         self.unknowns = Unknowns(comm, lattice)
         self.owned.callback(self.unknowns.destroy)
@@ -172,6 +174,7 @@ class Stepper:
             self.functional.begin(problem)
             self.control.begin()
             self.base[:] = problem.fixed
+            self.kinks.begin(problem.contact)
             self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
             if start is None and self.jacobian.preconditioner.has_to_balance:
                 iterate = self._evaluate(self.x)
@@ -293,16 +296,23 @@ class Stepper:
         if self.preset.true_hessian and x.handle == snes.getSolution().handle:
             return 0.0  # the start of a line search, which is where it was linearised
         with LOCAL:
-            change, distance = self.functional.change(self.functional.positions(x), self.base)
+            q = self.functional.positions(x)
+            self.kinks.see(q, self.base)
+            change, distance = self.functional.change(q, self.base)
         return -1.0 if self.control.is_flat and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: the Jacobian there, and what that solve starts from."""
         with LOCAL:
+            if snes.its > 0:
+                self.kinks.see(self.functional.positions(x), self.base)  # where no objective was asked for
             self.unknowns.to_nodes(x, self.base)
             self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
             known = self.control.now.corrected and not self.projected  # the estimate has linearised at this very x
-            self.jacobian.linearise(self.base, self.functional.problem.contact, self.projected, known)
+            self.jacobian.linearise(
+                self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
+            )
+            self.kinks.await_step()
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
         if self.preset.start_from_b:

@@ -18,6 +18,7 @@ from msmpetsc.solve.nonlinear.rounding import Rounding
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
+KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
@@ -74,6 +75,7 @@ class ErrorControl:
     def begin(self) -> None:
         """Know nothing yet of a new step."""
         self.now = StepError(self.target)
+        self.estimate.begin()
 
     def judge(self, iterate: Iterate) -> None:
         """Know the error of an iterate; only a bound on it while that is far too large."""
@@ -99,7 +101,8 @@ class ErrorControl:
     def _estimated(self, iterate: Iterate, distance: float, goal: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         now = self.now
-        length = self.estimate(iterate, now.residual, EARLY * goal * distance if goal else np.inf)
+        enough, will_do = EARLY * goal * distance if goal else np.inf, KNOWN * goal * distance
+        length = self.estimate(iterate, now.residual, enough, will_do=will_do)
         if not np.isfinite(length):
             now.alarmed = True
             return now.bound

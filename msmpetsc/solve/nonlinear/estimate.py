@@ -20,6 +20,9 @@ CHECK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 UNIFORMLY_CLOSE = 0.3  # with multigrid, which leaves out nothing that is smooth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
+USUAL_LEAST = (
+    0.2  # lambda with multigrid: no more until solves show less, for the first of CG's Ritz values are too large
+)
 LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
 MOST = 512
 
@@ -37,7 +40,8 @@ class ErrorEstimate:
         self.length = np.inf  # the last estimate [m sqrt(kg)]
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
-        self.lowest = 1.0
+        self.lowest, self.will_do = 1.0, 0.0
+        self.least, self.missing = USUAL_LEAST, 0.0
         self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
@@ -50,16 +54,30 @@ class ErrorEstimate:
         self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._converged)
 
-    def __call__(self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0) -> float:
+    def begin(self) -> None:
+        """Know nothing yet of a new step."""
+        self.least = USUAL_LEAST
+
+    def heed(self, ksp: PETSc.KSP) -> None:
+        """Know lambda as a solve of this step with CG on about the same Hessian has shown it."""
+        if ksp.its > 0 and ksp.getType() == PETSc.KSP.Type.CG:
+            least = ksp.computeExtremeSingularValues()[1]
+            self.least = min(self.least, least) if least > 0 else self.least
+
+    def __call__(
+        self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0, will_do: float = 0.0
+    ) -> float:
         """Estimate |x - x*|_M at an iterate (collective); a result over ``enough`` may be too low.
 
-        bound  : on it, |F|_(M^-1) where H is no less than M
-        lowest : eigenvalue of M^(-1) H, as far as is known
+        bound   : on it, |F|_(M^-1) where H is no less than M
+        lowest  : eigenvalue of M^(-1) H, as far as is known
+        will_do : an error known to be no more than that need not be known better
 
         Infinite where the Hessian is not positive definite: there no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
+        self.will_do, self.missing = will_do, 0.0
         with ESTIMATE:
             self.linearise(iterate.q)
             self.ksp.solve(iterate.f, self.correction)
@@ -69,6 +87,9 @@ class ErrorEstimate:
     def _length(self) -> float:
         """|e_k|_M, grown once more as it has since k was half of it; or, where CG was cut short, all that it may be."""
         length, its = self.functional.norm(self.correction), self.ksp.its
+        if self.missing > 0:
+            self.residual = self.ksp.buildResidual(self.residual)
+            return length + self.missing
         left, half = self._left(), self.lengths.get(its // 2, 0.0)
         if its >= MOST and left > LEFT * length:
             return length + left
@@ -85,6 +106,8 @@ class ErrorEstimate:
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
+        if self.preconditioner.is_uniform and self._will_do(ksp, its, residual):
+            return reasons.CONVERGED_ITS
         every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
         if residual > 0 and (its == 0 or its % max(every // 2, 1)):
             return reasons.ITERATING
@@ -96,6 +119,19 @@ class ErrorEstimate:
         if not self.preconditioner.is_uniform and 4 * its**2 * length < self.bound:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
+
+    def _will_do(self, ksp: PETSc.KSP, its: int, residual: float) -> bool:
+        """Whether |e_k|_M, and with it all that may be missing, is less than will do."""
+        if not 0 < residual < np.sqrt(self.lowest * self.least) * self.will_do:
+            return False
+        if its > 0:
+            self.heed(ksp)
+        missing = residual / np.sqrt(self.lowest * self.least)
+        length = self.functional.norm(ksp.getSolution())
+        if length + missing > self.will_do:
+            return False
+        self.missing = missing
+        return True
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Whether e is near in the norm of H, as far as CG can show."""

@@ -139,6 +139,7 @@ class Stepper:
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
         snes.setFromOptions()
+        ksp.setComputeEigenvalues(True)  # for what the estimate has to know
         return snes, ksp
 
     def _create_control(self, error: float | None) -> tuple[ErrorControl, Minimum]:
@@ -340,6 +341,7 @@ class Stepper:
         iterate = self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
+            control.estimate.heed(self.ksp)
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
         control.now.alarmed |= self.ksp.reason == INDEFINITE

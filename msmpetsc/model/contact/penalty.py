@@ -94,7 +94,7 @@ class Friction:
 
     def all_secant(self) -> np.ndarray:
         """Return what ``blocks`` takes for all nodes to have their secants, (a,) bool."""
-        return np.ones(len(self.nodes), bool, like=self.limit)
+        return self.limit >= 0
 
     def passes_kink(self, q: np.ndarray, base: np.ndarray) -> np.ndarray:
         """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""

@@ -19,7 +19,7 @@ from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.model.lattice import CORNERS
-from msmpetsc.model.springs import spring_block
+from msmpetsc.model.springs import SYMMETRIC, spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
@@ -49,7 +49,6 @@ def _products(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 WEIGHTS = _weights()
 OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times one code and the other
 OF_NODES = _products(WEIGHTS)
-SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a block stand among 6
 
 
 @dataclass(frozen=True)

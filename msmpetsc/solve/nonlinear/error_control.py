@@ -8,6 +8,7 @@ error.
 from dataclasses import dataclass
 
 import numpy as np
+from petsc4py import PETSc
 
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
@@ -33,6 +34,7 @@ class StepError:
     error       : of the last iterate, estimated or bounded
     bound       : on it
     residual    : |F|_(M^-1) of the last iterate
+    ratio       : of bound to error, as the last Newton correction has shown it
     early       : how many times the goal an error may be to be estimated
     corrected   : the last iterate's error was estimated, so that its Newton correction is known
     alarmed     : something has shown a negative curvature
@@ -44,6 +46,7 @@ class StepError:
     error: float = np.inf
     bound: float = np.inf
     residual: float = np.inf
+    ratio: float = 1.0
     early: float = EARLY
     corrected: bool = False
     alarmed: bool = False
@@ -77,6 +80,13 @@ class ErrorControl:
         self.now = StepError(self.target)
         self.estimate.begin()
 
+    def heed(self, ksp: PETSc.KSP, correction: PETSc.Vec) -> None:
+        """Know the error that the last iterate had, the length of its Newton correction, and what that solve showed."""
+        self.estimate.heed(ksp)
+        length = self.functional.norm(correction)
+        if np.isfinite(self.now.residual) and length > 0:
+            self.now.ratio = max(self.now.residual / length, 1.0)
+
     def judge(self, iterate: Iterate) -> None:
         """Know the error of an iterate; only a bound on it while that is far too large."""
         now, functional = self.now, self.functional
@@ -90,7 +100,7 @@ class ErrorControl:
         if not distance > 0 or not np.isfinite(now.residual):  # the start x = y tells nothing yet
             return 0.0 if now.at_rounding else np.inf
         now.bound = now.residual / distance
-        if now.bound > self.ratio * now.early * now.goal and not now.at_rounding:
+        if now.bound > max(self.ratio, now.ratio) * now.early * now.goal and not now.at_rounding:
             return now.bound
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature

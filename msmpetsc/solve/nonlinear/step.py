@@ -341,7 +341,8 @@ class Stepper:
         iterate = self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
-            control.estimate.heed(self.ksp)
+            if self.preset.true_hessian and not self.projected:
+                control.heed(self.ksp, snes.getSolutionUpdate())
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
         control.now.alarmed |= self.ksp.reason == INDEFINITE

@@ -202,13 +202,13 @@ def add_springs(
             c, ex, ey, ez = spring_block(x, y, z, rest[s], k[s], b, True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
-                f, block = t2 * factor[entry], values[places[i, pair[entry]]]
-                block[0] += f * xx
-                block[1] += f * xy
-                block[2] += f * xz
-                block[3] += f * yy
-                block[4] += f * yz
-                block[5] += f * zz
+                f, place = t2 * factor[entry], places[i, pair[entry]]
+                values[place, 0] += f * xx  # a view of the block would take as long again
+                values[place, 1] += f * xy
+                values[place, 2] += f * xz
+                values[place, 3] += f * yy
+                values[place, 4] += f * yz
+                values[place, 5] += f * zz
 
 
 @kernel

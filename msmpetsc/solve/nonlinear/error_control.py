@@ -22,6 +22,7 @@ FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was esti
 KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
+KINKED = 0.1  # the tightest while friction has kinks on the way of a full step
 SHARE = 0.5  # of the error that would do, left to the linear solve
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
 
@@ -136,10 +137,11 @@ class ErrorControl:
         now = self.now
         return now.bound < FULL_STEP_ERROR and (now.corrected or not now.doubts)
 
-    def relative_tolerance(self) -> float:
-        """ksp_rtol of the next linear solve: it need not gain more digits than are missing."""
-        missing = self.now.bound / self.ratio
-        return min(max(SHARE * self.now.goal / missing, self.tightest), LOOSEST)
+    def relative_tolerance(self, has_kinks: bool) -> float:
+        """ksp_rtol of the next linear solve: it need not gain more digits than are missing, and no more than one where
+        g ``has_kinks`` on its way, which it does not know of."""
+        missing, tightest = self.now.bound / self.ratio, max(self.tightest, KINKED) if has_kinks else self.tightest
+        return min(max(SHARE * self.now.goal / missing, tightest), LOOSEST)
 
     def doubt(self, has_moved: bool) -> bool:
         """Go on from a point that is no minimum, or farther from one than it seemed; whether there is more to gain.

@@ -91,7 +91,7 @@ class Stepper:
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
-        self.kinks = FrictionKinks()
+        self.kinks = FrictionKinks(comm)
         self.owned = ExitStack()
         self.unknowns = Unknowns(comm, lattice)
         self.owned.callback(self.unknowns.destroy)
@@ -370,7 +370,8 @@ class Stepper:
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
         if self.preset.inexact and self.options.is_default("ksp_rtol"):
-            self.ksp.setTolerances(rtol=self.control.relative_tolerance())
+            has_kinks = self.preset.true_hessian and self.kinks.are_any
+            self.ksp.setTolerances(rtol=self.control.relative_tolerance(has_kinks))
 
     def _abandon(self) -> None:
         """After an error within PETSc its objects may be in the middle of something, and crash when they are

@@ -27,6 +27,8 @@ from msmpetsc.model.lattice import Lattice
 
 Product = Callable[[np.ndarray, np.ndarray], None]  # adds (a Hessian) v [N] to the second argument
 
+SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
+
 # A spring of no length has no direction: it then pulls nothing and its energy stays 1/2 k r^2.
 TINY = 1e-300
 
@@ -227,10 +229,9 @@ def add_spring_concavity(
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
-        across = spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening)
-        if across < 0.0:
-            concavity[a] -= 2.0 * across
-            concavity[b] -= 2.0 * across
+        push = -2.0 * min(spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening), 0.0)
+        concavity[a] += push  # also where there is none: to step over these takes longer
+        concavity[b] += push
 
 
 @numba.njit(cache=True)
@@ -264,12 +265,22 @@ def add_elastic_diagonal(
     blocks: np.ndarray,
 ) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
+    sums = np.zeros((len(blocks), 6))  # xx, xy, xz, yy, yz, zz
     for s in range(len(springs)):
         a, b = springs[s, 0], springs[s, 1]
         x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
         c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, True)
-        add_spring_block(blocks[a], c, ex, ey, ez)
-        add_spring_block(blocks[b], c, ex, ey, ez)
+        xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
+        for i in (a, b):
+            sums[i, 0] += xx
+            sums[i, 1] += xy
+            sums[i, 2] += xz
+            sums[i, 3] += yy
+            sums[i, 4] += yz
+            sums[i, 5] += zz
+    for i in range(len(blocks)):
+        for entry in range(9):
+            blocks[i, entry] += sums[i, SYMMETRIC[entry]]
 
 
 @numba.njit(cache=True)

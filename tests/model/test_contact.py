@@ -111,6 +111,39 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
     assert (np.delete(bound, nodes) == 0).all()
 
 
+@pytest.mark.parametrize("name", ["plane, sticking", "plane, slipping", "box, slipping"])
+def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name: str):
+    """Nor beyond the kink, as nodes slip back: there that of the true curvature does."""
+    contact, q, v = pressed(CASES[name])
+    friction = contact.states[0].friction
+    force, back, below = np.zeros_like(q), np.zeros_like(q), []
+    friction.add_gradient(q, force)
+    back[friction.nodes] = -friction.slip(q)[0]
+    for moved in [reach * way for reach in (1e-4, 1e-2, 0.5, 1, 2, 10) for way in (v, back)]:
+        d, change = moved[friction.nodes], friction.change(q + moved, q)
+        for secant in (friction.all_secant(), None):
+            parabola = (force * moved).sum() + 0.5 * np.einsum("ai,aij,aj", d, friction.blocks(q, True, secant), d)
+            below.append(parabola < change - 1e-9 * abs(change) - 1e-12)
+    assert not any(below[::2])
+    assert any(below[1::2]) or "sticking" in name
+
+
+def test_nodes_have_secants_where_they_turn_or_come_to_stick():
+    contact, q, _ = pressed(CASES["plane, slipping"])
+    friction = contact.states[0].friction
+    u, length = friction.slip(q)
+    on, back, stuck = q.copy(), q.copy(), q.copy()
+    on[friction.nodes] += 0.5 * u
+    back[friction.nodes] -= 1.5 * u
+    stuck[friction.nodes] -= (1 - 0.5 * friction.stick / length)[:, None] * u
+    passes = [contact.passes_kinks(end, q)[0] for end in (on, back, stuck)]
+    assert not passes[0].any() and passes[1].all() and passes[2].all()
+    some = np.arange(len(friction.nodes)) % 2 == 0
+    blocks = next(b for _, b in list(contact.hessian(q, True, [some]))[1:])
+    np.testing.assert_array_equal(blocks[some], friction.blocks(q, False)[some])
+    np.testing.assert_array_equal(blocks[~some], friction.blocks(q, True)[~some])
+
+
 def test_both_regimes_of_friction_are_among_the_cases():
     for name, holds in {"sticking": True, "slipping": False}.items():
         contact, q, _ = pressed(CASES[f"plane, {name}"])

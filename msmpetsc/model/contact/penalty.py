@@ -20,6 +20,8 @@ from msmpetsc.backend.arrays import like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides, of_nodes
 
+Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
+
 
 @dataclass(frozen=True)
 class Penalty:
@@ -91,10 +93,20 @@ class Friction:
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 
-    def blocks(self, q: np.ndarray, true: bool) -> np.ndarray:
+    def all_secant(self) -> np.ndarray:
+        """Return what ``blocks`` takes for all nodes to have their secants, (a,) bool."""
+        return self.limit >= 0
+
+    def passes_kink(self, q: np.ndarray, base: np.ndarray) -> np.ndarray:
+        """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""
+        (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
+        return ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
+
+    def blocks(self, q: np.ndarray, true: bool, secant: np.ndarray | None = None) -> np.ndarray:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
-        The second part is not positive; unless ``true`` it is left out, which is no less than the Hessian.
+        The second part is not positive; unless ``true``, or where ``secant`` (a,), it is left out. What is then left
+        is no less than the Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
         """
         u, length = self.slip(q)
         slope = self.slope(length)
@@ -102,7 +114,8 @@ class Friction:
         if true:
             direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
             curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
-            blocks += (curvature - slope)[:, None, None] * _squares(direction)
+            less = curvature - slope if secant is None else np.where(secant, 0.0, curvature - slope)
+            blocks += less[:, None, None] * _squares(direction)
         return self.limit[:, None, None] * blocks
 
 
@@ -168,20 +181,31 @@ class Contact:
             if state.friction:
                 state.friction.add_gradient(q, gradient)
 
-    def hessian(self, q: np.ndarray, true: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def all_secant(self) -> Secants:
+        """Return what ``hessian`` takes for all friction to have its secant."""
+        return [state.friction.all_secant() if state.friction else None for state in self.states]
+
+    def passes_kinks(self, q: np.ndarray, base: np.ndarray) -> Secants:
+        """Return the same for the nodes alone whose friction has a kink on their way from base to q."""
+        return [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
+
+    def hessian(
+        self, q: np.ndarray, true: bool, secants: Secants | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield of each push and each friction the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
         The Hessian is the sum of all; each block is positive semidefinite.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
             Hessian, nothing along a slip, would let nodes run to and fro
+        secants : where friction has that of its secant all the same
         """
-        for state in self.states:
+        for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
             inside, face = state.depths(q[: self.owned])
             pressed = np.flatnonzero(inside > 0)
             yield pressed, state.stiffness * _squares(state.normals[face[pressed]])
             if state.friction:
-                yield state.friction.nodes, state.friction.blocks(q, true)
+                yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
     def bound(self, q: np.ndarray) -> np.ndarray:
         """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes are in contact."""

@@ -7,7 +7,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, to_host
-from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.model.contact.penalty import Contact, Secants
 from msmpetsc.model.elasticity import Elasticity, Hessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -39,11 +39,11 @@ class ContactBlocks:
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool) -> None:
-        """Take the blocks at positions q, ``true`` ones or such as go with A."""
+    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool, secants: Secants | None = None) -> None:
+        """Take the blocks at positions q, ``true`` ones, but for ``secants``, or such as go with A."""
         self.parts = []
         with CONTACT:
-            for nodes, blocks in contact.hessian(q, true) if contact else ():
+            for nodes, blocks in contact.hessian(q, true, secants) if contact else ():
                 free = np.flatnonzero(self.row[nodes] >= 0)
                 if len(free):
                     self.parts.append((self.row[nodes[free]], self.t2 * blocks[free]))
@@ -107,13 +107,16 @@ class TrueHessian(Viewable):
         self.elastic: Hessian | None = None  # until it is linearised
         self.products = 0
 
-    def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool = False) -> None:
-        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs)."""
+    def linearise(
+        self, q: np.ndarray, contact: Contact | None, projected: bool = False, secants: Secants | None = None
+    ) -> None:
+        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs),
+        ``secants`` the true curvature of some friction (model.contact.penalty)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             count_flops(self.elasticity.flops.hessian)
             if self.contact:
-                self.contact.linearise(contact, q, True)
+                self.contact.linearise(contact, q, True, secants)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"

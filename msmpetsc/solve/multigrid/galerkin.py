@@ -19,7 +19,7 @@ from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.inversion import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.model.lattice import CORNERS
-from msmpetsc.model.springs import spring_block
+from msmpetsc.model.springs import SYMMETRIC, spring_block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
@@ -49,7 +49,6 @@ def _products(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 WEIGHTS = _weights()
 OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))  # by 28 times one code and the other
 OF_NODES = _products(WEIGHTS)
-SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a block stand among 6
 
 
 @dataclass(frozen=True)
@@ -203,13 +202,13 @@ def add_springs(
             c, ex, ey, ez = spring_block(x, y, z, rest[s], k[s], b, True)
             xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
             for entry in range(begin[kind], begin[kind + 1]):
-                f, block = t2 * factor[entry], values[places[i, pair[entry]]]
-                block[0] += f * xx
-                block[1] += f * xy
-                block[2] += f * xz
-                block[3] += f * yy
-                block[4] += f * yz
-                block[5] += f * zz
+                f, place = t2 * factor[entry], places[i, pair[entry]]
+                values[place, 0] += f * xx  # a view of the block would take as long again
+                values[place, 1] += f * xy
+                values[place, 2] += f * xz
+                values[place, 3] += f * yy
+                values[place, 4] += f * yz
+                values[place, 5] += f * zz
 
 
 @kernel

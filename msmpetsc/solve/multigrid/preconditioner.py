@@ -14,8 +14,8 @@ from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.multigrid.translations import Translations
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
-WORSE = 2.0  # times the iterations for a digit that the first solve took with a hierarchy: time for a new one
-FEW = 3  # iterations more than that: of a count so low nothing can be said
+USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
+WORTH = 10.0  # iterations that a new hierarchy takes the time of
 
 
 class LatticePreconditioner:
@@ -25,7 +25,8 @@ class LatticePreconditioner:
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     q        : positions (l, 3) [m] of that; None before the first
     contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
-    first    : iterations a digit, and in all, of the first solve with it; None before that
+    pace     : iterations a digit of the first solve with it; None before that
+    wasted   : iterations since then that were more than that
     is_stale : a new one is due
     """
 
@@ -45,7 +46,8 @@ class LatticePreconditioner:
         self.translations = Translations(comm, unknowns, bodies) if bodies.free.any() else None
         self.q: np.ndarray | None = None
         self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
-        self.first: tuple[float, int] | None = None
+        self.pace: float | None = None
+        self.wasted = 0.0
         self.is_stale, self.is_free = True, False
 
     @property
@@ -69,19 +71,23 @@ class LatticePreconditioner:
             columns -= self.translations.of(self.unknowns.columns(f))
 
     def learn(self, its: int, rtol: float) -> None:
-        """A linear solve took so many iterations to a relative tolerance; none say nothing."""
+        """A linear solve took so many iterations to a relative tolerance; none say nothing.
+
+        A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
+        """
         if its == 0:
             return
-        pace = its / max(-np.log10(rtol), 0.1)
-        if self.first is None:
-            self.first = pace, its
-        elif pace > WORSE * self.first[0] and its > self.first[1] + FEW:
-            self.is_stale = True
+        digits = max(-np.log10(rtol), 0.1)
+        if self.pace is None:
+            self.pace = its / digits
+        self.wasted += max(its - self.pace * digits, 0.0)
+        self.is_stale |= self.wasted > WORTH
 
     def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact)
-        self.q, self.contact, self.first, self.is_stale = q, contact, None, False
+        self.pace, self.wasted = USUAL_PACE if self.q is None else None, 0.0
+        self.q, self.contact, self.is_stale = q, contact, False
 
     def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
@@ -91,10 +97,10 @@ class LatticePreconditioner:
         return not self.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
-        """The Hessian of contact (owned, 9) at q; (0, 9) where there is none."""
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(q, True) if contact else ():
+        for nodes, added in contact.hessian(q, False) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 
@@ -119,7 +125,9 @@ class LatticePreconditioner:
         contact = np.zeros((self.unknowns.lattice.owned, 9), like=self.contact)
         contact[: len(self.contact)] = self.contact
         q = self.unknowns.lattice.nodes if self.q is None else self.q
-        store(checkpoint, self.unknowns, q, contact if self.touches else None, self.first, not self.is_stale)
+        store(
+            checkpoint, self.unknowns, q, contact if self.touches else None, self.pace, self.wasted, not self.is_stale
+        )
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint; from an empty one as if no step had been taken."""
@@ -130,8 +138,8 @@ class LatticePreconditioner:
         contact = like(lattice.nodes, stored)
         touched = self.comm.allreduce(bool(contact.any()), MPI.LOR)
         self._build(with_ghosts(self.comm, lattice, checkpoint.row("hierarchy_q")), contact if touched else contact[:0])
-        its = checkpoint.count("hierarchy_its")
-        self.first = (checkpoint.number("hierarchy_pace", 0.0, 0), its) if its else None
+        self.pace = checkpoint.number("hierarchy_pace", 0.0, 0) or None
+        self.wasted = checkpoint.number("hierarchy_wasted", 0.0, 0)
 
     def destroy(self) -> None:
         self.multigrid.destroy()
@@ -142,18 +150,18 @@ def store(
     unknowns: Unknowns,
     q: np.ndarray,
     contact: np.ndarray | None,
-    first: tuple[float, int] | None,
+    pace: float | None,
+    wasted: float,
     serves: bool,
 ) -> None:
     """Store where a hierarchy was built, and whether it serves; a solver that may yet make one stores that it does not,
     for all checkpoints of a run are of the same parts."""
-    pace, its = first or (0.0, 0)
     rows = {"hierarchy_q": q[: unknowns.lattice.owned]} | ({} if contact is None else {"hierarchy_contact": contact})
-    checkpoint.keep(rows, {"hierarchy_pace": pace, "hierarchy_its": its, "hierarchy_serves": serves})
+    checkpoint.keep(rows, {"hierarchy_pace": pace or 0.0, "hierarchy_wasted": wasted, "hierarchy_serves": serves})
 
 
 def store_none(checkpoint: Checkpoint, unknowns: Unknowns, touches: bool) -> None:
     """Store that no hierarchy was built yet."""
     nodes = unknowns.lattice.nodes
     contact = np.zeros((unknowns.lattice.owned, 9), like=nodes) if touches else None
-    store(checkpoint, unknowns, nodes, contact, None, False)
+    store(checkpoint, unknowns, nodes, contact, None, 0.0, False)

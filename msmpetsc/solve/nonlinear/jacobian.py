@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
 from msmpetsc.errors import InputError
-from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.model.contact.penalty import Contact, Secants
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
@@ -100,14 +100,17 @@ class Jacobian:
         mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
         return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
 
-    def linearise(self, q: np.ndarray, contact: Contact | None, projected: bool, known: bool = False) -> None:
+    def linearise(
+        self, q: np.ndarray, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
+    ) -> None:
         """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.
 
         projected : without the negative parts of H
+        secants   : of friction that H does not have the true curvature of
         known     : H was linearised at this very q already
         """
         if self.true_hessian and not known:
-            self.hessian.linearise(q, contact, projected)
+            self.hessian.linearise(q, contact, projected, secants)
         elif self.blocks:
             self.blocks.linearise(contact, q, False)
         changed = self.preconditioner.prepare(q, contact)

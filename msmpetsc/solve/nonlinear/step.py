@@ -20,6 +20,7 @@ from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
+from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum
@@ -98,6 +99,7 @@ class Stepper:
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
+        self.kinks = FrictionKinks(comm)
         self.owned = ExitStack()
         self.unknowns = Unknowns(comm, lattice, static)
         self.owned.callback(self.unknowns.destroy)
@@ -145,6 +147,7 @@ class Stepper:
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
         snes.setFromOptions()
+        ksp.setComputeEigenvalues(True)  # for what the estimate has to know
         return snes, ksp
 
     def _create_control(self, error: float | None) -> tuple[ErrorControl, Minimum]:
@@ -180,6 +183,7 @@ class Stepper:
             self.functional.begin(problem)
             self.control.begin()
             self.base[:] = problem.fixed
+            self.kinks.begin(problem.contact)
             self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
             if start is None and self.jacobian.preconditioner.has_to_balance:
                 iterate = self._evaluate(self.x)
@@ -301,16 +305,23 @@ class Stepper:
         if self.preset.true_hessian and x.handle == snes.getSolution().handle:
             return 0.0  # the start of a line search, which is where it was linearised
         with LOCAL:
-            change, distance = self.functional.change(self.functional.positions(x), self.base)
+            q = self.functional.positions(x)
+            self.kinks.see(q, self.base)
+            change, distance = self.functional.change(q, self.base)
         return -1.0 if self.control.is_flat and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: the Jacobian there, and what that solve starts from."""
         with LOCAL:
+            if snes.its > 0:
+                self.kinks.see(self.functional.positions(x), self.base)  # where no objective was asked for
             self.unknowns.to_nodes(x, self.base)
             self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
             known = self.control.now.corrected and not self.projected  # the estimate has linearised at this very x
-            self.jacobian.linearise(self.base, self.functional.problem.contact, self.projected, known)
+            self.jacobian.linearise(
+                self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
+            )
+            self.kinks.await_step()
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
         if self.preset.start_from_b:
@@ -338,6 +349,8 @@ class Stepper:
         iterate = self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
+            if self.preset.true_hessian and not self.projected:
+                control.heed(self.ksp, snes.getSolutionUpdate())
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
         control.now.alarmed |= self.ksp.reason == INDEFINITE
@@ -365,7 +378,8 @@ class Stepper:
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
         if self.preset.inexact and self.options.is_default("ksp_rtol"):
-            self.ksp.setTolerances(rtol=self.control.relative_tolerance())
+            has_kinks = self.preset.true_hessian and self.kinks.are_any
+            self.ksp.setTolerances(rtol=self.control.relative_tolerance(has_kinks))
 
     def _abandon(self) -> None:
         """After an error within PETSc its objects may be in the middle of something, and crash when they are

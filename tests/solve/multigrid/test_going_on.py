@@ -65,8 +65,7 @@ CASES = {
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several coarse levels; hierarchies that are given up soon; newton that changes over after a few steps."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
-    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.FEW", 0)
-    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.WORSE", 1.05)
+    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.WORTH", 1.0)
     monkeypatch.setattr(preconditioning, "LONG", 4)
     monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
 

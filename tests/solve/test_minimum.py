@@ -24,6 +24,7 @@ from msmpetsc.model.build import build_model
 from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.nonlinear import preconditioning
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -125,15 +126,22 @@ def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
     return simulation, simulation.state.q
 
 
+@pytest.mark.parametrize("multigrid", [False, True])
 @pytest.mark.parametrize("share", [0.2, 0.6, 0.97])
-def test_the_lowest_curvature_is_that_of_a_dense_matrix(tmp_path: Path, share: float):
-    """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that knows nothing."""
+def test_the_lowest_curvature_is_that_of_a_dense_matrix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, multigrid: bool
+):
+    """Of a squashed beam, free, so that its rigid motions are among the modes; after a search that knows nothing, of a
+    step with Jacobi's preconditioner, which has multigrid for the search where there are many nodes."""
+    monkeypatch.setattr(preconditioning, "LARGE", 1 if multigrid else 10**9)
     simulation, q = squashed(tmp_path, share)
     stepper = simulation.integrator.stepper
     functional, curvature = stepper.functional, stepper.minimum.curvature
     functional.begin(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.jacobian.hessian.linearise(q, None)
     found, direction = curvature.lowest(q, curvature.compression(q), False, None)
+    preconditioner = stepper.jacobian.preconditioner
+    assert preconditioner.multigrid is None and (preconditioner.for_searches is not None) == multigrid
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
     lowest = np.linalg.eigvalsh(dense / root / root[:, None])[0]
     assert found == pytest.approx(direction @ dense @ direction / (direction**2 @ functional.mass))

@@ -63,6 +63,11 @@ class LatticePreconditioner:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
+    def build_anew(self, q: np.ndarray, contact: Contact | None) -> None:
+        """Build the hierarchy at positions q (l, 3) [m], whatever there was."""
+        self.is_stale = True
+        self.prepare(q, contact)
+
     def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
         their forces balance: linear solves leave them there."""

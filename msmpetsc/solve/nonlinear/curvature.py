@@ -81,7 +81,7 @@ NONE = Compression(0.0, 0.0, False)
 class LowestCurvature:
     """Looks for directions of negative curvature of a step's Hessian. All methods but properties are collective.
 
-    preconditioner : of the step's linear solves
+    preconditioner : of the step's linear solves, or multigrid for a long search
     """
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
@@ -118,7 +118,8 @@ class LowestCurvature:
         """
         if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
             self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
-            values, modes = self._search_at_length(q, hint, EFFORT if alarmed else self.effort)
+            with self.preconditioner.searching(q, self.functional.problem.contact):
+                values, modes = self._search_at_length(q, hint, EFFORT if alarmed else self.effort)
         else:
             its = self.effort.followed
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)

@@ -66,7 +66,9 @@ class Jacobian:
         reserve = partial(store_none, unknowns=unknowns, touches=touches)
         ratio, is_held = self._stiffness_ratio(), unknowns.total < unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
-        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, reserve, kind, chooses, ratio)
+        self.preconditioner = StepPreconditioner(
+            self._of_matrix, of_lattice, reserve, kind, chooses, ratio, unknowns.total
+        )
         self.pmat = python_matrix(unknowns, Preconditioned(self.preconditioner), comm)
         owned.callback(self.pmat.destroy)
 

@@ -2,10 +2,12 @@
 
 With Jacobi's, CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations, kappa = 2 (1 + t^2 k / m) where nothing is held,
 k the springs at a node together; multigrid takes about four whatever that is, each as dear as several. So short steps
-are Jacobi's, until they are seen to take longer than they should.
+are Jacobi's, until they are seen to take longer than they should. A search for the lowest modes, which Jacobi's takes a
+hundred iterations for, has multigrid of its own meanwhile.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from petsc4py import PETSc
@@ -19,6 +21,7 @@ from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
 MULTIGRID = PETSc.PC.Type.MG
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
+LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
 
 
@@ -44,6 +47,7 @@ class StepPreconditioner:
     reserve : stores that there is no hierarchy yet
     kind    : -pc_type; multigrid is taken where that is mg
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
+    nodes   : free ones, on all ranks
     """
 
     def __init__(
@@ -54,8 +58,11 @@ class StepPreconditioner:
         kind: str,
         chooses: bool,
         ratio: float,
+        nodes: int,
     ):
         self.make_multigrid, self.reserve, self.chooses = make_multigrid, reserve, chooses
+        self.is_large, self.is_searching = nodes >= LARGE, False
+        self.for_searches: LatticePreconditioner | None = None
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
         expected = expected_iterations(ratio)
@@ -75,12 +82,27 @@ class StepPreconditioner:
     @property
     def is_uniform(self) -> bool:
         """Whether smooth errors fade as fast as rough ones."""
-        return self.multigrid is not None
+        return self.multigrid is not None or self.is_searching
 
     @property
     def products(self) -> int:
         """Products with the Hessian so far."""
-        return self.multigrid.multigrid.fine.products if self.multigrid else 0
+        return sum(lattice.multigrid.fine.products for lattice in (self.multigrid, self.for_searches) if lattice)
+
+    @contextmanager
+    def searching(self, q: np.ndarray, contact: Contact | None) -> Iterator[None]:
+        """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
+        smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
+        if self.multigrid or not (self.chooses and self.is_large):
+            yield
+            return
+        self.for_searches = self.for_searches or self.make_multigrid()
+        self.for_searches.build_anew(q, contact)
+        self.is_searching = True
+        try:
+            yield
+        finally:
+            self.is_searching = False
 
     def _choose(self, reason: str) -> None:
         log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
@@ -115,7 +137,8 @@ class StepPreconditioner:
         self.in_use.setUp(pc)
 
     def apply(self, pc: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.in_use.apply(pc, x, y)
+        chosen = self.for_searches if self.is_searching and self.for_searches else self.in_use
+        chosen.apply(pc, x, y)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.in_use.view(pc, viewer)
@@ -143,6 +166,6 @@ class StepPreconditioner:
                 part.restore(checkpoint)
 
     def destroy(self, _: PETSc.PC) -> None:
-        for owned in (self.of_matrix, self.multigrid):
+        for owned in (self.of_matrix, self.multigrid, self.for_searches):
             if owned:
                 owned.destroy()

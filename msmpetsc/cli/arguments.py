@@ -292,8 +292,8 @@ def add_compare(commands: Commands) -> None:
     parser = commands.add_parser(
         "compare",
         help="say whether two results agree",
-        description="Compare two results of one lattice at the times that both have. Exit status 0: they agree; "
-        "1: they differ; 2: they cannot be compared.",
+        description="Compare two results at the times that both have; of different lattices their surfaces alone. "
+        "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
     )
     parser.add_argument("first", metavar="A.h5", type=file_argument)
     parser.add_argument("second", metavar="B.h5", type=file_argument)

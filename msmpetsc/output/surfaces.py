@@ -25,7 +25,7 @@ class SurfaceDistance:
     rms      : (p,) distance of the points [m], root mean square over the area
     greatest : (p,) greatest distance of a point [m]
     worst    : (p,) the point that is so far
-    moved    : greatest distance of a point of the reference from its place at rest, in these frames [m]; 0 if none moves
+    moved    : greatest distance of a point of the reference from its place at rest, [m]; 0 if none moves
     """
 
     pairs: np.ndarray

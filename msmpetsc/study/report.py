@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 PRINTED = {
     "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame",
     "time_frame_min", "time_frame_max", "time_second",
-    "ksp_its", "products", "memory", "true_error", "trajectory_error",
+    "ksp_its", "products", "memory", "true_error", "trajectory_error", "surface_error",
 }  # fmt: skip
 NOT_PRINTED = {*COLUMNS} - PRINTED
 FIRST, LAST = ("label", "status"), "command"  # columns of the whole table even where all cases agree in them

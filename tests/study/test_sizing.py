@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from msmpetsc.study.plan import Candidate
-from msmpetsc.study.sizing.choice import Budget, Model, Solving, Stepping, cost_growth
+from msmpetsc.study.sizing.choice import Budget, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, error_law
 
 
@@ -37,7 +37,9 @@ def stepping(integrator: str, step: float, error: float, cost: float) -> Steppin
 EULER = [stepping("implicit-euler", 0.01 / 2**k, 0.32 / 2**k, 2.0**k) for k in range(8)]
 BDF2 = [stepping("bdf2", 0.01 / 2**k, 0.08 / 4**k, 2.0**k) for k in range(5)]
 SOLVINGS = [Solving(1e-1, 0.02, 0.7), Solving(1e-2, 0.002, 1.0), Solving(1e-3, 0.0002, 1.3)]
-MODEL = Model(ErrorLaw(2.0, 2.0), [*EULER, *BDF2], SOLVINGS, cells=1000, growth=1.0, least=100, most=10**6)
+MODEL = Model(
+    ErrorLaw(2.0, 2.0), [*EULER, *BDF2], SOLVINGS, cells=1000, costs=[(100, 1.0), (1000, 10.0)], least=100, most=10**6
+)
 
 
 def test_the_cheapest_split_is_that_of_all_splits():
@@ -82,5 +84,9 @@ def test_shares_of_the_cost_say_what_a_smaller_error_would_cost():
 
 
 def test_cost_grows_with_cells_as_measured():
-    assert cost_growth([100, 800, 6400], [5.0, 1.0, 10.0]) == pytest.approx(math.log(10) / math.log(8))
-    assert cost_growth([100], [1.0]) == 1 and cost_growth([100, 800], [1.0, 1.1]) == 1
+    """Read off the lattices; beyond them as between the last two, but in proportion to the cells at least."""
+    model = replace(MODEL, costs=[(100, 1.0), (800, 2.0), (6400, 20.0)])
+    assert model.growth(800, 6400) == pytest.approx(10) and model.growth(800, 100) == pytest.approx(0.5)
+    assert model.growth(6400, 8 * 6400) == pytest.approx(10)
+    assert replace(MODEL, costs=[(100, 1.0), (800, 1.1)]).growth(800, 8000) == pytest.approx(10)
+    assert replace(MODEL, costs=[(100, 1.0)]).growth(100, 300) == pytest.approx(3)

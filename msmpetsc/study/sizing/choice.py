@@ -4,8 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.sizing.orders import ErrorLaw
+
+STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
 
 
 @dataclass(frozen=True)
@@ -67,9 +71,9 @@ class Choice:
 class Model:
     """What the trials told: errors of the cells, the steps and their solution, and what each costs.
 
-    law       : of the error over the edge of a cell, cells^(-1/3)
-    cells     : of the lattice that the steppings were tried on
-    growth    : the cost goes as cells to this power
+    law         : of the error over the edge of a cell, cells^(-1/3)
+    cells       : of the lattice that the steppings were tried on
+    costs       : of one of them by the cells of the lattices tried, ascending
     least, most : cells that may be chosen
     """
 
@@ -77,7 +81,7 @@ class Model:
     steppings: Sequence[Stepping]
     solvings: Sequence[Solving]
     cells: float
-    growth: float
+    costs: Sequence[tuple[float, float]]
     least: int
     most: int
 
@@ -106,23 +110,39 @@ class Model:
     def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
         """Return a choice with its errors and its cost."""
         budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
-        cost = stepping.cost * solving.cost * (cells / self.cells) ** self.growth
+        cost = stepping.cost * solving.cost * self.growth(self.cells, cells)
         method = replace(stepping.method, step_error=solving.step_error)
-        return Choice(method, int(cells), budget, cost, self._shares(stepping, solving))
+        return Choice(method, int(cells), budget, cost, self._shares(stepping, solving, cells))
+
+    def growth(self, before: float, after: float) -> float:
+        """Return how many times the cost is when there are so many cells, read off the lattices tried."""
+        cells, costs = np.log(self.costs).T
+        if len(cells) < 2:
+            return after / before
+        slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, STEEPEST)
+        beyond = max(1.0, slopes[-1])
+        knots = np.concatenate([[0.0], np.cumsum(slopes * np.diff(cells))])
+
+        def log_cost(count: float) -> float:
+            past = max(0.0, math.log(count) - cells[-1])  # where nothing was tried
+            return float(np.interp(math.log(count), cells, knots)) + beyond * past
+
+        return math.exp(log_cost(after) - log_cost(before))
 
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
         """Return how its steps may be solved; explicit ones are not."""
         return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
 
-    def _shares(self, stepping: Stepping, solving: Solving) -> Budget:
+    def _shares(self, stepping: Stepping, solving: Solving, cells: float) -> Budget:
         """Return d log cost / d log error of each part over their sum."""
         same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
         parts = (
-            3 * self.growth / self.law.order,
+            3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order,
             _steepness([(each.error, each.cost) for each in same], (stepping.error, stepping.cost)),
             _steepness([(each.error, each.cost) for each in self.solvings], (solving.error, solving.cost)),
         )
-        return Budget(*(part / sum(parts) for part in parts))
+        total = sum(parts) or 1.0
+        return Budget(*(part / total for part in parts))
 
 
 def _steepness(tried: Sequence[tuple[float, float]], chosen: tuple[float, float]) -> float:
@@ -137,11 +157,3 @@ def _steepness(tried: Sequence[tuple[float, float]], chosen: tuple[float, float]
     smaller = [other for other in others if other[0] < error]
     near = max(smaller) if smaller else min(others)
     return max(0.0, math.log(near[1] / cost) / math.log(error / near[0]))
-
-
-def cost_growth(cells: Sequence[float], seconds: Sequence[float]) -> float:
-    """Return the power of the cells that a step's computing time goes by, from the two largest lattices; 1 at least."""
-    if len(cells) < 2 or min(seconds) <= 0:
-        return 1.0
-    power = math.log(seconds[-1] / seconds[-2]) / math.log(cells[-1] / cells[-2])
-    return min(1.6, max(1.0, power))

@@ -1,0 +1,307 @@
+"""The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Integrator
+from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
+from msmpetsc.study.distances import surface_error
+from msmpetsc.study.plan import Candidate
+from msmpetsc.study.runner import Bench
+from msmpetsc.study.schema import Study, StudyScene, Sweep
+from msmpetsc.study.sizing.choice import Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, error_law
+
+PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
+COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
+FINEST = 2  # times finer than the scene's: the finest cells that are chosen
+HALVINGS = 6  # of the scene's step
+PART = 8  # the error of the finest step must be so small a part of the error asked for
+LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
+TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
+TOO_MUCH = 1.1  # times the error asked for, measured, and the choice is made once more
+
+
+@dataclass(frozen=True)
+class SizeTrial:
+    """A run that was made.
+
+    asked, cells : valid cells asked for, and had
+    cost         : computing seconds a simulated second
+    result       : its file
+    """
+
+    method: Candidate
+    asked: int
+    cells: float
+    cost: float
+    result: Path
+
+    @property
+    def edge(self) -> float:
+        """Edge of a cell, of a body of one cell."""
+        return self.cells ** (-1 / 3)
+
+
+class Tried(NamedTuple):
+    """A trial as a point over cost and expected error."""
+
+    method: str
+    cells: float
+    cost: float
+    error: float
+
+
+@dataclass
+class SizePlan:
+    """The answer.
+
+    choice : None where no two runs could be compared
+    met    : whether it is expected to meet the error
+    bounds : what keeps the error from being smaller, or the estimate from being sure, in words
+    check  : the error of the choice as measured at last; None where it was not run
+    """
+
+    choice: Choice
+    met: bool
+    bounds: list[str]
+    check: float | None = None
+    tried: list[Tried] = field(default_factory=list)
+
+
+class Sizer:
+    """Makes the trials of one scene for one surface error."""
+
+    def __init__(
+        self,
+        scene: Path,
+        bench: Bench,
+        *,
+        target: float,
+        presets: Collection[str],
+        frames: int,
+        cells: int | None,
+        ranks: int,
+        report: Callable[[SizeTrial | str], None],
+    ):
+        self.scene, self.bench, self.target, self.presets, self.ranks = scene, bench, target, presets, ranks
+        self.as_given = load_scene(scene, (), presets)
+        count = cells or self.as_given.cages.count
+        if count is None:
+            raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")
+        self.cells, self.report = count, report
+        self.step = self.as_given.time.step
+        steps = min(frames, self.as_given.time.steps)
+        self.duration = self.step * max(1, steps // 2 * 2)  # twice the step fits into it, too
+        self.solved = min(1e-3, target / 10)  # step error of the trials
+        self.bounds: list[str] = []
+        self.trials: list[SizeTrial] = []
+
+    def plan(self) -> SizePlan:
+        """Make the trials and choose. Raises InputError where too few runs end well."""
+        coarse = max(1, self.cells // COARSER**3)
+        steppings = self._steppings(coarse)
+        method = self._provisional(steppings)
+        solvings = self._solvings(method, coarse)
+        law, lattices = self._law(method)
+        costs = [(each.cells, each.cost) for each in lattices]
+        on = next(each.cells for each in self.trials if each.asked == coarse)
+        least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
+        model = Model(law, steppings, solvings, on, costs, least, most)
+        plan = self._checked(model, lattices[-1])
+        return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
+
+    # Time
+
+    def _steppings(self, cells: int) -> list[Stepping]:
+        """Return integrators and steps with the error of the step alone."""
+        ladder = self._ladder(cells)
+        finest = ladder[-1]
+        apart = [_apart(*pair) for pair in pairwise(ladder)]
+        law = error_law([each.method.time_step for each in ladder], apart, STEP_ORDERS)
+        if not law.seen:
+            self.bounds.append(
+                f"the step: no order was seen, as where a body strikes an obstacle; BDF2's two shortest steps are "
+                f"{apart[-1]:.1e} apart"
+            )
+        left = law.error(finest.method.time_step)
+        known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
+        known.append(Stepping(finest.method, left, finest.cost))
+        tried = [each.method.time_step for each in ladder]
+        known += self._others("implicit-euler", tried, known, finest=finest, left=left, cells=cells)
+        known += self._others("verlet", [self.step], known, finest=finest, left=left, cells=cells)
+        return known
+
+    def _ladder(self, cells: int) -> list[SizeTrial]:
+        """Return runs of BDF2 with steps halved until the error left is small."""
+        runs: list[SizeTrial] = []
+        for halving in range(-1, 1 + HALVINGS):
+            run = self._run(self._method("bdf2", self.step / 2**halving), cells)
+            if run is None:
+                break
+            runs.append(run)
+            if len(runs) < 3:
+                continue
+            apart = [_apart(*pair) for pair in pairwise(runs)]
+            law = error_law([each.method.time_step for each in runs], apart, STEP_ORDERS)
+            if law.error(run.method.time_step) <= self.target / PART:
+                break
+        if len(runs) < 2:
+            raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
+        return runs
+
+    def _others(
+        self,
+        integrator: Integrator,
+        steps: list[float],
+        known: list[Stepping],
+        *,
+        finest: SizeTrial,
+        left: float,
+        cells: int,
+    ) -> list[Stepping]:
+        """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
+        others: list[Stepping] = []
+        enough = min((each.cost for each in known if each.error <= self.target / 2), default=math.inf)
+        for step in steps:
+            run = self._run(self._method(integrator, step), cells)
+            if run is None:
+                break
+            others.append(Stepping(run.method, _apart(run, finest) + left, run.cost))
+            if others[-1].error <= self.target / 3 or run.cost > 2 * enough:
+                break
+        return others
+
+    def _provisional(self, steppings: list[Stepping]) -> Candidate:
+        """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
+        fair = [each for each in steppings if each.error <= self.target / 2]
+        if fair:
+            return min(fair, key=lambda each: each.cost).method
+        return min(steppings, key=lambda each: each.error).method
+
+    def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
+        """Return how loosely the steps may be solved, and what that leaves."""
+        if method.step_error is None:
+            return [Solving(self.solved, 0.0, 1.0)]
+        base = self._run(method, cells)
+        known: list[Solving] = []
+        for step_error in LOOSE:
+            run = self._run(replace(method, step_error=step_error), cells) if base else None
+            if run and base:
+                known.append(Solving(step_error, _apart(run, base), run.cost / base.cost))
+        rest = known[-1].error * self.solved / known[-1].step_error if known and known[-1].step_error else 0.0
+        return [*known, Solving(self.solved, rest, 1.0)]
+
+    # Cells
+
+    def _law(self, method: Candidate) -> tuple[ErrorLaw, list[SizeTrial]]:
+        """Return the error of the cells, and the runs of the three lattices that it comes from."""
+        counts = [max(1, self.cells // COARSER ** (3 * power)) for power in (2, 1, 0)]
+        runs = [run for count in counts if (run := self._run(method, count))]
+        if len(runs) < 2:
+            raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
+        apart = [_apart(*pair) for pair in pairwise(runs)]
+        law = error_law([each.edge for each in runs], apart, CELL_ORDERS)
+        if not law.seen:
+            why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
+            self.bounds.append(f"the cells: no order was seen ({why}); first order is taken")
+        return law, runs
+
+    def _checked(self, model: Model, finest: SizeTrial) -> SizePlan:
+        """Choose, run the choice against the finest lattice, and choose once more where that was too hopeful."""
+        choice = model.cheapest(self.target)
+        if choice is None:
+            return SizePlan(model.best(), False, [])
+        measured = self._measured(choice, model, finest)
+        if measured is None or measured <= TOO_MUCH * self.target:
+            return SizePlan(choice, True, [], measured)
+        self.report(f"measured {measured:.1e}, more than expected: chosen once more")
+        law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
+        again = replace(model, law=law).cheapest(self.target)
+        if again is None:
+            return SizePlan(choice, False, [], measured)
+        return SizePlan(again, True, [], self._measured(again, model, finest))
+
+    def _measured(self, choice: Choice, model: Model, finest: SizeTrial) -> float | None:
+        """Return the error of the choice from its distance to the finest lattice; None where that tells nothing."""
+        run = self._run(choice.method, choice.cells)
+        if run is None or run.result == finest.result:
+            return None
+        apart = _apart(run, finest)
+        if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
+            share = (run.edge / finest.edge) ** model.law.order
+            return apart * share / max(1 - share, 0.1) + choice.budget.time + choice.budget.step
+        of_method = next(each.error for each in model.steppings if each.method == finest.method)
+        return apart + model.law.error(finest.edge) + of_method
+
+    # What is said
+
+    def _bounds(self, plan: SizePlan, model: Model) -> list[str]:
+        """Return what bounds the error, in words."""
+        bounds, best = list(self.bounds), model.best().budget
+        if not plan.met:
+            wanted = model.cells_for(self.target / 2)
+            if best.time > self.target / 2:
+                bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
+            if best.cells > self.target / 2:
+                bounds.append(
+                    f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; half the error asked for "
+                    f"would take {wanted:.2g}"
+                )
+        return bounds
+
+    def _tried(self, model: Model) -> list[Tried]:
+        """Return cost and expected error of each trial."""
+        times = {(each.method.integrator, each.method.time_step): each.error for each in model.steppings}
+        solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
+        tried = []
+        for each in self.trials:
+            method = each.method
+            error = times[method.integrator, method.time_step] + solved[method.step_error] + model.law.error(each.edge)
+            tried.append(Tried(f"{method.integrator}, {method.time_step:g} s", each.cells, each.cost, error))
+        return tried
+
+    # Runs
+
+    def _method(self, integrator: Integrator, step: float) -> Candidate:
+        solves = integrator != "verlet"
+        return Candidate(integrator, step, PRESET if solves else "", "", self.solved if solves else None)
+
+    def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
+        """Return a run, made if it was not yet; None if it fails, which is reported."""
+        done = next((each for each in self.trials if (each.method, each.asked) == (method, cells)), None)
+        if done is not None:
+            return done
+        case = self._case(method, cells)
+        row = self.bench.measure(case, keep=True).row
+        if row["status"] != "ok" or not row.get("time_second"):
+            self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
+            return None
+        trial = SizeTrial(method, cells, row["cells"], row["time_second"], self.bench.result_of(case))
+        self.trials.append(trial)
+        self.report(trial)
+        return trial
+
+    def _case(self, method: Candidate, cells: int) -> Case:
+        cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
+        scene = StudyScene(
+            name=self.scene.stem, file=self.scene.name, duration=self.duration, set=(f"cages={inline(cages)}",)
+        )
+        sweep = Sweep(
+            integrators=(method.integrator,), time_steps=(method.time_step,), ranks=(self.ranks,),
+            presets=(method.preset,) if method.preset else (), errors=(method.step_error,) if method.step_error else (),
+        )  # fmt: skip
+        timeout = TIME if cells < self.cells else LONG_TIME
+        study = Study(timeout=timeout, scene=(scene,), sweep=(sweep,))
+        case = study_cases(study, self.scene.parent, True, self.presets)[0]
+        return case.changed(SURFACE, f"output.every={max(1, round(self.step / method.time_step))}")
+
+
+def _apart(run: SizeTrial, reference: SizeTrial) -> float:
+    return surface_error(run.result, reference.result)

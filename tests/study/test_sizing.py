@@ -1,13 +1,26 @@
 """Sizing: errors from runs of several sizes, and the cheapest split of an error among cells, time step and solution."""
 
+# ruff: noqa: F811 (fixtures are imported)
 import math
+import shlex
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 
 import pytest
+from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
+from msmpetsc.cli import plan as plan_command
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.study.cases import Case
 from msmpetsc.study.plan import Candidate
-from msmpetsc.study.sizing.choice import Budget, Model, Solving, Stepping
+from msmpetsc.study.runner import CaseResult
+from msmpetsc.study.sizing import trials
+from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, error_law
+from msmpetsc.study.sizing.trials import SizePlan, Sizer, Tried
 
 
 @pytest.mark.parametrize("order", [1.2, 1.6, 2.0])
@@ -38,7 +51,14 @@ EULER = [stepping("implicit-euler", 0.01 / 2**k, 0.32 / 2**k, 2.0**k) for k in r
 BDF2 = [stepping("bdf2", 0.01 / 2**k, 0.08 / 4**k, 2.0**k) for k in range(5)]
 SOLVINGS = [Solving(1e-1, 0.02, 0.7), Solving(1e-2, 0.002, 1.0), Solving(1e-3, 0.0002, 1.3)]
 MODEL = Model(
-    ErrorLaw(2.0, 2.0), [*EULER, *BDF2], SOLVINGS, cells=1000, costs=[(100, 1.0), (1000, 10.0)], least=100, most=10**6
+    ErrorLaw(2.0, 2.0),
+    [*EULER, *BDF2],
+    SOLVINGS,
+    cells=1000,
+    costs=[(100, 1.0), (1000, 10.0)],
+    explicit=False,
+    least=100,
+    most=10**6,
 )
 
 
@@ -75,6 +95,14 @@ def test_explicit_steps_are_not_solved():
     )
 
 
+def test_explicit_substeps_shorten_with_the_cells():
+    """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of explicit ones."""
+    for explicit, factor in ((False, 16), (True, 8)):
+        model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
+        costs = [model.choice(model.steppings[0], SOLVINGS[2], cells).cost for cells in (1000, 8000)]
+        assert costs[1] / costs[0] == pytest.approx(factor)
+
+
 def test_shares_of_the_cost_say_what_a_smaller_error_would_cost():
     """Cost goes as error^-1.5 by cells of order 2, as error^-1/2 by BDF2's steps, and by log 1.3 of the solution."""
     parts = (1.5, 0.5, math.log10(1.3))
@@ -90,3 +118,153 @@ def test_cost_grows_with_cells_as_measured():
     assert model.growth(6400, 8 * 6400) == pytest.approx(10)
     assert replace(MODEL, costs=[(100, 1.0), (800, 1.1)]).growth(800, 8000) == pytest.approx(10)
     assert replace(MODEL, costs=[(100, 1.0)]).growth(100, 300) == pytest.approx(3)
+
+
+class Bodies:
+    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution."""
+
+    def __init__(self, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0):
+        self.explicit, self.impacts, self.cell_error = explicit, impacts, cell_error
+        self.errors: dict[Path, float] = {}  # by the result
+
+    def result_of(self, case: Case) -> Path:
+        return Path(case.id)
+
+    def error_of(self, case: Case, cells: int) -> float:
+        t, substep = case.time_step, min(case.time_step, 1e-3)
+        time = {"verlet": 1e4 * substep**2, "bdf2": 400 * t**2, "implicit-euler": 20 * t}[case.integrator]
+        stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
+        return self.cell_error * cells**-0.5 + time + 0.1 * (case.error or 0) + stuck
+
+    def measure(self, case: Case, keep: bool) -> CaseResult:
+        assert keep and case.stores_surface
+        explicit = case.integrator == "verlet"
+        if explicit and not self.explicit:
+            return CaseResult({"status": "timeout", "reason": "took longer than 1 s"}, None, 0.0)
+        (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
+        self.errors[self.result_of(case)] = self.error_of(case, cells)
+        substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
+        cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
+        row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost, "iterations": substeps}
+        return CaseResult(row, None, 1.0)
+
+
+def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    bench, said = Bodies(**bodies), []
+    monkeypatch.setattr(trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b]))
+    sizer = Sizer(
+        tmp_path / "scene.toml", bench, target=target, presets=["newton"], frames=10, cells=6400, ranks=1,
+        report=said.append,
+    )  # fmt: skip
+    return sizer.plan(), bench, said
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+@pytest.mark.parametrize("target", [0.1, 0.03])
+def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch, explicit: bool, target: float):
+    """The choice's own error, of the formula, is between a third of what was asked for and that."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
+    method, cells = plan.choice.method, plan.choice.cells
+    assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
+    case = Case(
+        scene="", file=Path(), content="", set=(), integrator=method.integrator, time_step=method.time_step,
+        error=method.step_error,
+    )  # fmt: skip
+    assert target / 3 < bench.error_of(case, cells) <= 1.01 * target  # what is measured is off by a little
+    assert plan.choice.budget.total <= target and len(plan.tried) >= 6
+
+
+def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch):
+    """There may be 8 times the cells at most: an error of 1.8e-2 is left."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, cell_error=4.0)
+    assert not plan.met and plan.choice.cells == 8 * 6400
+    (said,) = (bound for bound in plan.bounds if bound.startswith("the mesh's cells"))
+    assert f"{4 * (8 * 6400) ** -0.5:.1e} is left with 51200 cells" in said
+
+
+def test_a_plan_says_when_impacts_bound_the_error(tmp_path: Path, monkeypatch):
+    """Shorter steps do not come nearer to each other."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, impacts=True)
+    assert not plan.met and any(bound.startswith("the step") for bound in plan.bounds)
+
+
+def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
+    said: list = []
+    bench = Bodies()
+    monkeypatch.setattr(
+        bench, "measure", lambda case, keep: CaseResult({"status": "failed", "reason": "planted"}, None, 0)
+    )
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sizer = Sizer(
+        tmp_path / "scene.toml", bench, target=0.1, presets=["newton"], frames=10, cells=None, ranks=1,
+        report=said.append,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="the trials failed on 1 cells, see above"):
+        sizer.plan()
+    assert all("planted" in text for text in said) and len(said) == 2
+
+
+def test_a_scene_with_a_cell_size_needs_a_number_of_cells(tmp_path: Path):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    with pytest.raises(InputError, match="--cells N says how many"):
+        Sizer(
+            tmp_path / "scene.toml", Bodies(), target=0.1, presets=["newton"], frames=10, cells=None, ranks=1,
+            report=print,
+        )  # fmt: skip
+
+
+PLAN = SizePlan(
+    Choice(Candidate("bdf2", 0.005, "newton", "", 1e-2), 4321, Budget(0.05, 0.03, 0.001), 7.5, Budget(0.6, 0.3, 0.1)),
+    met=True, bounds=["the step: planted"], check=0.07,
+    tried=[Tried("bdf2", 500, 2.0, 0.2), Tried("verlet", 4000, 9.0, 0.06)],
+)  # fmt: skip
+
+
+def test_the_command_tells_the_answer_writes_it_and_draws_it(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: PLAN)
+    path, chart = tmp_path / "scene.toml", tmp_path / "chart.png"
+    path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    before = load_scene(path)
+    assert main(["plan", str(path), "--surface-error", "0.1", "--write", "--chart", str(chart)]) == 0
+    out, written = capsys.readouterr().out, load_scene(path)
+    assert "7.5 computing seconds a simulated second, surface error 8.1e-02 at most" in out
+    assert "cells              5.0e-02         60%" in out and "what bounds it: the step: planted" in out
+    assert written.cages.count == 4321 and written.cages.cell_size is None and before.budget is None
+    assert (written.time.integrator, written.time.step, written.solver.error) == ("bdf2", 0.005, 0.01)
+    assert written.budget.model_dump() == {
+        "target": 0.1, "cells": 0.05, "time": 0.03, "step": 0.001, "count": 4321, "time_step": 0.005
+    }  # fmt: skip
+    command = next(line for line in out.splitlines() if line.startswith("msmpetsc run "))
+    changes = [word for flag, word in pairwise(shlex.split(command)) if flag == "--set"]
+    path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    changed = load_scene(path, changes)
+    assert (changed.cages, changed.time, changed.solver, changed.budget) == (
+        written.cages, written.time, written.solver, written.budget
+    )  # fmt: skip
+    assert chart.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: replace(PLAN, met=False))
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    assert main(["plan", str(path), "--surface-error", "0.01", "--write"]) == 3
+    assert (
+        path.read_text() == SCENE and "nothing meets 0.01; the smallest error within reach" in capsys.readouterr().out
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--surface-error", "2"], "between 0 and 1"),
+        (["--surface-error", "0.1", "--cells", "0"], "--cells must be at least 1"),
+        (["--surface-error", "0.1", "--chart", "x.svg"], "*.png"),
+        (["--error", "0.1", "--cells", "100"], "for --surface-error only"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):
+    assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("msmpetsc: error: ") and words in line

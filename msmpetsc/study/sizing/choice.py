@@ -74,6 +74,7 @@ class Model:
     law         : of the error over the edge of a cell, cells^(-1/3)
     cells       : of the lattice that the steppings were tried on
     costs       : of one of them by the cells of the lattices tried, ascending
+    explicit    : whether that one was explicit, whose substeps shorten as the edge of a cell
     least, most : cells that may be chosen
     """
 
@@ -82,6 +83,7 @@ class Model:
     solvings: Sequence[Solving]
     cells: float
     costs: Sequence[tuple[float, float]]
+    explicit: bool
     least: int
     most: int
 
@@ -110,7 +112,9 @@ class Model:
     def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
         """Return a choice with its errors and its cost."""
         budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
-        cost = stepping.cost * solving.cost * self.growth(self.cells, cells)
+        shorter = (stepping.method.integrator == "verlet") - self.explicit  # substeps, than those of the costs known
+        growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
+        cost = stepping.cost * solving.cost * growth
         method = replace(stepping.method, step_error=solving.step_error)
         return Choice(method, int(cells), budget, cost, self._shares(stepping, solving, cells))
 

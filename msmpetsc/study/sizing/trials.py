@@ -21,7 +21,10 @@ from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, err
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
 COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
 FINEST = 2  # times finer than the scene's: the finest cells that are chosen
+IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
+REFINED = 3  # times that explicit substeps are halved, at most
+APART = 2  # times the cells, or else the check of a choice against the finest lattice tells nothing
 PART = 8  # the error of the finest step must be so small a part of the error asked for
 LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
@@ -34,6 +37,7 @@ class SizeTrial:
 
     asked, cells : valid cells asked for, and had
     cost         : computing seconds a simulated second
+    substeps     : of a step, for verlet; else iterations
     result       : its file
     """
 
@@ -41,6 +45,7 @@ class SizeTrial:
     asked: int
     cells: float
     cost: float
+    substeps: float
     result: Path
 
     @property
@@ -102,6 +107,7 @@ class Sizer:
         self.solved = min(1e-3, target / 10)  # step error of the trials
         self.bounds: list[str] = []
         self.trials: list[SizeTrial] = []
+        self.step_errors: dict[Candidate, float] = {}  # of the time step alone
 
     def plan(self) -> SizePlan:
         """Make the trials and choose. Raises InputError where too few runs end well."""
@@ -113,63 +119,78 @@ class Sizer:
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
         least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
-        model = Model(law, steppings, solvings, on, costs, least, most)
+        model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", least, most)
         plan = self._checked(model, lattices[-1])
         return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
 
     # Time
 
     def _steppings(self, cells: int) -> list[Stepping]:
-        """Return integrators and steps with the error of the step alone."""
-        ladder = self._ladder(cells)
-        finest = ladder[-1]
-        apart = [_apart(*pair) for pair in pairwise(ladder)]
-        law = error_law([each.method.time_step for each in ladder], apart, STEP_ORDERS)
-        if not law.seen:
+        """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
+        ladder, sizes = self._explicit(cells)
+        if len(ladder) < 2:
+            ladder, sizes = self._implicit(cells)
+        if len(ladder) < 2:
+            raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
+        finest, left = ladder[-1], self._left(ladder, sizes)
+        if left > self.target / PART:
+            integrator, apart = finest.method.integrator, _apart(ladder[-2], finest)
             self.bounds.append(
-                f"the step: no order was seen, as where a body strikes an obstacle; BDF2's two shortest steps are "
-                f"{apart[-1]:.1e} apart"
+                f"the step, as where bodies strike obstacles: the two shortest of {integrator} are {apart:.1e} apart"
             )
-        left = law.error(finest.method.time_step)
         known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
         known.append(Stepping(finest.method, left, finest.cost))
-        tried = [each.method.time_step for each in ladder]
-        known += self._others("implicit-euler", tried, known, finest=finest, left=left, cells=cells)
-        known += self._others("verlet", [self.step], known, finest=finest, left=left, cells=cells)
-        return known
+        explicit = finest.method.integrator == "verlet"
+        chosen_from = known[:1] if explicit else known  # shorter substeps than verlet's own cost much, and give nothing
+        for integrator in IMPLICIT:
+            if explicit or integrator != finest.method.integrator:
+                chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
+        self.step_errors = {each.method: each.error for each in (*known, *chosen_from)}
+        return chosen_from
 
-    def _ladder(self, cells: int) -> list[SizeTrial]:
-        """Return runs of BDF2 with steps halved until the error left is small."""
+    def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
+        """Return runs of verlet, whose error halved substeps tell, and their substeps; none where it takes too long."""
+        first = self._run(self._method("verlet", self.step), cells)
+        if first is None:
+            return [], []
+        runs, sizes = [first], [self.step / first.substeps]
+        for _ in range(REFINED):
+            sizes.append(sizes[-1] / 2)
+            run = self._run(self._method("verlet", sizes[-1]), cells)
+            if run is None:
+                return [], []
+            runs.append(run)
+            if self._left(runs, sizes) <= self.target / PART:
+                break
+        return runs, sizes
+
+    def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
+        """Return runs of BDF2 with steps halved until the error left is small, and their steps."""
         runs: list[SizeTrial] = []
-        for halving in range(-1, 1 + HALVINGS):
-            run = self._run(self._method("bdf2", self.step / 2**halving), cells)
+        for step in self._halved():
+            run = self._run(self._method("bdf2", step), cells)
             if run is None:
                 break
             runs.append(run)
-            if len(runs) < 3:
-                continue
-            apart = [_apart(*pair) for pair in pairwise(runs)]
-            law = error_law([each.method.time_step for each in runs], apart, STEP_ORDERS)
-            if law.error(run.method.time_step) <= self.target / PART:
+            if len(runs) > 2 and self._left(runs, [each.method.time_step for each in runs]) <= self.target / PART:
                 break
-        if len(runs) < 2:
-            raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
-        return runs
+        return runs, [each.method.time_step for each in runs]
+
+    def _halved(self) -> list[float]:
+        return [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
+
+    def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
+        """Return the error of the last of runs whose steps, or substeps, have these sizes."""
+        apart = [_apart(*pair) for pair in pairwise(runs)]
+        return error_law(sizes, apart, STEP_ORDERS).error(sizes[-1])
 
     def _others(
-        self,
-        integrator: Integrator,
-        steps: list[float],
-        known: list[Stepping],
-        *,
-        finest: SizeTrial,
-        left: float,
-        cells: int,
+        self, integrator: Integrator, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
     ) -> list[Stepping]:
         """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
         others: list[Stepping] = []
-        enough = min((each.cost for each in known if each.error <= self.target / 2), default=math.inf)
-        for step in steps:
+        enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
+        for step in self._halved():
             run = self._run(self._method(integrator, step), cells)
             if run is None:
                 break
@@ -178,11 +199,15 @@ class Sizer:
                 break
         return others
 
+    def _at_scale(self, stepping: Stepping) -> float:
+        """Return the cost on the finest lattice over its growth: explicit substeps are shorter there."""
+        return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
+
     def _provisional(self, steppings: list[Stepping]) -> Candidate:
         """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
         fair = [each for each in steppings if each.error <= self.target / 2]
         if fair:
-            return min(fair, key=lambda each: each.cost).method
+            return min(fair, key=self._at_scale).method
         return min(steppings, key=lambda each: each.error).method
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
@@ -230,13 +255,15 @@ class Sizer:
 
     def _measured(self, choice: Choice, model: Model, finest: SizeTrial) -> float | None:
         """Return the error of the choice from its distance to the finest lattice; None where that tells nothing."""
+        if 1 / APART < choice.cells / finest.cells < APART:
+            return None
         run = self._run(choice.method, choice.cells)
-        if run is None or run.result == finest.result:
+        if run is None:
             return None
         apart = _apart(run, finest)
         if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
             share = (run.edge / finest.edge) ** model.law.order
-            return apart * share / max(1 - share, 0.1) + choice.budget.time + choice.budget.step
+            return apart * share / (1 - share) + choice.budget.time + choice.budget.step
         of_method = next(each.error for each in model.steppings if each.method == finest.method)
         return apart + model.law.error(finest.edge) + of_method
 
@@ -247,7 +274,7 @@ class Sizer:
         bounds, best = list(self.bounds), model.best().budget
         if not plan.met:
             wanted = model.cells_for(self.target / 2)
-            if best.time > self.target / 2:
+            if best.time > self.target / 2 and not bounds:
                 bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
             if best.cells > self.target / 2:
                 bounds.append(
@@ -258,13 +285,13 @@ class Sizer:
 
     def _tried(self, model: Model) -> list[Tried]:
         """Return cost and expected error of each trial."""
-        times = {(each.method.integrator, each.method.time_step): each.error for each in model.steppings}
         solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
         tried = []
         for each in self.trials:
             method = each.method
-            error = times[method.integrator, method.time_step] + solved[method.step_error] + model.law.error(each.edge)
-            tried.append(Tried(f"{method.integrator}, {method.time_step:g} s", each.cells, each.cost, error))
+            as_tried = replace(method, step_error=self.solved if method.step_error else None)
+            error = self.step_errors[as_tried] + solved[method.step_error] + model.law.error(each.edge)
+            tried.append(Tried(method.integrator, each.cells, each.cost, error))
         return tried
 
     # Runs
@@ -283,7 +310,9 @@ class Sizer:
         if row["status"] != "ok" or not row.get("time_second"):
             self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
             return None
-        trial = SizeTrial(method, cells, row["cells"], row["time_second"], self.bench.result_of(case))
+        trial = SizeTrial(
+            method, cells, row["cells"], row["time_second"], row["iterations"], self.bench.result_of(case)
+        )
         self.trials.append(trial)
         self.report(trial)
         return trial

@@ -123,8 +123,8 @@ def test_cost_grows_with_cells_as_measured():
 class Bodies:
     """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution."""
 
-    def __init__(self, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0):
-        self.explicit, self.impacts, self.cell_error = explicit, impacts, cell_error
+    def __init__(self, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, fails=lambda *_: False):
+        self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
         self.errors: dict[Path, float] = {}  # by the result
 
     def result_of(self, case: Case) -> Path:
@@ -142,6 +142,8 @@ class Bodies:
         if explicit and not self.explicit:
             return CaseResult({"status": "timeout", "reason": "took longer than 1 s"}, None, 0.0)
         (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
+        if self.fails(case.integrator, cells):
+            return CaseResult({"status": "failed", "reason": "planted"}, None, 0.0)
         self.errors[self.result_of(case)] = self.error_of(case, cells)
         substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
         cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
@@ -173,6 +175,22 @@ def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch,
     )  # fmt: skip
     assert target / 3 < bench.error_of(case, cells) <= 1.01 * target  # what is measured is off by a little
     assert plan.choice.budget.total <= target and len(plan.tried) >= 6
+
+
+def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
+    """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is, and that is said."""
+    first, *_ = sized(tmp_path, monkeypatch, 0.1)
+    runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
+    plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
+    assert first.choice.method.integrator == "verlet" and plan.met and plan.choice.method.integrator != "verlet"
+    assert any("planted" in text for text in said if isinstance(text, str))
+    assert any("verlet" in bound and "fails" in bound for bound in plan.bounds)
+
+
+def test_where_the_coarsest_lattice_fails_one_between_stands_in(tmp_path: Path, monkeypatch):
+    """As where a pin holds no node: the order is seen all the same."""
+    plan, *_ = sized(tmp_path, monkeypatch, 0.1, fails=lambda _, cells: cells == 100)
+    assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {800, 2263, 6400}
 
 
 def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch):

@@ -24,10 +24,11 @@ FINEST = 2  # times finer than the scene's: the finest cells that are chosen
 IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
-APART = 2  # times the cells, or else the check of a choice against the finest lattice tells nothing
+APART = 2  # times the cells, or else the distance of a choice from the finest lattice tells nothing
 PART = 8  # the error of the finest step must be so small a part of the error asked for
 LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
+CHOICES = 3  # that are tried
 TOO_MUCH = 1.1  # times the error asked for, measured, and the choice is made once more
 
 
@@ -67,10 +68,10 @@ class Tried(NamedTuple):
 class SizePlan:
     """The answer.
 
-    choice : None where no two runs could be compared
+    choice : the cheapest that meets the error, or of the smallest error there is
     met    : whether it is expected to meet the error
     bounds : what keeps the error from being smaller, or the estimate from being sure, in words
-    check  : the error of the choice as measured at last; None where it was not run
+    check  : the error of the choice as measured; None where that tells nothing
     """
 
     choice: Choice
@@ -111,7 +112,7 @@ class Sizer:
 
     def plan(self) -> SizePlan:
         """Make the trials and choose. Raises InputError where too few runs end well."""
-        coarse = max(1, self.cells // COARSER**3)
+        coarse = max(1, round(self.cells / COARSER**3))
         steppings = self._steppings(coarse)
         method = self._provisional(steppings)
         solvings = self._solvings(method, coarse)
@@ -226,9 +227,14 @@ class Sizer:
     # Cells
 
     def _law(self, method: Candidate) -> tuple[ErrorLaw, list[SizeTrial]]:
-        """Return the error of the cells, and the runs of the three lattices that it comes from."""
-        counts = [max(1, self.cells // COARSER ** (3 * power)) for power in (2, 1, 0)]
+        """Return the error of the cells, and the runs of the three lattices that it comes from.
+
+        Where the coarsest fails, in which a pin may hold no node, one between the others stands in for it.
+        """
+        counts = [max(1, round(self.cells / COARSER ** (3 * power))) for power in (2, 1, 0)]
         runs = [run for count in counts if (run := self._run(method, count))]
+        if len(runs) < len(counts) and (between := self._run(method, round(self.cells / COARSER**1.5))):
+            runs = sorted([*runs, between], key=lambda run: run.cells)
         if len(runs) < 2:
             raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
         apart = [_apart(*pair) for pair in pairwise(runs)]
@@ -239,33 +245,42 @@ class Sizer:
         return law, runs
 
     def _checked(self, model: Model, finest: SizeTrial) -> SizePlan:
-        """Choose, run the choice against the finest lattice, and choose once more where that was too hopeful."""
-        choice = model.cheapest(self.target)
-        if choice is None:
-            return SizePlan(model.best(), False, [])
-        measured = self._measured(choice, model, finest)
-        if measured is None or measured <= TOO_MUCH * self.target:
-            return SizePlan(choice, True, [], measured)
-        self.report(f"measured {measured:.1e}, more than expected: chosen once more")
-        law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
-        again = replace(model, law=law).cheapest(self.target)
-        if again is None:
-            return SizePlan(choice, False, [], measured)
-        return SizePlan(again, True, [], self._measured(again, model, finest))
+        """Choose and run the choice; choose once more without what fails, and where the error was too hopeful."""
+        choice, measured = model.cheapest(self.target), None
+        for _ in range(CHOICES):
+            if choice is None:
+                break
+            run = self._run(choice.method, choice.cells)
+            if run is None:
+                model = self._without(choice.method, model)
+            else:
+                measured = self._measured(choice, run, finest, model)
+                if measured is None or measured <= TOO_MUCH * self.target:
+                    return SizePlan(choice, True, [], measured)
+                self.report(f"measured {measured:.1e}, more than expected: chosen once more")
+                law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
+                model = replace(model, law=law)
+            choice = model.cheapest(self.target)
+        return SizePlan(choice or model.best(), False, [], measured)
 
-    def _measured(self, choice: Choice, model: Model, finest: SizeTrial) -> float | None:
-        """Return the error of the choice from its distance to the finest lattice; None where that tells nothing."""
-        if 1 / APART < choice.cells / finest.cells < APART:
-            return None
-        run = self._run(choice.method, choice.cells)
-        if run is None:
+    def _without(self, method: Candidate, model: Model) -> Model:
+        """Return a model without a way to step, unless it is the last."""
+        kept = [each for each in model.steppings if each.method != replace(method, step_error=each.method.step_error)]
+        self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
+        return replace(model, steppings=kept or model.steppings)
+
+    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> float | None:
+        """Return the error of a run of the choice from its distance to the finest lattice.
+
+        None where their cells are so alike that it tells nothing.
+        """
+        if 1 / APART < run.cells / finest.cells < APART:
             return None
         apart = _apart(run, finest)
         if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
             share = (run.edge / finest.edge) ** model.law.order
             return apart * share / (1 - share) + choice.budget.time + choice.budget.step
-        of_method = next(each.error for each in model.steppings if each.method == finest.method)
-        return apart + model.law.error(finest.edge) + of_method
+        return apart + model.law.error(finest.edge) + self.step_errors[finest.method]
 
     # What is said
 

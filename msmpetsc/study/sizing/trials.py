@@ -38,7 +38,7 @@ class SizeTrial:
 
     asked, cells : valid cells asked for, and had
     cost         : computing seconds a simulated second
-    substeps     : of a step, for verlet; else iterations
+    substeps     : of a step, for verlet; else iterations; their mean
     result       : its file
     """
 
@@ -159,7 +159,7 @@ class Sizer:
         first = self._run(self._method("verlet", self.step), cells)
         if first is None:
             return [], []
-        runs, sizes = [first], [self.step / first.substeps]
+        runs, sizes = [first], [self.step / math.ceil(first.substeps)]  # frames come at the same times
         for _ in range(REFINED):
             sizes.append(sizes[-1] / 2)
             run = self._run(self._method("verlet", sizes[-1]), cells)

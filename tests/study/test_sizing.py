@@ -3,11 +3,15 @@
 # ruff: noqa: F811 (fixtures are imported)
 import math
 import shlex
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from conftest import ENVIRONMENT, ROOT
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
 from msmpetsc.cli import plan as plan_command
@@ -15,6 +19,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import Case
+from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import CaseResult
 from msmpetsc.study.sizing import trials
@@ -232,6 +237,26 @@ def test_a_scene_with_a_cell_size_needs_a_number_of_cells(tmp_path: Path):
             tmp_path / "scene.toml", Bodies(), target=0.1, presets=["newton"], frames=10, cells=None, ranks=1,
             report=print,
         )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_true_error_of_a_plan_is_what_was_asked_for(tmp_path: Path):
+    """A soft beam, against a run of eight times the cells in explicit substeps, which are half as long on these."""
+    for name in ("beam_soft.toml", "beam.obj"):
+        shutil.copy(ROOT / "scenes" / "studies" / name, tmp_path)
+    scene = str(tmp_path / "beam_soft.toml")
+    words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
+    assert main(["plan", scene, *words]) == 0
+    time, cells = load_scene(Path(scene)).time, load_scene(Path(scene)).cages.count
+    every = max(1, round(1 / 60 / time.step))
+    fine = ["time={step = 0.016666666666666666, duration = 0.5, integrator = 'verlet'}", f"cages.count={8 * cells}"]
+    results = [tmp_path / "plan.h5", tmp_path / "fine.h5"]
+    for result, changes in zip(results, ([f"output.every={every}"], fine), strict=True):
+        own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
+        command = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", str(result), *own]
+        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
+    assert 0.1 / 5 < surface_error(*results) < 1.5 * 0.1
 
 
 PLAN = SizePlan(

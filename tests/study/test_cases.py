@@ -161,3 +161,6 @@ def test_the_studies_shipped_are_sound():
         path = ROOT / "scenes" / "studies" / f"{name}.toml"
         few, many = (study_cases(load_study(path, presets), path.parent, full) for full in (False, True))
         assert 10 < len(few) < 130 and len(few) < len(many)
+    path = ROOT / "scenes" / "studies" / "size.toml"
+    sizes = study_cases(load_study(path, presets), path.parent, False)
+    assert len({case.scene for case in sizes}) == 4 and all(case.stores_surface for case in sizes)

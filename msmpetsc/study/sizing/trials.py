@@ -20,6 +20,7 @@ from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, err
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
 COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
+COARSEST = (2.0, 5 / 3, 4 / 3)  # times that it is done, the first that can be run
 FINEST = 2  # times finer than the scene's: the finest cells that are chosen
 IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
@@ -112,7 +113,7 @@ class Sizer:
 
     def plan(self) -> SizePlan:
         """Make the trials and choose. Raises InputError where too few runs end well."""
-        coarse = max(1, round(self.cells / COARSER**3))
+        coarse = self._coarser(1)
         steppings = self._steppings(coarse)
         method = self._provisional(steppings)
         solvings = self._solvings(method, coarse)
@@ -234,12 +235,11 @@ class Sizer:
     def _law(self, method: Candidate) -> tuple[ErrorLaw, list[SizeTrial]]:
         """Return the error of the cells, and the runs of the three lattices that it comes from.
 
-        Where the coarsest fails, in which a pin may hold no node, one between the others stands in for it.
+        Where the coarsest fails, in which a pin may hold no node, a finer one stands in for it.
         """
-        counts = [max(1, round(self.cells / COARSER ** (3 * power))) for power in (2, 1, 0)]
-        runs = [run for count in counts if (run := self._run(method, count))]
-        if len(runs) < len(counts) and (between := self._run(method, round(self.cells / COARSER**1.5))):
-            runs = sorted([*runs, between], key=lambda run: run.cells)
+        coarsest = (run for power in COARSEST if (run := self._run(method, self._coarser(power))))
+        finer = (self._run(method, self._coarser(power)) for power in (1, 0))
+        runs = [run for run in (next(coarsest, None), *finer) if run is not None]
         if len(runs) < 2:
             raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
         apart = [_apart(*pair) for pair in pairwise(runs)]
@@ -248,6 +248,10 @@ class Sizer:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
             self.bounds.append(f"the cells: no order was seen ({why}); first order is taken")
         return law, runs
+
+    def _coarser(self, power: float) -> int:
+        """Return the cells of the lattice coarsened so many times."""
+        return max(1, round(self.cells / COARSER ** (3 * power)))
 
     def _checked(self, model: Model, finest: SizeTrial) -> SizePlan:
         """Choose and run the choice; choose once more without what fails, and where the error was too hopeful."""

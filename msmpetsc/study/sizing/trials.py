@@ -122,7 +122,7 @@ class Sizer:
         on = next(each.cells for each in self.trials if each.asked == coarse)
         least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
         model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", least, most)
-        plan = self._checked(model, lattices[-1])
+        plan, model = self._checked(model, lattices[-1])
         return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
 
     # Time
@@ -253,8 +253,11 @@ class Sizer:
         """Return the cells of the lattice coarsened so many times."""
         return max(1, round(self.cells / COARSER ** (3 * power)))
 
-    def _checked(self, model: Model, finest: SizeTrial) -> SizePlan:
-        """Choose and run the choice; choose once more without what fails, and where the error was too hopeful."""
+    def _checked(self, model: Model, finest: SizeTrial) -> tuple[SizePlan, Model]:
+        """Choose and run the choice; choose once more without what fails, and where the error was too hopeful.
+
+        Returns the model with what was learnt, too.
+        """
         choice, measured = model.cheapest(self.target), None
         for _ in range(CHOICES):
             if choice is None:
@@ -265,12 +268,12 @@ class Sizer:
             else:
                 measured = self._measured(choice, run, finest, model)
                 if measured is None or measured <= TOO_MUCH * self.target:
-                    return SizePlan(choice, True, [], measured)
+                    return SizePlan(choice, True, [], measured), model
                 self.report(f"measured {measured:.1e}, more than expected: chosen once more")
                 law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
                 model = replace(model, law=law)
             choice = model.cheapest(self.target)
-        return SizePlan(choice or model.best(), False, [], measured)
+        return SizePlan(choice or model.best(), False, [], measured), model
 
     def _without(self, method: Candidate, model: Model) -> Model:
         """Return a model without a way to step, unless it is the last."""

@@ -27,6 +27,8 @@ HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
 APART = 2  # times the cells, or else the distance of a choice from the finest lattice tells nothing
 PART = 8  # the error of the finest step must be so small a part of the error asked for
+FAR = 0.15  # surfaces so far apart move out of step: that is no small error any more, and shrinks with no order
+USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
 LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
 CHOICES = 3  # that are tried
@@ -243,10 +245,13 @@ class Sizer:
         if len(runs) < 2:
             raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
         apart = [_apart(*pair) for pair in pairwise(runs)]
-        law = error_law([each.edge for each in runs], apart, CELL_ORDERS)
+        least, greatest = CELL_ORDERS
+        far = len(runs) > 2 and apart[0] > FAR
+        law = error_law([each.edge for each in runs], apart, (USUAL if far else least, greatest))
         if not law.seen:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
-            self.bounds.append(f"the cells: no order was seen ({why}); first order is taken")
+            why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell" if far else why
+            self.bounds.append(f"the cells: no order was seen ({why}); order {law.order:g} is taken")
         return law, runs
 
     def _coarser(self, power: float) -> int:

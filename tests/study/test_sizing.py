@@ -215,6 +215,13 @@ def test_lattices_out_of_step_tell_no_order(tmp_path: Path, monkeypatch):
     assert 0.05 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) < 0.15
 
 
+def test_where_no_order_is_seen_a_finer_lattice_is_asked(tmp_path: Path, monkeypatch):
+    """At 100 cells and 800 the errors are alike, so order 1.5 is taken, with which 3e-2 is out of reach; it is not."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.03, cell_error=3.0, most=0.2)
+    assert max(each.cells for each in plan.tried) >= round(6400 * 2**1.5)
+    assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) < 1.5 * 0.03
+
+
 def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch):
     """There may be 8 times the cells at most: an error of 1.8e-2 is left."""
     plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, cell_error=4.0)

@@ -110,6 +110,7 @@ class Sizer:
         self.duration = self.step * max(1, steps // 2 * 2)  # twice the step fits into it, too
         self.solved = min(1e-3, target / 10)  # step error of the trials
         self.bounds: list[str] = []
+        self.cell_bound = ""  # what is not sure of the cells' error
         self.trials: list[SizeTrial] = []
         self.step_errors: dict[Candidate, float] = {}  # of the time step alone
 
@@ -119,11 +120,15 @@ class Sizer:
         steppings = self._steppings(coarse)
         method = self._provisional(steppings)
         solvings = self._solvings(method, coarse)
-        law, lattices = self._law(method)
+        lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
         least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
+        law = self._law(lattices)
         model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", least, most)
+        if not law.seen and model.cheapest(self.target) is None and (finer := self._run(method, self._coarser(-0.5))):
+            lattices = [*lattices[-2:], finer]  # where no order was seen, the finest that are known say most
+            model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices[-1])
         return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
 
@@ -234,8 +239,8 @@ class Sizer:
 
     # Cells
 
-    def _law(self, method: Candidate) -> tuple[ErrorLaw, list[SizeTrial]]:
-        """Return the error of the cells, and the runs of the three lattices that it comes from.
+    def _lattices(self, method: Candidate) -> list[SizeTrial]:
+        """Return the runs of the three lattices that the error of the cells comes from.
 
         Where the coarsest fails, in which a pin may hold no node, a finer one stands in for it.
         """
@@ -244,15 +249,20 @@ class Sizer:
         runs = [run for run in (next(coarsest, None), *finer) if run is not None]
         if len(runs) < 2:
             raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
+        return runs
+
+    def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
+        """Return the error of the cells from runs of two lattices or three."""
         apart = [_apart(*pair) for pair in pairwise(runs)]
         least, greatest = CELL_ORDERS
         far = len(runs) > 2 and apart[0] > FAR
         law = error_law([each.edge for each in runs], apart, (USUAL if far else least, greatest))
+        self.cell_bound = ""
         if not law.seen:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
             why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell" if far else why
-            self.bounds.append(f"the cells: no order was seen ({why}); order {law.order:g} is taken")
-        return law, runs
+            self.cell_bound = f"the cells: no order was seen ({why}); order {law.order:g} is taken"
+        return law
 
     def _coarser(self, power: float) -> int:
         """Return the cells of the lattice coarsened so many times."""
@@ -303,10 +313,10 @@ class Sizer:
 
     def _bounds(self, plan: SizePlan, model: Model) -> list[str]:
         """Return what bounds the error, in words."""
-        bounds, best = list(self.bounds), model.best().budget
+        bounds, best = [*self.bounds, *filter(None, [self.cell_bound])], model.best().budget
         if not plan.met:
             wanted = model.cells_for(self.target / 2)
-            if best.time > self.target / 2 and not bounds:
+            if best.time > self.target / 2 and not self.bounds:
                 bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
             if best.cells > self.target / 2:
                 bounds.append(

@@ -283,7 +283,7 @@ class Sizer:
             else:
                 measured = self._measured(choice, run, finest, model)
                 if measured is None or measured <= TOO_MUCH * self.target:
-                    return SizePlan(choice, True, [], measured), model
+                    return SizePlan(replace(choice, cost=run.cost), True, [], measured), model
                 self.report(f"measured {measured:.1e}, more than expected: chosen once more")
                 law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
                 model = replace(model, law=law)

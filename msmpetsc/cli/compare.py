@@ -6,8 +6,9 @@ import numpy as np
 
 from msmpetsc.cli.arguments import refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import Comparison, FieldError, compare, point_text, rest_of
+from msmpetsc.output.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.output.reader import Result, refuse_deadly
+from msmpetsc.output.surfaces import MEAN, compare_surfaces
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
@@ -22,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_deadly(args.first)
     refuse_deadly(args.second)
     with Result(args.first) as first, Result(args.second) as second:
-        comparison = compare(first, second, names)
+        comparison = compared(first, second, names)
         print_what_is_not_shared(first, second, comparison)
         for line in (HEAD, *(row(field, comparison, args.rtol) for field in comparison.fields)):
             print(line)
@@ -32,6 +33,25 @@ def run(args: argparse.Namespace) -> int:
         if apart:
             print("they have not the same times, which counts as different without --shared")
     return DIFFERENT if differs or apart else SAME
+
+
+def compared(first: Result, second: Result, names: list[str] | None) -> Comparison:
+    """Compare two results, of different lattices by their surfaces alone, which is said."""
+    try:
+        return compare(first, second, names)
+    except DifferentLattices as error:
+        differ = str(error)
+    if names not in (None, ["surface"]):
+        raise InputError(f"{differ}: only their surfaces can be compared")
+    try:
+        comparison = compare_surfaces(first, second)
+    except InputError as error:
+        raise InputError(f"{differ}; {error}") from None
+    print(f"{differ}: their surfaces alone are compared")
+    mean = next(field for field in comparison.fields if field.name == MEAN)
+    overall = np.sqrt(np.mean(mean.errors**2))
+    print(f"surface error {overall:.3g}: rms over the surface and time, of the largest displacement in {second.path}")
+    return comparison
 
 
 def print_what_is_not_shared(first: Result, second: Result, comparison: Comparison) -> None:

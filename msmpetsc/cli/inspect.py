@@ -52,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
     print_counts(args, scene, partition, counted)
+    print_budget(scene)
     if not args.no_times:
         print_needs(args, scene, body.surface, partition, mesh)
     print_limits(partition)
@@ -87,6 +88,19 @@ def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition",
         print(f"{name:{WIDTH}}{total:15.0f}{values.mean():15.1f}{values.max():15.0f}")
     positions = f"positions of {scene.stored} frames, file [GB]"
     print(f"{positions:{WIDTH}}{24 * scene.stored * partition.nodes.sum() / GB:15.3g}")
+
+
+def print_budget(scene: Scene) -> None:
+    """Print the surface error that a plan expects, where the scene says it, and whether it is of this scene."""
+    budget = scene.budget
+    if budget is None:
+        return
+    parts = {"cells": budget.cells, "time step": budget.time, "solution of the steps": budget.step}
+    print(f"\n{'surface error expected':{WIDTH}}{sum(parts.values()):15.2g}, asked for {budget.target:g}")
+    for name, error in parts.items():
+        print(f"{f'  of the {name}':{WIDTH}}{error:15.2g}")
+    if (budget.count, budget.time_step) != (scene.cages.count, scene.time.step):
+        print(f"  expected of {budget.count} cells and steps of {budget.time_step:g} s, not of what the scene has now")
 
 
 def print_needs(

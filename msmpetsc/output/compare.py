@@ -29,6 +29,10 @@ SAME_POINT = 1e-6  # of a cell
 SAME_TIME = 1e-6  # of the spacing of frames
 
 
+class DifferentLattices(InputError):
+    """Two runs are not of one lattice."""
+
+
 @dataclass
 class FieldError:
     """How far one field of two runs is apart.
@@ -82,7 +86,8 @@ class Distances(NamedTuple):
 def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
     """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
 
-    Raises InputError if the lattices do not match, or the runs have no time or not these fields in common.
+    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or not these fields in
+    common.
     """
     refuse_different_lattices(a, b)
     chosen, left_out = _chosen(a, b, names)
@@ -194,10 +199,10 @@ def rows_agree(a: np.ndarray, b: np.ndarray, slack: float) -> np.ndarray:
 
 
 def refuse_different_lattices(a: Result, b: Result) -> None:
-    """Raise InputError with the first reason why the two are not of one lattice."""
+    """Raise DifferentLattices with the first reason why the two are not of one lattice."""
 
     def refuse(reason: str) -> None:
-        raise InputError(f"{a.path} and {b.path} are runs of different lattices: {reason}")
+        raise DifferentLattices(f"{a.path} and {b.path} are runs of different lattices: {reason}")
 
     nodes, b_nodes = a.lattice.nodes[:], b.lattice.nodes[:]
     sizes = cell_size(a, nodes), cell_size(b, b_nodes)

@@ -460,6 +460,17 @@ class Output(Table):
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
 
 
+class Budget(Table):
+    """The surface error that a plan expects: rms over surface and time, of the largest displacement."""
+
+    target: Positive = Field(description="asked for [-]")
+    cells: NotNegative = Field(description="of the cells [-]")
+    time: NotNegative = Field(description="of the time step [-]")
+    step: NotNegative = Field(description="of the steps' solution [-]")
+    count: Count = Field(description="number of cells that it was estimated for [-]")
+    time_step: Positive = Field(description="time step that it was estimated for [s]")
+
+
 class Picture(Table):
     """How the result is drawn."""
 
@@ -489,6 +500,7 @@ class SceneFile(Table):
     solver: Solver = Field(Solver.model_validate({}), description="how a step is solved")
     safety: Safety = Field(Safety.model_validate({}), description="what is done about a step that fails")
     output: Output = Field(Output.model_validate({}), description="what is stored")
+    budget: Budget | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
     _of_one_kind = field_validator("part")(_as_the_material)

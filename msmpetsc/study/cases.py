@@ -48,6 +48,7 @@ KEYS = {
     "true_error": Key(argument="--true-error", column=False),
     "trace": Key(argument="--trace", column=False),
 }
+SURFACE = "output.surface=true"  # the override of a case whose surface is compared
 NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "point")
 
 
@@ -103,6 +104,11 @@ class Case:
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
         what |= {"place": asdict(self.point)} if self.point else {}  # as tables of before have it
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def stores_surface(self) -> bool:
+        """Whether its surface is compared, not its nodes."""
+        return SURFACE in self.set
 
     @property
     def work(self) -> float:
@@ -188,11 +194,11 @@ def with_solver(case: Case, scene: Scene) -> Case:
     return case.changed(f"solver={inline(scene.solver.model_dump(exclude_unset=True) | solver)}")
 
 
-def with_time(case: Case, duration: float, every: int, scene: Scene) -> Case:
-    """Return a case with the overrides of its time and output tables."""
+def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
+    """Return a case with the overrides of its time and output tables; with its surface stored if ``surface``."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
     time |= scene_tables(override_values(case))["time"]
-    output = ("output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
+    output = (SURFACE if surface else "output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
     return case.changed(f"time={inline(time)}", *output)
 
 
@@ -294,13 +300,20 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
     every = 1
     if case.reference is not None:
         every = max(1, round((scene.frame or as_given.time.step) / case.time_step))
-    return with_time(case, duration, every, as_given)
+    surface = case.reference is not None and case.reference.stores_surface
+    return with_time(case, duration, every, as_given, surface)
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the run that this lattice's motion is measured against, stored at the moments that are compared."""
+    """Return the run that a case is measured against, stored at the moments that are compared.
+
+    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in it.
+    """
     if scene.reference is None:
         return None
+    cells = scene.reference.cells
+    if cells:
+        base = replace(base, cells=cells, set=(*scene.set, f"cages.count={cells}"))
     frame = scene.frame or as_given.time.step
     duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
     return reference_case(base, scene.reference, as_given, frame=frame, duration=duration)
@@ -308,18 +321,19 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
 
 def reference_case(base: Case, reference: ReferenceRun, scene: Scene, *, frame: float, duration: float) -> Case:
     """Return a run of the same lattice with tiny steps; frame, duration [s]."""
+    surface = reference.cells is not None
     case = replace(
         base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
     )
     if reference.integrator == "verlet":
-        return with_time(replace(case, substep=reference.substep), duration, 1, scene)
+        return with_time(replace(case, substep=reference.substep), duration, 1, scene, surface)
     step = reference.step or frame  # the schema asks for it
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
     solver = inline({"preset": reference.preset, "error": reference.error})
-    return with_time(case.changed(f"solver={solver}"), duration, every, scene)
+    return with_time(case.changed(f"solver={solver}"), duration, every, scene, surface)
 
 
 # Maps

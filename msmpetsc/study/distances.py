@@ -1,4 +1,4 @@
-"""Distances of motions: the shape error, from the rest shape, and the trajectory error, from the true motion."""
+"""Distances of motions: the shape error, from the rest shape; trajectory and surface error, from the true motion."""
 
 import warnings
 from pathlib import Path
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.errors import InputError
 from msmpetsc.output.compare import common_times, refuse_different_lattices
 from msmpetsc.output.reader import Result
+from msmpetsc.output.surfaces import surface_distance
 
 
 def shape_error(run: Result, frame: int) -> float | None:
@@ -64,3 +65,19 @@ def trajectory_error(result: Path, reference: Path) -> float:
     if moved == 0:
         raise InputError(f"{reference}: nothing moves in it")
     return float(np.sqrt(off / moved))
+
+
+def surface_error(result: Path, reference: Path) -> float:
+    """Return the distance of a run's surface from that of a reference run, of any lattice of the same mesh [-].
+
+        sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
+
+    The reference stands for the body itself: this is the error of cells, time step and unfinished steps together.
+
+    Raises InputError if the meshes differ, a surface was not stored, there is no common time, or nothing moves.
+    """
+    with Result(result) as run, Result(reference) as true:
+        distance = surface_distance(run, true)
+    if distance.moved == 0:
+        raise InputError(f"{reference}: nothing moves in it")
+    return distance.overall / distance.moved

@@ -21,6 +21,7 @@ from msmpetsc.study.charts.cells import figure6_charts, growth_charts
 from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.order import order_charts
 from msmpetsc.study.charts.pareto import LEVELS, MEASURES, TRAJECTORY, cost_of, pareto_charts
+from msmpetsc.study.charts.sizes import size_charts
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.charts.style import RC, Chart, Point, curve_styles, save_png, svg_text
 from msmpetsc.study.metrics import counted
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 PRINTED = {
     "label", "scene", "x", "y", "outcome", "status", "reason", "time_step", "error", "cells", "ranks", "time_frame",
     "time_frame_min", "time_frame_max", "time_second",
-    "ksp_its", "products", "memory", "true_error", "trajectory_error",
+    "ksp_its", "products", "memory", "true_error", "trajectory_error", "surface_error",
 }  # fmt: skip
 NOT_PRINTED = {*COLUMNS} - PRINTED
 FIRST, LAST = ("label", "status"), "command"  # columns of the whole table even where all cases agree in them
@@ -95,7 +96,7 @@ def draw_charts(table: "DataFrame", traces: list[dict], study: dict) -> list[Cha
     with matplotlib.style.context(["default", RC]):
         charts = stability_charts(table, study)
         sweeps = swept(table)
-        for draw in (pareto_charts, figure6_charts, growth_charts):
+        for draw in (size_charts, pareto_charts, figure6_charts, growth_charts):
             charts += draw(sweeps, styles)
         charts += order_charts(sweeps, styles, study)
         commands = dict(zip(sweeps["case"], sweeps["command"], strict=True))

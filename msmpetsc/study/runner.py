@@ -12,7 +12,7 @@ from threading import Lock
 
 from msmpetsc.errors import InputError
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
-from msmpetsc.study.distances import trajectory_error
+from msmpetsc.study.distances import surface_error, trajectory_error
 from msmpetsc.study.metrics import of_frames, outcome, rates, read_costs, read_failure, read_trace, together
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.progress import StudyProgress
@@ -44,10 +44,14 @@ class Bench:
     _locks: dict[str, Lock] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
-    def measure(self, case: Case) -> CaseResult:
-        """Run a case as often as it says; what goes wrong stands in its row."""
+    def result_of(self, case: Case) -> Path:
+        """Return where the result of a case lies while it runs, and after it if it is kept."""
+        return self.folder / "runs" / f"{case.id}.h5"
+
+    def measure(self, case: Case, keep: bool = False) -> CaseResult:
+        """Run a case as often as it says; what goes wrong stands in its row. ``keep``: its result stays."""
         runs: list[Row] = []
-        path, seconds = self.folder / "runs" / f"{case.id}.h5", 0.0
+        path, seconds = self.result_of(case), 0.0
         reference, why = self._reference(case)
         trace, kind = None, ""
         for repeat in range(case.repeats):
@@ -57,9 +61,11 @@ class Bench:
             if repeat == 0:
                 trace = read_trace(path.with_suffix(".json"))
                 if reference is not None and not ended.reason:
-                    row["trajectory_error"], why = _distance(path, reference)
+                    errors, why = _distance(case, path, reference)
+                    row |= errors
             kind = read_failure(path.with_suffix(".json"))
-            _remove_files(path, log=not ended.reason)
+            if not keep or ended.reason:
+                _remove_files(path, log=not ended.reason)
             runs.append(row)
             if ended.reason:
                 break
@@ -119,11 +125,13 @@ class Bench:
         return (path, "") if path.is_file() else (None, f"no reference: {failed.read_text()}")
 
 
-def _distance(path: Path, reference: Path) -> tuple[float | None, str]:
+def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
+    """Return the error of a run's surface, or of its nodes, by the name of its column; or why there is none."""
+    name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     try:
-        return trajectory_error(path, reference), ""
+        return {f"{name}_error": measure(path, reference)}, ""
     except InputError as error:
-        return None, f"no trajectory error: {error}"
+        return {}, f"no {name} error: {error}"
 
 
 def _remove_files(path: Path, log: bool) -> None:

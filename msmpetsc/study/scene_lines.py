@@ -2,7 +2,9 @@
 
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import tomlkit
@@ -11,45 +13,47 @@ from msmpetsc.scene.reading import read_toml
 from msmpetsc.study.cases import inline, scene_tables
 from msmpetsc.study.plan import Candidate
 
+Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 
-def tables(method: Candidate) -> dict[str, dict[str, Any]]:
-    """Return what the method says of a scene; None: the key must not stand there."""
-    return scene_tables(
+
+def tables(method: Candidate, more: Tables = MappingProxyType({})) -> Tables:
+    """Return what the method says of a scene, and ``more`` tables; None: the key must not stand there."""
+    return {**scene_tables(
         {
             "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
             "error": method.step_error, "max_iterations": None,
         }
-    )  # fmt: skip
+    ), **more}  # fmt: skip
 
 
-def lines(method: Candidate) -> str:
+def lines(method: Candidate, more: Tables = MappingProxyType({})) -> str:
     """Return TOML lines to paste."""
     shown = {
         name: {key: value for key, value in table.items() if value is not None}
-        for name, table in tables(method).items()
+        for name, table in tables(method, more).items()
     }
     return tomlkit.dumps(shown).strip()
 
 
-def overrides(scene: Path, method: Candidate) -> list[str]:
+def overrides(scene: Path, method: Candidate, more: Tables = MappingProxyType({})) -> list[str]:
     """Return the same as changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
     (_, document), changes = read_toml(scene), []
-    for name, table in tables(method).items():
+    for name, table in tables(method, more).items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):
-            changes.append(f"{name}={inline(given | table)}")  # --set changes keys, and takes none away
+            changes.append(f"{name}={inline({**given, **table})}")  # --set changes keys, and takes none away
         else:
             changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
     return changes
 
 
-def put_into(scene: Path, method: Candidate) -> None:
+def put_into(scene: Path, method: Candidate, more: Tables = MappingProxyType({})) -> None:
     """Change the scene file; comments, order and all else stay as they are. Raises OSError if it cannot be written."""
     with open(scene, "r+", encoding="utf-8", newline="") as file:  # a file that is read-only is meant to stay
         text = file.read()
     line_end = "\r\n" if "\r\n" in text else "\n"
     document = tomlkit.parse(text)
-    for name, table in tables(method).items():
+    for name, table in tables(method, more).items():
         if name not in document:
             document[name] = tomlkit.table()
         old: Any = document[name]

@@ -51,12 +51,19 @@ Options = Annotated[str, AfterValidator(_words)]
 
 
 class ReferenceRun(Table):
-    """The run that a scene's motion is measured against, with steps so short that it stands for the true motion."""
+    """The run that a scene's motion is measured against, with steps so short that it stands for the true motion.
+
+    With cells of its own, many more than the cases have, it stands for the body itself, and surfaces are compared.
+    """
 
     integrator: Integrator = Field(default="verlet", description="how it is stepped")
     step: Positive | None = Field(default=None, description="implicit-euler: time step [s]")
     substep: Positive | None = Field(
         default=None, description="verlet: longest substep [s]; the stability limit's if absent"
+    )
+    cells: Count | None = Field(
+        default=None,
+        description="number of its own valid cells: then surfaces are compared; the case's own lattice if absent [-]",
     )
     preset: Preset = Field(default="newton", description="implicit-euler: solver preset")
     error: Error = Field(default=1e-6, description="implicit-euler: relative error of a step [-]")
@@ -94,7 +101,8 @@ class StudyScene(Length):
         description="moments compared with the reference lie this far apart [s]; the scene's time step if absent",
     )
     reference: ReferenceRun | None = Field(
-        default=None, description="what the trajectory error is measured against; none if absent"
+        default=None,
+        description="what the trajectory error, or with cells of its own the surface error, is measured against",
     )
     true_error: Count | None = Field(
         default=None, description="every so many steps the true step error is measured [-]"

@@ -89,6 +89,7 @@ COLUMNS = {
     "true_error": Column(float, "1", "step error, rms of the steps measured"),
     "energy_error": Column(float, "1", "the same in energy"),
     "trajectory_error": Column(float, "1", "distance from the reference run"),
+    "surface_error": Column(float, "1", "distance of the surface from that of a reference run of other cells"),
     "machine": Column(str, "", "where it ran"),
     "versions": Column(str, "", "of the programs"),
     "command": Column(str, "", "the line that repeats the case"),

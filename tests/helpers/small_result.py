@@ -46,7 +46,9 @@ def frame(index: int, **other) -> Frame:
     return Frame(**{"index": index, "time": DT * index, **energies, **numbers, **arrays, **other})
 
 
-def write(path: Path, frames: list[Frame] | None = None, surface: bool = True, **lattice) -> Path:
+def write(
+    path: Path, frames: list[Frame] | None = None, surface: bool = True, points: np.ndarray = POINTS, **lattice
+) -> Path:
     """The file, with other frames or other arrays of the lattice where they are given."""
     frames = [frame(index) for index in range(FRAMES)] if frames is None else frames
     s = len(springs())
@@ -57,7 +59,7 @@ def write(path: Path, frames: list[Frame] | None = None, surface: bool = True, *
         for name, rows in (arrays | lattice).items():
             file.write(f"lattice/{name}", rows)
         if surface:
-            file.write("surface/points", POINTS)
+            file.write("surface/points", points)
             file.write("surface/triangles", np.array([[0, 1, 2], [1, 2, 3]]))
             file.write("embedding/indptr", 8 * np.arange(len(POINTS) + 1))
             file.write("embedding/indices", cells()[[0, 1, 1, 0]].ravel())

@@ -14,8 +14,11 @@ from conftest import ENVIRONMENT
 from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
 
 from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
 from msmpetsc.output.compare import DEFAULT, compare, difference
 from msmpetsc.output.reader import Result
+from msmpetsc.output.surfaces import point_areas, surface_distance
+from msmpetsc.study.distances import surface_error
 
 DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the last frame
 
@@ -158,9 +161,52 @@ OTHER_SPRINGS[4] = [0, 11]
 )
 def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, capsys, lattice: dict, reason: str):
     n = len(lattice.get("nodes", NODES))
-    frames = [frame(i, position=np.zeros((n, 3))) for i in range(2)]
-    status, _, said = told(capsys, a, small_result.write(tmp_path / "b.h5", frames, **lattice))
-    assert status == 2 and re.search(reason, said), said
+    frames = [frame(i, position=np.zeros((n, 3)), surface=None) for i in range(2)]
+    b = small_result.write(tmp_path / "b.h5", frames, surface=False, **lattice)
+    status, _, said = told(capsys, a, b)
+    assert status == 2 and re.search(reason, said) and said.count("\n") == 1, said
+
+
+def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> Path:
+    """A run of the same mesh on a lattice twice as coarse; from frame 2 on its surface point 3 is off by so much."""
+    frames = [frame(i, surface=points + 0.01 * i * small_result.X) for i in range(FRAMES)]
+    for one in frames[2:]:
+        one.surface[3, 1] += by
+    return small_result.write(path, frames, points=points, nodes=2 * NODES)
+
+
+def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(a: Path, tmp_path: Path, capsys):
+    b = other_lattice(tmp_path / "b.h5", by=0.02)
+    status, out, _ = told(capsys, a, b)
+    largest = np.hypot(0.04, 0.02)  # of a displacement in b
+    assert status == 1 and "different lattices: cells of 0.5 m and 1 m: their surfaces alone are compared" in out
+    assert "they differ from frame 2 on, t = 0.02 s: surface, surface, rms" in out and "surface point 3, at rest" in out
+    with Result(a) as one, Result(b) as other:
+        distance = surface_distance(one, other)
+        assert distance.moved == pytest.approx(largest, rel=1e-6)
+        areas = point_areas(one)
+    rms = 0.02 * np.sqrt(areas[3] / areas.sum())
+    assert distance.rms == pytest.approx([0, 0, rms, rms, rms], rel=1e-4, abs=1e-8)
+    assert surface_error(a, b) == pytest.approx(rms * np.sqrt(3 / 5) / largest, rel=1e-4)
+    assert f"surface error {surface_error(a, b):.3g}: " in out
+    assert told(capsys, a, b, "--rtol", "1")[0] == 0
+    assert "only their surfaces can be compared" in told(capsys, a, b, "--fields", "kinetic")[2]
+
+
+def test_points_count_by_the_area_around_them(a: Path):
+    with Result(a) as run:
+        p, areas = POINTS, point_areas(run)
+    first, second = (np.linalg.norm(np.cross(p[b] - p[a], p[c] - p[a])) / 6 for a, b, c in ((0, 1, 2), (1, 2, 3)))
+    assert areas == pytest.approx([first, first + second, first + second, second])
+
+
+def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path, capsys):
+    b = other_lattice(tmp_path / "b.h5", points=POINTS + np.outer([0, 0, 1, 0], [0, 0.01, 0]))
+    status, _, said = told(capsys, a, b)
+    assert status == 2 and said.count("\n") == 1 and "different meshes: point 2 rests at (0.9, 0.4, 0.4) m" in said
+    with pytest.raises(InputError, match="nothing moves"):
+        still = small_result.write(tmp_path / "still.h5", [frame(0)])
+        surface_error(a, still)
 
 
 def test_the_order_of_springs_does_not_matter(a: Path, tmp_path: Path, capsys):

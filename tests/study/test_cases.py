@@ -133,6 +133,18 @@ def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
     assert after.id != before.id
 
 
+def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
+    """It has neither a case's cells nor what a sweep changes, and surfaces are stored, which are compared."""
+    reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
+    sweep = '[[sweep]]\ncells = [10, 80]\n[[sweep]]\ncells = [10]\nset = ["cages.boundary=whole"]'
+    found = all_cases(tmp_path, ONE_SCENE + reference + sweep)
+    (one,) = {case.reference.id: case.reference for case in found}.values()
+    assert one.cells == 5000 and "cages.count=5000" in one.set and "cages.boundary=whole" not in one.set
+    assert len(found) == 3 and all(case.stores_surface for case in (one, *found))
+    (own, _) = all_cases(tmp_path, ONE_SCENE + reference.replace("cells = 5000, ", "") + "[[sweep]]\ncells = [10, 80]")
+    assert own.reference.set[0] == "cages.count=10" and not own.stores_surface and not own.reference.stores_surface
+
+
 def test_the_studies_shipped_are_sound():
     presets = {
         "newton",
@@ -149,3 +161,6 @@ def test_the_studies_shipped_are_sound():
         path = ROOT / "scenes" / "studies" / f"{name}.toml"
         few, many = (study_cases(load_study(path, presets), path.parent, full) for full in (False, True))
         assert 10 < len(few) < 130 and len(few) < len(many)
+    path = ROOT / "scenes" / "studies" / "size.toml"
+    sizes = study_cases(load_study(path, presets), path.parent, False)
+    assert len({case.scene for case in sizes}) == 4 and all(case.stores_surface for case in sizes)

@@ -14,6 +14,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cells import curves, figure6_charts, growth_charts, is_cholesky
 from msmpetsc.study.charts.convergence import convergence_charts
 from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, winners
+from msmpetsc.study.charts.sizes import RING, size_charts
 from msmpetsc.study.charts.style import curve_styles
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import read_table, records, succeeded, typed
@@ -371,3 +372,21 @@ def test_a_trace_without_errors_is_left_out(tmp_path: Path):
     traces = [{"scene": "a", "label": "b", "trace": trace} for trace in (None, {}, {"position_error": [None]})]
     (tmp_path / "traces.json").write_text(json.dumps(traces))
     assert svgs(write_report(tmp_path).read_text()) == []
+
+
+def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path):
+    """Fill is both cheaper and more exact than whole cells but for their coarsest."""
+    rows = [
+        row_of(label, scene="heart", cells=n, time_frame=time, surface_error=error)
+        for label, errors in (("whole", (0.3, 0.2, 0.1)), ("fill", (0.2, 0.05, 0.01)))
+        for n, time, error in zip((250, 700, 2000), (0.01, 0.02, 0.08), errors, strict=True)
+    ]
+    rows.append(row_of("fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3))
+    text = write_report(write_rows(tmp_path, rows)).read_text()
+    assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
+    assert len([title for title in tooltips(text) if "surface error: " in spaced(title)]) == 6
+    assert "</span> with 2,000 cells." in text and "a pin holds no node" in text
+    table = read_table(tmp_path)
+    (chart,) = size_charts(table, curve_styles(table["label"]))
+    (rings,) = [line for line in chart.figure.axes[0].lines if line.get_markersize() == RING["markersize"]]
+    assert list(rings.get_ydata()) == [0.2, 0.05, 0.01]

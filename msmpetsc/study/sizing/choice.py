@@ -1,0 +1,163 @@
+"""The cheapest way to a surface error: it is split among cells, time step and the solution of the steps."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from msmpetsc.study.plan import Candidate
+from msmpetsc.study.sizing.orders import ErrorLaw
+
+STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """An integrator with its step, tried on one lattice.
+
+    error : of the time step alone [-]
+    cost  : computing seconds a simulated second there
+    """
+
+    method: Candidate
+    error: float
+    cost: float
+
+
+@dataclass(frozen=True)
+class Solving:
+    """A relative error of each step that is asked for.
+
+    error : that it leaves in the motion [-]
+    cost  : over that of the trials
+    """
+
+    step_error: float | None
+    error: float
+    cost: float
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The parts of a surface error, each relative to the largest displacement [-]."""
+
+    cells: float
+    time: float
+    step: float
+
+    @property
+    def total(self) -> float:
+        """Return their sum, which no combination of them exceeds."""
+        return self.cells + self.time + self.step
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to run, and what is expected of it.
+
+    cost   : computing seconds a simulated second
+    shares : of the cost by part of the error: how much of its rise each part is, were a smaller error asked for
+    """
+
+    method: Candidate
+    cells: int
+    budget: Budget
+    cost: float
+    shares: Budget
+
+
+@dataclass(frozen=True)
+class Model:
+    """What the trials told: errors of the cells, the steps and their solution, and what each costs.
+
+    law         : of the error over the edge of a cell, cells^(-1/3)
+    cells       : of the lattice that the steppings were tried on
+    costs       : of one of them by the cells of the lattices tried, ascending
+    explicit    : whether that one was explicit, whose substeps shorten as the edge of a cell
+    least, most : cells that may be chosen
+    """
+
+    law: ErrorLaw
+    steppings: Sequence[Stepping]
+    solvings: Sequence[Solving]
+    cells: float
+    costs: Sequence[tuple[float, float]]
+    explicit: bool
+    least: int
+    most: int
+
+    def cheapest(self, target: float) -> Choice | None:
+        """Return the cheapest choice whose errors add up to the target at most; None if none does."""
+        choices = [
+            self.choice(stepping, solving, cells)
+            for stepping in self.steppings
+            for solving in self._solvings(stepping)
+            if (cells := self.cells_for(target - stepping.error - solving.error)) <= self.most
+        ]
+        return min(choices, key=lambda choice: choice.cost, default=None)
+
+    def best(self) -> Choice:
+        """Return the choice of the least error, whatever it costs."""
+        stepping = min(self.steppings, key=lambda each: each.error)
+        solving = min(self._solvings(stepping), key=lambda each: each.error)
+        return self.choice(stepping, solving, self.most)
+
+    def cells_for(self, error: float) -> float:
+        """Return how many cells have this error; infinitely many where nothing is left of it."""
+        if error <= 0:
+            return math.inf
+        return max(self.least, math.ceil(self.law.size(error) ** -3)) if self.law.factor > 0 else self.least
+
+    def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
+        """Return a choice with its errors and its cost."""
+        budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
+        shorter = (stepping.method.integrator == "verlet") - self.explicit  # substeps, than those of the costs known
+        growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
+        cost = stepping.cost * solving.cost * growth
+        method = replace(stepping.method, step_error=solving.step_error)
+        return Choice(method, int(cells), budget, cost, self._shares(stepping, solving, cells))
+
+    def growth(self, before: float, after: float) -> float:
+        """Return how many times the cost is when there are so many cells, read off the lattices tried."""
+        cells, costs = np.log(self.costs).T
+        if len(cells) < 2:
+            return after / before
+        slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, STEEPEST)
+        beyond = max(1.0, slopes[-1])
+        knots = np.concatenate([[0.0], np.cumsum(slopes * np.diff(cells))])
+
+        def log_cost(count: float) -> float:
+            past = max(0.0, math.log(count) - cells[-1])  # where nothing was tried
+            return float(np.interp(math.log(count), cells, knots)) + beyond * past
+
+        return math.exp(log_cost(after) - log_cost(before))
+
+    def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
+        """Return how its steps may be solved; explicit ones are not."""
+        return [Solving(None, 0.0, 1.0)] if stepping.method.integrator == "verlet" else self.solvings
+
+    def _shares(self, stepping: Stepping, solving: Solving, cells: float) -> Budget:
+        """Return d log cost / d log error of each part over their sum."""
+        same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
+        parts = (
+            3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order,
+            _steepness([(each.error, each.cost) for each in same], (stepping.error, stepping.cost)),
+            _steepness([(each.error, each.cost) for each in self.solvings], (solving.error, solving.cost)),
+        )
+        total = sum(parts) or 1.0
+        return Budget(*(part / total for part in parts))
+
+
+def _steepness(tried: Sequence[tuple[float, float]], chosen: tuple[float, float]) -> float:
+    """Return how fast cost rises as the error falls, d log cost / -d log error, towards the next smaller error tried.
+
+    Where none is smaller, from the next greater one; 0 of one alone.
+    """
+    error, cost = chosen
+    others = [other for other in tried if other[0] > 0 and other[0] != error]
+    if error <= 0 or not others:
+        return 0.0
+    smaller = [other for other in others if other[0] < error]
+    near = max(smaller) if smaller else min(others)
+    return max(0.0, math.log(near[1] / cost) / math.log(error / near[0]))

@@ -1,0 +1,378 @@
+"""The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
+
+import math
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.schema import Integrator
+from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
+from msmpetsc.study.distances import surface_error
+from msmpetsc.study.plan import Candidate
+from msmpetsc.study.runner import Bench
+from msmpetsc.study.schema import Study, StudyScene, Sweep
+from msmpetsc.study.sizing.choice import Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, error_law
+
+PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
+COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
+COARSEST = (2.0, 5 / 3, 4 / 3)  # times that it is done, the first that can be run
+FINEST = 2  # times finer than the scene's: the finest cells that are chosen
+IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
+HALVINGS = 6  # of the scene's step
+REFINED = 3  # times that explicit substeps are halved, at most
+APART = 2  # times the cells, or else the distance of a choice from the finest lattice tells nothing
+PART = 8  # the error of the finest step must be so small a part of the error asked for
+FAR = 0.15  # surfaces so far apart move out of step: that is no small error any more, and shrinks with no order
+USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
+LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
+TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
+CHOICES = 3  # that are tried
+TOO_MUCH = 1.1  # times the error asked for, measured, and the choice is made once more
+
+
+@dataclass(frozen=True)
+class SizeTrial:
+    """A run that was made.
+
+    asked, cells : valid cells asked for, and had
+    cost         : computing seconds a simulated second
+    substeps     : of a step, for verlet; else iterations; their mean
+    result       : its file
+    """
+
+    method: Candidate
+    asked: int
+    cells: float
+    cost: float
+    substeps: float
+    result: Path
+
+    @property
+    def edge(self) -> float:
+        """Edge of a cell, of a body of one cell."""
+        return self.cells ** (-1 / 3)
+
+
+class Tried(NamedTuple):
+    """A trial as a point over cost and expected error."""
+
+    method: str
+    cells: float
+    cost: float
+    error: float
+
+
+@dataclass
+class SizePlan:
+    """The answer.
+
+    choice : the cheapest that meets the error, or of the smallest error there is
+    met    : whether it is expected to meet the error
+    bounds : what keeps the error from being smaller, or the estimate from being sure, in words
+    check  : the error of the choice as measured; None where that tells nothing
+    """
+
+    choice: Choice
+    met: bool
+    bounds: list[str]
+    check: float | None = None
+    tried: list[Tried] = field(default_factory=list)
+
+
+class Sizer:
+    """Makes the trials of one scene for one surface error."""
+
+    def __init__(
+        self,
+        scene: Path,
+        bench: Bench,
+        *,
+        target: float,
+        presets: Collection[str],
+        frames: int,
+        cells: int | None,
+        ranks: int,
+        report: Callable[[SizeTrial | str], None],
+    ):
+        self.scene, self.bench, self.target, self.presets, self.ranks = scene, bench, target, presets, ranks
+        self.as_given = load_scene(scene, (), presets)
+        count = cells or self.as_given.cages.count
+        if count is None:
+            raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")
+        self.cells, self.report = count, report
+        self.step = self.as_given.time.step
+        steps = min(frames, self.as_given.time.steps)
+        self.duration = self.step * max(1, steps // 2 * 2)  # twice the step fits into it, too
+        self.solved = min(1e-3, target / 10)  # step error of the trials
+        self.bounds: list[str] = []
+        self.cell_bound = ""  # what is not sure of the cells' error
+        self.trials: list[SizeTrial] = []
+        self.step_errors: dict[Candidate, float] = {}  # of the time step alone
+
+    def plan(self) -> SizePlan:
+        """Make the trials and choose. Raises InputError where too few runs end well."""
+        coarse = self._coarser(1)
+        steppings = self._steppings(coarse)
+        method = self._provisional(steppings)
+        solvings = self._solvings(method, coarse)
+        lattices = self._lattices(method)
+        costs = [(each.cells, each.cost) for each in lattices]
+        on = next(each.cells for each in self.trials if each.asked == coarse)
+        least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
+        law = self._law(lattices)
+        model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", least, most)
+        if not law.seen and model.cheapest(self.target) is None and (finer := self._run(method, self._coarser(-0.5))):
+            lattices = [*lattices[-2:], finer]  # where no order was seen, the finest that are known say most
+            model = replace(model, law=self._law(lattices))
+        plan, model = self._checked(model, lattices[-1])
+        return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
+
+    # Time
+
+    def _steppings(self, cells: int) -> list[Stepping]:
+        """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
+        ladder, sizes = self._explicit(cells)
+        if len(ladder) < 2:
+            ladder, sizes = self._implicit(cells)
+        if len(ladder) < 2:
+            raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
+        finest, left = ladder[-1], self._left(ladder, sizes)
+        if left > self.target / PART:
+            integrator, apart = finest.method.integrator, _apart(ladder[-2], finest)
+            self.bounds.append(f"the step: the two shortest of {integrator} are {apart:.1e} apart{self._contact_law()}")
+        known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
+        known.append(Stepping(finest.method, left, finest.cost))
+        explicit = finest.method.integrator == "verlet"
+        chosen_from = known[:1] if explicit else known  # shorter substeps than verlet's own cost much, and give nothing
+        for integrator in IMPLICIT:
+            if explicit or integrator != finest.method.integrator:
+                chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
+        self.step_errors = {each.method: each.error for each in (*known, *chosen_from)}
+        return chosen_from
+
+    def _contact_law(self) -> str:
+        """Return what contact has to do with it, in words; "" for nothing."""
+        responses = {obstacle.response for obstacle in self.as_given.obstacle}
+        if "reflect" in responses:
+            return '; a rebound of response = "reflect" depends on the step, that of "penalty" has a limit'
+        return "; contact is stiff" if responses else ""
+
+    def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
+        """Return runs of verlet, whose error halved substeps tell, and their substeps; none where it takes too long."""
+        first = self._run(self._method("verlet", self.step), cells)
+        if first is None:
+            return [], []
+        runs, sizes = [first], [self.step / math.ceil(first.substeps)]  # frames come at the same times
+        for _ in range(REFINED):
+            sizes.append(sizes[-1] / 2)
+            run = self._run(self._method("verlet", sizes[-1]), cells)
+            if run is None:
+                return [], []
+            runs.append(run)
+            if self._left(runs, sizes) <= self.target / PART:
+                break
+        return runs, sizes
+
+    def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
+        """Return runs of BDF2 with steps halved until the error left is small, and their steps."""
+        runs: list[SizeTrial] = []
+        for step in self._halved():
+            run = self._run(self._method("bdf2", step), cells)
+            if run is None:
+                break
+            runs.append(run)
+            if len(runs) > 2 and self._left(runs, [each.method.time_step for each in runs]) <= self.target / PART:
+                break
+        return runs, [each.method.time_step for each in runs]
+
+    def _halved(self) -> list[float]:
+        return [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
+
+    def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
+        """Return the error of the last of runs whose steps, or substeps, have these sizes."""
+        apart = [_apart(*pair) for pair in pairwise(runs)]
+        return error_law(sizes, apart, STEP_ORDERS).error(sizes[-1])
+
+    def _others(
+        self, integrator: Integrator, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
+    ) -> list[Stepping]:
+        """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
+        others: list[Stepping] = []
+        enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
+        for step in self._halved():
+            run = self._run(self._method(integrator, step), cells)
+            if run is None:
+                break
+            others.append(Stepping(run.method, _apart(run, finest) + left, run.cost))
+            if others[-1].error <= self.target / 3 or run.cost > 2 * enough:
+                break
+        return others
+
+    def _at_scale(self, stepping: Stepping) -> float:
+        """Return the cost on the finest lattice over its growth: explicit substeps are shorter there."""
+        return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
+
+    def _provisional(self, steppings: list[Stepping]) -> Candidate:
+        """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
+        fair = [each for each in steppings if each.error <= self.target / 2]
+        if fair:
+            return min(fair, key=self._at_scale).method
+        return min(steppings, key=lambda each: each.error).method
+
+    def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
+        """Return how loosely the steps may be solved, and what that leaves."""
+        if method.step_error is None:
+            return [Solving(self.solved, 0.0, 1.0)]
+        base = self._run(method, cells)
+        known: list[Solving] = []
+        for step_error in LOOSE:
+            run = self._run(replace(method, step_error=step_error), cells) if base else None
+            if run and base:
+                known.append(Solving(step_error, _apart(run, base), run.cost / base.cost))
+        rest = known[-1].error * self.solved / known[-1].step_error if known and known[-1].step_error else 0.0
+        return [*known, Solving(self.solved, rest, 1.0)]
+
+    # Cells
+
+    def _lattices(self, method: Candidate) -> list[SizeTrial]:
+        """Return the runs of the three lattices that the error of the cells comes from.
+
+        Where the coarsest fails, in which a pin may hold no node, a finer one stands in for it.
+        """
+        coarsest = (run for power in COARSEST if (run := self._run(method, self._coarser(power))))
+        finer = (self._run(method, self._coarser(power)) for power in (1, 0))
+        runs = [run for run in (next(coarsest, None), *finer) if run is not None]
+        if len(runs) < 2:
+            raise InputError(f"{self.scene}: only one lattice could be run, see above: the cells' error is not known")
+        return runs
+
+    def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
+        """Return the error of the cells from runs of two lattices or three."""
+        apart = [_apart(*pair) for pair in pairwise(runs)]
+        least, greatest = CELL_ORDERS
+        far = len(runs) > 2 and apart[0] > FAR
+        law = error_law([each.edge for each in runs], apart, (USUAL if far else least, greatest))
+        self.cell_bound = ""
+        if not law.seen:
+            why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
+            why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell" if far else why
+            self.cell_bound = f"the cells: no order was seen ({why}); order {law.order:g} is taken"
+        return law
+
+    def _coarser(self, power: float) -> int:
+        """Return the cells of the lattice coarsened so many times."""
+        return max(1, round(self.cells / COARSER ** (3 * power)))
+
+    def _checked(self, model: Model, finest: SizeTrial) -> tuple[SizePlan, Model]:
+        """Choose and run the choice; choose once more without what fails, and where the error was too hopeful.
+
+        Returns the model with what was learnt, too.
+        """
+        choice, measured = model.cheapest(self.target), None
+        for _ in range(CHOICES):
+            if choice is None:
+                break
+            run = self._run(choice.method, choice.cells)
+            if run is None:
+                model = self._without(choice.method, model)
+            else:
+                measured = self._measured(choice, run, finest, model)
+                if measured is None or measured <= TOO_MUCH * self.target:
+                    return SizePlan(replace(choice, cost=run.cost), True, [], measured), model
+                self.report(f"measured {measured:.1e}, more than expected: chosen once more")
+                law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
+                model = replace(model, law=law)
+            choice = model.cheapest(self.target)
+        return SizePlan(choice or model.best(), False, [], measured), model
+
+    def _without(self, method: Candidate, model: Model) -> Model:
+        """Return a model without a way to step, unless it is the last."""
+        kept = [each for each in model.steppings if each.method != replace(method, step_error=each.method.step_error)]
+        self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
+        return replace(model, steppings=kept or model.steppings)
+
+    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> float | None:
+        """Return the error of a run of the choice from its distance to the finest lattice.
+
+        None where their cells are so alike that it tells nothing.
+        """
+        if 1 / APART < run.cells / finest.cells < APART:
+            return None
+        apart = _apart(run, finest)
+        if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
+            share = (run.edge / finest.edge) ** model.law.order
+            return apart * share / (1 - share) + choice.budget.time + choice.budget.step
+        return apart + model.law.error(finest.edge) + self.step_errors[finest.method]
+
+    # What is said
+
+    def _bounds(self, plan: SizePlan, model: Model) -> list[str]:
+        """Return what bounds the error, in words."""
+        bounds, best = [*self.bounds, *filter(None, [self.cell_bound])], model.best().budget
+        if not plan.met:
+            wanted = model.cells_for(self.target / 2)
+            if best.time > self.target / 2 and not self.bounds:
+                bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
+            if best.cells > self.target / 2:
+                bounds.append(
+                    f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; half the error asked for "
+                    f"would take {wanted:.2g}"
+                )
+        return bounds
+
+    def _tried(self, model: Model) -> list[Tried]:
+        """Return cost and expected error of each trial."""
+        solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
+        tried = []
+        for each in self.trials:
+            method = each.method
+            as_tried = replace(method, step_error=self.solved if method.step_error else None)
+            error = self.step_errors[as_tried] + solved[method.step_error] + model.law.error(each.edge)
+            tried.append(Tried(method.integrator, each.cells, each.cost, error))
+        return tried
+
+    # Runs
+
+    def _method(self, integrator: Integrator, step: float) -> Candidate:
+        solves = integrator != "verlet"
+        return Candidate(integrator, step, PRESET if solves else "", "", self.solved if solves else None)
+
+    def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
+        """Return a run, made if it was not yet; None if it fails, which is reported."""
+        done = next((each for each in self.trials if (each.method, each.asked) == (method, cells)), None)
+        if done is not None:
+            return done
+        case = self._case(method, cells)
+        row = self.bench.measure(case, keep=True).row
+        if row["status"] != "ok" or not row.get("time_second"):
+            self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
+            return None
+        trial = SizeTrial(
+            method, cells, row["cells"], row["time_second"], row["iterations"], self.bench.result_of(case)
+        )
+        self.trials.append(trial)
+        self.report(trial)
+        return trial
+
+    def _case(self, method: Candidate, cells: int) -> Case:
+        cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
+        scene = StudyScene(
+            name=self.scene.stem, file=self.scene.name, duration=self.duration, set=(f"cages={inline(cages)}",)
+        )
+        sweep = Sweep(
+            integrators=(method.integrator,), time_steps=(method.time_step,), ranks=(self.ranks,),
+            presets=(method.preset,) if method.preset else (), errors=(method.step_error,) if method.step_error else (),
+        )  # fmt: skip
+        timeout = TIME if cells < self.cells else LONG_TIME
+        study = Study(timeout=timeout, scene=(scene,), sweep=(sweep,))
+        case = study_cases(study, self.scene.parent, True, self.presets)[0]
+        return case.changed(SURFACE, f"output.every={max(1, round(self.step / method.time_step))}")
+
+
+def _apart(run: SizeTrial, reference: SizeTrial) -> float:
+    return surface_error(run.result, reference.result)

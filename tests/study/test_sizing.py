@@ -1,0 +1,337 @@
+"""Sizing: errors from runs of several sizes, and the cheapest split of an error among cells, time step and solution."""
+
+# ruff: noqa: F811 (fixtures are imported)
+import math
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from conftest import ENVIRONMENT, ROOT
+from study_files import SCENE, own_log  # noqa: F401 (fixtures)
+
+from msmpetsc.cli import plan as plan_command
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.study.cases import Case
+from msmpetsc.study.distances import surface_error
+from msmpetsc.study.plan import Candidate
+from msmpetsc.study.runner import CaseResult
+from msmpetsc.study.sizing import trials
+from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, error_law
+from msmpetsc.study.sizing.trials import SizePlan, Sizer, Tried
+
+
+@pytest.mark.parametrize("order", [1.2, 1.6, 2.0])
+@pytest.mark.parametrize("sizes", [(4, 2, 1), (4.3, 1.9, 1)])
+def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
+    """The error is 0.03 size^order exactly."""
+    e = [0.03 * size**order for size in sizes]
+    law = error_law(sizes, [e[0] - e[1], e[1] - e[2]], CELL_ORDERS)
+    assert law.seen and law.order == pytest.approx(order) and law.error(0.5) == pytest.approx(0.03 * 0.5**order)
+    assert law.size(law.error(0.7)) == pytest.approx(0.7)
+
+
+def test_an_order_that_cannot_be_is_not_believed():
+    """Distances that do not shrink have no order: the least is taken, which makes the error the greatest."""
+    stuck = error_law((4, 2, 1), [0.05, 0.05], CELL_ORDERS)
+    assert not stuck.seen and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
+    steep = error_law((4, 2, 1), [0.5, 0.01], CELL_ORDERS)
+    assert steep.order == 2.2 and steep.error(1) == pytest.approx(0.01 / (2**2.2 - 1))
+    two = error_law((2, 1), [0.05], CELL_ORDERS)
+    assert not two.seen and two.error(1) == pytest.approx(0.05)
+
+
+def stepping(integrator: str, step: float, error: float, cost: float) -> Stepping:
+    return Stepping(Candidate(integrator, step, "newton", "", 1e-3), error, cost)
+
+
+EULER = [stepping("implicit-euler", 0.01 / 2**k, 0.32 / 2**k, 2.0**k) for k in range(8)]
+BDF2 = [stepping("bdf2", 0.01 / 2**k, 0.08 / 4**k, 2.0**k) for k in range(5)]
+SOLVINGS = [Solving(1e-1, 0.02, 0.7), Solving(1e-2, 0.002, 1.0), Solving(1e-3, 0.0002, 1.3)]
+MODEL = Model(
+    ErrorLaw(2.0, 2.0),
+    [*EULER, *BDF2],
+    SOLVINGS,
+    cells=1000,
+    costs=[(100, 1.0), (1000, 10.0)],
+    explicit=False,
+    least=100,
+    most=10**6,
+)
+
+
+def test_the_cheapest_split_is_that_of_all_splits():
+    """Whatever else is tried, nothing that meets the error is cheaper."""
+    choice = MODEL.cheapest(0.03)
+    assert choice.budget.total <= 0.03 and choice.method.integrator == "bdf2"
+    assert choice.budget.cells == pytest.approx(2 * choice.cells ** (-2 / 3))
+    for each in MODEL.steppings:
+        for solving in SOLVINGS:
+            for cells in range(100, 40_000, 100):
+                other = MODEL.choice(each, solving, cells)
+                assert other.budget.total > 0.03 or other.cost >= choice.cost
+
+
+def test_a_smaller_error_costs_more_and_none_is_promised_that_cannot_be():
+    costs = [MODEL.cheapest(target).cost for target in (0.1, 0.03, 0.01)]
+    assert costs == sorted(costs) and costs[0] < costs[-1]
+    few = replace(MODEL, most=1000)
+    assert few.cheapest(0.01) is None and few.best().cells == 1000
+    assert few.best().budget.cells == pytest.approx(0.02)
+    assert replace(MODEL, steppings=EULER[:2]).cheapest(0.1) is None
+
+
+def test_cells_are_not_fewer_than_were_tried():
+    assert MODEL.cheapest(0.9).cells == MODEL.least
+
+
+def test_explicit_steps_are_not_solved():
+    model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)])
+    choice = model.cheapest(0.03)
+    assert (
+        choice.method.step_error is None and choice.budget.step == 0 and choice.shares.time == choice.shares.step == 0
+    )
+
+
+def test_explicit_substeps_shorten_with_the_cells():
+    """Eight times the cells are twice the substeps; the costs known are of implicit steps, or of explicit ones."""
+    for explicit, factor in ((False, 16), (True, 8)):
+        model = replace(MODEL, steppings=[stepping("verlet", 0.01, 1e-4, 3.0)], explicit=explicit)
+        costs = [model.choice(model.steppings[0], SOLVINGS[2], cells).cost for cells in (1000, 8000)]
+        assert costs[1] / costs[0] == pytest.approx(factor)
+
+
+def test_shares_of_the_cost_say_what_a_smaller_error_would_cost():
+    """Cost goes as error^-1.5 by cells of order 2, as error^-1/2 by BDF2's steps, and by log 1.3 of the solution."""
+    parts = (1.5, 0.5, math.log10(1.3))
+    shares = MODEL.choice(BDF2[1], SOLVINGS[1], 1000).shares
+    assert (shares.cells, shares.time, shares.step) == pytest.approx([part / sum(parts) for part in parts])
+    assert Budget(0.1, 0.2, 0.3).total == pytest.approx(0.6)
+
+
+def test_cost_grows_with_cells_as_measured():
+    """Read off the lattices; beyond them as between the last two, but in proportion to the cells at least."""
+    model = replace(MODEL, costs=[(100, 1.0), (800, 2.0), (6400, 20.0)])
+    assert model.growth(800, 6400) == pytest.approx(10) and model.growth(800, 100) == pytest.approx(0.5)
+    assert model.growth(6400, 8 * 6400) == pytest.approx(10)
+    assert replace(MODEL, costs=[(100, 1.0), (800, 1.1)]).growth(800, 8000) == pytest.approx(10)
+    assert replace(MODEL, costs=[(100, 1.0)]).growth(100, 300) == pytest.approx(3)
+
+
+class Bodies:
+    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution."""
+
+    def __init__(
+        self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
+        fails=lambda *_: False,
+    ):  # fmt: skip
+        self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
+        self.most = most  # error of cells, out of step
+        self.errors: dict[Path, float] = {}  # by the result
+
+    def result_of(self, case: Case) -> Path:
+        return Path(case.id)
+
+    def error_of(self, case: Case, cells: int) -> float:
+        t, substep = case.time_step, min(case.time_step, 1e-3)
+        time = {"verlet": 1e4 * substep**2, "bdf2": 400 * t**2, "implicit-euler": 20 * t}[case.integrator]
+        stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
+        return min(self.most, self.cell_error * cells**-0.5) + time + 0.1 * (case.error or 0) + stuck
+
+    def measure(self, case: Case, keep: bool) -> CaseResult:
+        assert keep and case.stores_surface
+        explicit = case.integrator == "verlet"
+        steps = max(0.01 / case.time_step, case.time_step / 0.01)
+        assert steps == pytest.approx(round(steps))  # so that frames come at the same times
+        if explicit and not self.explicit:
+            return CaseResult({"status": "timeout", "reason": "took longer than 1 s"}, None, 0.0)
+        (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
+        if self.fails(case.integrator, cells):
+            return CaseResult({"status": "failed", "reason": "planted"}, None, 0.0)
+        self.errors[self.result_of(case)] = self.error_of(case, cells)
+        substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
+        cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
+        row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost, "iterations": substeps - 0.3}
+        return CaseResult(row, None, 1.0)
+
+
+def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    bench, said = Bodies(**bodies), []
+    monkeypatch.setattr(trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b]))
+    sizer = Sizer(
+        tmp_path / "scene.toml", bench, target=target, presets=["newton"], frames=10, cells=6400, ranks=1,
+        report=said.append,
+    )  # fmt: skip
+    return sizer.plan(), bench, said
+
+
+def case_of(method: Candidate) -> Case:
+    return Case(
+        scene="", file=Path(), content="", set=(), integrator=method.integrator, time_step=method.time_step,
+        error=method.step_error,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("explicit", [True, False])
+@pytest.mark.parametrize("target", [0.1, 0.03])
+def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch, explicit: bool, target: float):
+    """The choice's own error, of the formula, is between a third of what was asked for and that."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
+    method, cells = plan.choice.method, plan.choice.cells
+    assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
+    assert target / 3 < bench.error_of(case_of(method), cells) <= 1.01 * target  # what is measured is off by a little
+    assert plan.choice.budget.total <= target and len(plan.tried) >= 6
+
+
+def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
+    """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is, and that is said."""
+    first, *_ = sized(tmp_path, monkeypatch, 0.1)
+    runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
+    plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
+    assert first.choice.method.integrator == "verlet" and plan.met and plan.choice.method.integrator != "verlet"
+    assert any("planted" in text for text in said if isinstance(text, str))
+    assert any("verlet" in bound and "fails" in bound for bound in plan.bounds)
+
+
+def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, monkeypatch):
+    """As where a pin holds no node: the order is seen all the same."""
+    plan, *_ = sized(tmp_path, monkeypatch, 0.1, fails=lambda _, cells: cells == 100)
+    assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {200, 800, 6400}
+
+
+def test_lattices_out_of_step_tell_no_order(tmp_path: Path, monkeypatch):
+    """Nothing is farther apart than 0.4, however coarse: the two distances are alike, and the usual order is taken."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=5.0, most=0.45)
+    (said,) = plan.bounds
+    assert "apart, too far to tell); order 1.5 is taken" in said
+    assert 0.05 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) < 0.15
+
+
+def test_where_no_order_is_seen_a_finer_lattice_is_asked(tmp_path: Path, monkeypatch):
+    """At 100 cells and 800 the errors are alike, so order 1.5 is taken, with which 3e-2 is out of reach; it is not."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.03, cell_error=3.0, most=0.2)
+    assert max(each.cells for each in plan.tried) >= round(6400 * 2**1.5)
+    assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) < 1.5 * 0.03
+
+
+def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch):
+    """There may be 8 times the cells at most: an error of 1.8e-2 is left."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, cell_error=4.0)
+    assert not plan.met and plan.choice.cells == 8 * 6400
+    (said,) = (bound for bound in plan.bounds if bound.startswith("the mesh's cells"))
+    assert f"{4 * (8 * 6400) ** -0.5:.1e} is left with 51200 cells" in said
+
+
+def test_a_plan_says_when_impacts_bound_the_error(tmp_path: Path, monkeypatch):
+    """Shorter steps do not come nearer to each other."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, impacts=True)
+    assert not plan.met and any(bound.startswith("the step") for bound in plan.bounds)
+
+
+def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
+    said: list = []
+    bench = Bodies()
+    monkeypatch.setattr(
+        bench, "measure", lambda case, keep: CaseResult({"status": "failed", "reason": "planted"}, None, 0)
+    )
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sizer = Sizer(
+        tmp_path / "scene.toml", bench, target=0.1, presets=["newton"], frames=10, cells=None, ranks=1,
+        report=said.append,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="the trials failed on 1 cells, see above"):
+        sizer.plan()
+    assert all("planted" in text for text in said) and len(said) == 2
+
+
+def test_a_scene_with_a_cell_size_needs_a_number_of_cells(tmp_path: Path):
+    (tmp_path / "scene.toml").write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    with pytest.raises(InputError, match="--cells N says how many"):
+        Sizer(
+            tmp_path / "scene.toml", Bodies(), target=0.1, presets=["newton"], frames=10, cells=None, ranks=1,
+            report=print,
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_true_error_of_a_plan_is_what_was_asked_for(tmp_path: Path):
+    """A soft beam, against a run of eight times the cells in explicit substeps, which are half as long on these."""
+    for name in ("beam_soft.toml", "beam.obj"):
+        shutil.copy(ROOT / "scenes" / "studies" / name, tmp_path)
+    scene = str(tmp_path / "beam_soft.toml")
+    words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
+    assert main(["plan", scene, *words]) == 0
+    time, cells = load_scene(Path(scene)).time, load_scene(Path(scene)).cages.count
+    every = max(1, round(1 / 60 / time.step))
+    fine = ["time={step = 0.016666666666666666, duration = 0.5, integrator = 'verlet'}", f"cages.count={8 * cells}"]
+    results = [tmp_path / "plan.h5", tmp_path / "fine.h5"]
+    for result, changes in zip(results, ([f"output.every={every}"], fine), strict=True):
+        own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
+        command = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", str(result), *own]
+        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
+    assert 0.1 / 5 < surface_error(*results) < 1.5 * 0.1
+
+
+PLAN = SizePlan(
+    Choice(Candidate("bdf2", 0.005, "newton", "", 1e-2), 4321, Budget(0.05, 0.03, 0.001), 7.5, Budget(0.6, 0.3, 0.1)),
+    met=True, bounds=["the step: planted"], check=0.07,
+    tried=[Tried("bdf2", 500, 2.0, 0.2), Tried("verlet", 4000, 9.0, 0.06)],
+)  # fmt: skip
+
+
+def test_the_command_tells_the_answer_writes_it_and_draws_it(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: PLAN)
+    path, chart = tmp_path / "scene.toml", tmp_path / "chart.png"
+    path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    before = load_scene(path)
+    assert main(["plan", str(path), "--surface-error", "0.1", "--write", "--chart", str(chart)]) == 0
+    out, written = capsys.readouterr().out, load_scene(path)
+    assert "7.5 computing seconds a simulated second, surface error 8.1e-02 at most" in out
+    assert "cells              5.0e-02         60%" in out and "what bounds it: the step: planted" in out
+    assert written.cages.count == 4321 and written.cages.cell_size is None and before.budget is None
+    assert (written.time.integrator, written.time.step, written.solver.error) == ("bdf2", 0.005, 0.01)
+    assert written.budget.model_dump() == {
+        "target": 0.1, "cells": 0.05, "time": 0.03, "step": 0.001, "count": 4321, "time_step": 0.005
+    }  # fmt: skip
+    command = next(line for line in out.splitlines() if line.startswith("msmpetsc run "))
+    changes = [word for flag, word in pairwise(shlex.split(command)) if flag == "--set"]
+    path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
+    changed = load_scene(path, changes)
+    assert (changed.cages, changed.time, changed.solver, changed.budget) == (
+        written.cages, written.time, written.solver, written.budget
+    )  # fmt: skip
+    assert chart.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: replace(PLAN, met=False))
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    assert main(["plan", str(path), "--surface-error", "0.01", "--write"]) == 3
+    assert (
+        path.read_text() == SCENE and "nothing meets 0.01; the smallest error within reach" in capsys.readouterr().out
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--surface-error", "2"], "between 0 and 1"),
+        (["--surface-error", "0.1", "--cells", "0"], "--cells must be at least 1"),
+        (["--surface-error", "0.1", "--chart", "x.svg"], "*.png"),
+        (["--error", "0.1", "--cells", "100"], "for --surface-error only"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):
+    assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("msmpetsc: error: ") and words in line

@@ -182,6 +182,7 @@ def press_to(share: float) -> list[str]:
     return ["--set", f"obstacle.1.path.0.by={by}", "--set", f"obstacle.1.path.1.by={by}"]
 
 
+@pytest.mark.slow
 def test_pressed_to_30_percent_the_linear_law_inverts_cells_for_good_and_the_stiffening_one_does_not(result):
     """Section 6 of the paper: "its deformation effects will begin to distort"."""
     few = ["--set", "cages.count=500", "--set", "time.duration=2.4", "--set", "solver.error=1e-2"]
@@ -207,6 +208,7 @@ def test_the_heart_follows_the_pull_and_returns(result):
     assert run.inverted(held - 1) == 0
 
 
+@pytest.mark.slow
 def test_on_two_ranks_the_heart_is_led_and_let_go_alike(result):
     """Past the time when the anchored nodes become unknowns."""
     options = ["--set", "cages.count=300", "--set", "time.step=0.08", "--frames", "12", "--error", "1e-8"]
@@ -214,6 +216,7 @@ def test_on_two_ranks_the_heart_is_led_and_let_go_alike(result):
     assert np.abs(one.q - two.q).max() < 1e-6 * one.height
 
 
+@pytest.mark.slow
 def test_on_two_ranks_the_lung_is_pressed_alike(result):
     options = ["--set", "cages.count=300", "--set", "time.step=0.05", "--frames", "8", "--error", "1e-6"]
     one, two = result("lung_press", *options), result("lung_press", *options, ranks=2)

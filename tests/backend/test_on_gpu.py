@@ -291,6 +291,7 @@ def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():
         assert operator.attrgetter(name)(cupy)
 
 
+@pytest.mark.slow
 def test_ranks_agree_on_gpus_too(tmp_path: Path, on_ranks):
     """And a run of the command line: three ranks with ghosts, against one on the CPU."""
     path = block_scene(tmp_path, **CASES["pressed, rubbed and stiffening"])

@@ -8,8 +8,8 @@ CASES = [  # ranks that fail, where, and how
     ("1", "step", "input"),
     ("0", "model", "memory"),
     ("1,2", "model", "input"),
-    ("0,1,2", "step", "memory"),
-    ("2", "step", "bug"),
+    pytest.param("0,1,2", "step", "memory", marks=pytest.mark.slow),
+    pytest.param("2", "step", "bug", marks=pytest.mark.slow),
 ]
 
 

@@ -278,6 +278,7 @@ def test_beyond_that_the_plain_presets_fail_and_say_so(preset: str):
         squeezed_step(preset, 0.45, 1e-3)
 
 
+@pytest.mark.slow
 def test_two_ranks_press_a_stiffening_block_as_one(msmpetsc, tmp_path: Path):
     """To two fifths of its height, so that cells resist."""
     sides = np.array([0.5, 0.5, 0.25])

@@ -147,7 +147,7 @@ def test_a_damaged_part_is_named_in_one_line(stopped, tmp_path, capsys, how, nam
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
+@pytest.mark.parametrize("integrator", ["implicit-euler", pytest.param("verlet", marks=pytest.mark.slow)])
 def test_whatever_is_damaged_ends_in_a_line(stopped, tmp_path, monkeypatch, integrator):
     """In forks of a worker: more of it by a larger number."""
     source = stopped

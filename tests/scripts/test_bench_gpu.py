@@ -50,6 +50,7 @@ def test_parts_and_a_frame_are_measured(bench, tmp_path: Path, capsys: pytest.Ca
     assert "take" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_runs_are_compared(bench, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Here none of them is on a GPU, and that one is told to have failed."""
     path = block_scene(tmp_path, **FALL)

@@ -75,6 +75,7 @@ def test_the_set_up_is_over_when_steps_begin(tmp_path: Path, monkeypatch):
     assert [mark.getPerfInfo(stage)["count"] for stage in (events.MAIN, events.SETUP.id)] == [1, 0]
 
 
+@pytest.mark.slow
 def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
     floor = {"shape": "plane", "point": [0, 0, 0.01], "normal": [0, 0, 1], "response": "penalty"}
     words = block_scene(tmp_path, **SWINGS, obstacle=[floor]), "-o", tmp_path / "o.h5", "-log_view"

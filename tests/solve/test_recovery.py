@@ -96,7 +96,10 @@ def first_steps(name: str) -> Played:
     return play(name, f"time.duration={FIRST_STEPS[name] * scene.time.step!r}")
 
 
-@pytest.mark.parametrize("name", CASES)
+LONG = {"stiff half, twisted"}  # ten seconds
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in CASES])
 def test_newton_survives(name: str):
     played = first_steps(name)
     assert not played.words
@@ -267,7 +270,7 @@ def test_lengths_and_times_a_million_times_as_long_or_short_are_the_same_motion(
     same = [play(name) for name in ("stretched", "tiny", "huge")]
     one, *others = [[(f.position - f.position.mean(axis=0)) / p.size for f in p.frames] for p in same]
     for other in others:
-        assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 5e-3  # the error of the steps
+        assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 2e-2  # ten steps, of 1e-3 each
 
 
 # ---- other methods

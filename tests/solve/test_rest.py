@@ -96,6 +96,7 @@ def test_a_stopped_run_comes_to_rest_at_the_same_step(tmp_path: Path):
         assert np.array_equal(whole.frames.position[:], parts.frames.position[:])
 
 
+@pytest.mark.slow
 def test_ranks_come_to_rest_together(tmp_path: Path, msmpetsc):
     scene, path = beam(tmp_path, DAMPED, **ASIDE), tmp_path / "out.h5"
     _, frames = play(scene)

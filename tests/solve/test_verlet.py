@@ -320,6 +320,7 @@ def test_friction_on_what_moves_carries_it_along(tmp_path: Path):
 # ---- ranks and the schema
 
 
+@pytest.mark.slow
 def test_two_ranks_give_the_same(tmp_path: Path, msmpetsc):
     """With pins, anchors that let go, both kinds of obstacle, friction, and a law that stiffens."""
     floor = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}

@@ -45,7 +45,7 @@ def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
         assert shown in done.stdout, options
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("options", REFUSED)
 def test_options_that_cannot_be_are_one_line(msmpetsc, tmp_path: Path, options: str, ranks: int):
     path = block_scene(tmp_path, **SCENE)

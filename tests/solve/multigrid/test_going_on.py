@@ -114,7 +114,7 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["pressed", "chosen, led and let go"])
+@pytest.mark.parametrize("name", [pytest.param("pressed", marks=pytest.mark.slow), "chosen, led and let go"])
 def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, name: str, ranks: int):
     """By the command line, on several coarse levels."""
     stiff = {"young_modulus": 1e9, "density": 1000.0}

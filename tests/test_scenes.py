@@ -161,7 +161,7 @@ def error_of_lobes(run: Result) -> float:
     return max(shape_error(run.nodes[lobe], run.q[-1][lobe], run.mass[lobe]) for lobe in lobes)
 
 
-def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_while_its_trachea_sags(result):
+def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trachea(result):
     run = result("lung_press")
     plate = run.scene.obstacle[1]
     low = plate.box[0][2] + np.array([Motion.through(plate.path).at(time)[2] for time in run.time])
@@ -172,7 +172,7 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_while_its_tra
     body, tip = run.zone([0, 0, 0], [1, 1, 0.5]), run.zone([0, 0, 0.95], [1, 1, 1])
     assert error_of_lobes(run) < 0.02 * run.height
     assert run.moved(-1, body)[2] > -0.07  # it leans over and sags under its own weight
-    assert run.moved(-1, tip)[2] < -0.1
+    assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]  # folded, and up again
     assert all(run.inverted(frame) == 0 for frame in range(0, len(run.q), 10))
 
 

@@ -91,9 +91,7 @@ def build_lattice(
     stiffening: float = 0.0,
     of_cells: Callable[[np.ndarray], CellMaterial] | None = None,
 ) -> Lattice:
-    """Build the masses and springs of the valid cells (collective).
-
-    A boundary cell has the share of its mass and stiffness that is inside the surface (model.boundary_cells).
+    """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
 
     density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or

@@ -99,8 +99,7 @@ class Stepper:
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
-        self.kinks = FrictionKinks(comm)
-        self.owned = ExitStack()
+        self.kinks, self.owned = FrictionKinks(comm), ExitStack()
         self.unknowns = Unknowns(comm, lattice, static)
         self.owned.callback(self.unknowns.destroy)
         self.functional = StepFunctional(comm, self.unknowns, Elasticity(comm, lattice), time_step)

@@ -8,7 +8,6 @@ error.
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
@@ -19,10 +18,8 @@ from msmpetsc.solve.nonlinear.rounding import Rounding
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
-KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
-KINKED = 0.1  # the tightest while friction has kinks on the way of a full step
 SHARE = 0.5  # of the error that would do, left to the linear solve
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
 
@@ -35,7 +32,6 @@ class StepError:
     error       : of the last iterate, estimated or bounded
     bound       : on it
     residual    : |F|_(M^-1) of the last iterate
-    ratio       : of bound to error, as the last Newton correction has shown it
     early       : how many times the goal an error may be to be estimated
     corrected   : the last iterate's error was estimated, so that its Newton correction is known
     alarmed     : something has shown a negative curvature
@@ -47,7 +43,6 @@ class StepError:
     error: float = np.inf
     bound: float = np.inf
     residual: float = np.inf
-    ratio: float = 1.0
     early: float = EARLY
     corrected: bool = False
     alarmed: bool = False
@@ -79,14 +74,6 @@ class ErrorControl:
     def begin(self) -> None:
         """Know nothing yet of a new step."""
         self.now = StepError(self.target)
-        self.estimate.begin()
-
-    def heed(self, ksp: PETSc.KSP, correction: PETSc.Vec) -> None:
-        """Know the error that the last iterate had, the length of its Newton correction, and what that solve showed."""
-        self.estimate.heed(ksp)
-        length = self.functional.norm(correction)
-        if np.isfinite(self.now.residual) and length > 0:
-            self.now.ratio = max(self.now.residual / length, 1.0)
 
     def judge(self, iterate: Iterate) -> None:
         """Know the error of an iterate; only a bound on it while that is far too large."""
@@ -101,7 +88,7 @@ class ErrorControl:
         if not distance > 0 or not np.isfinite(now.residual):  # the start x = y tells nothing yet
             return 0.0 if now.at_rounding else np.inf
         now.bound = now.residual / distance
-        if now.bound > max(self.ratio, now.ratio) * now.early * now.goal and not now.at_rounding:
+        if now.bound > self.ratio * now.early * now.goal and not now.at_rounding:
             return now.bound
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature
@@ -112,8 +99,7 @@ class ErrorControl:
     def _estimated(self, iterate: Iterate, distance: float, goal: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         now = self.now
-        enough, will_do = EARLY * goal * distance if goal else np.inf, KNOWN * goal * distance
-        length = self.estimate(iterate, now.residual, enough, will_do=will_do)
+        length = self.estimate(iterate, now.residual, EARLY * goal * distance if goal else np.inf)
         if not np.isfinite(length):
             now.alarmed = True
             return now.bound
@@ -137,11 +123,10 @@ class ErrorControl:
         now = self.now
         return now.bound < FULL_STEP_ERROR and (now.corrected or not now.doubts)
 
-    def relative_tolerance(self, has_kinks: bool) -> float:
-        """ksp_rtol of the next linear solve: it need not gain more digits than are missing, and no more than one where
-        g ``has_kinks`` on its way, which it does not know of."""
-        missing, tightest = self.now.bound / self.ratio, max(self.tightest, KINKED) if has_kinks else self.tightest
-        return min(max(SHARE * self.now.goal / missing, tightest), LOOSEST)
+    def relative_tolerance(self) -> float:
+        """ksp_rtol of the next linear solve: it need not gain more digits than are missing."""
+        missing = self.now.bound / self.ratio
+        return min(max(SHARE * self.now.goal / missing, self.tightest), LOOSEST)
 
     def doubt(self, has_moved: bool) -> bool:
         """Go on from a point that is no minimum, or farther from one than it seemed; whether there is more to gain.

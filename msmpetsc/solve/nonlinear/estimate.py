@@ -6,9 +6,6 @@ more. In the norm of H their part is |e_k|_H^2 = e_k^T F, and miss no more than 
 preconditioner and lambda the least eigenvalue of P^(-1) H, of which CG's own Ritz values tell: the solve ends when
 the second is a part of the first and |e_k|_M hardly grows, or when that is over the error that would do. It does not
 end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the others for that long.
-
-With multigrid a few iterations tell lambda, those of the step's own solves with the true Hessian, too. There the solve
-ends as soon as |e_k|_M and all that it may miss are together an error that will do. That is then the estimate.
 """
 
 import numpy as np
@@ -23,8 +20,6 @@ CHECK_EVERY = 4  # iterations
 CLOSE = 0.1  # the part: at 0.4 a stiff beam, which takes Jacobi hundreds of iterations, had an estimate of a sixth
 UNIFORMLY_CLOSE = 0.3  # with multigrid, which leaves out nothing that is smooth
 GROWTH = 1.2  # of |e_k|_M since k was half of it: what weighs little in the norm of H may still be to come
-USUAL_LEAST = 0.2  # lambda with multigrid: no more than that, for CG's first Ritz values are too large
-TELLING = 3  # iterations that tell lambda; under compression it may be far less than usual
 LEFT = 2.0  # |r_k|_(M^-1) over |e_k|_M: where g is convex the error is then at most three times what was found
 MOST = 512
 
@@ -42,8 +37,7 @@ class ErrorEstimate:
         self.length = np.inf  # the last estimate [m sqrt(kg)]
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
-        self.lowest, self.will_do, self.began = 1.0, 0.0, 0.0
-        self.least, self.knows_least, self.missing = USUAL_LEAST, False, 0.0
+        self.lowest = 1.0
         self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
@@ -56,45 +50,26 @@ class ErrorEstimate:
         self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._converged)
 
-    def begin(self) -> None:
-        """Know nothing yet of a new step."""
-        self.least, self.knows_least = USUAL_LEAST, False
-
-    def heed(self, ksp: PETSc.KSP) -> None:
-        """Know lambda as a solve of this step with CG on about the same true Hessian has shown it."""
-        if ksp.its > 0 and ksp.getType() == PETSc.KSP.Type.CG:
-            least = ksp.computeExtremeSingularValues()[1]
-            self.least = min(self.least, least) if least > 0 else self.least
-            self.knows_least |= ksp.its >= TELLING
-
-    def __call__(
-        self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0, will_do: float = 0.0
-    ) -> float:
+    def __call__(self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0) -> float:
         """Estimate |x - x*|_M at an iterate (collective); a result over ``enough`` may be too low.
 
-        bound   : on it, |F|_(M^-1) where H is no less than M
-        lowest  : eigenvalue of M^(-1) H, as far as is known
-        will_do : an error known to be no more than that need not be known better
+        bound  : on it, |F|_(M^-1) where H is no less than M
+        lowest : eigenvalue of M^(-1) H, as far as is known
 
         Infinite where the Hessian is not positive definite: there no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
-        self.will_do, self.missing = will_do, 0.0
         with ESTIMATE:
             self.linearise(iterate.q)
             self.ksp.solve(iterate.f, self.correction)
             self.length = self._length() if self.ksp.reason > 0 else np.inf
-        if self.preconditioner.is_uniform and self.ksp.norm < self.began:
-            self.preconditioner.learn(self.ksp.its, self.ksp.norm / self.began)
         return self.length
 
     def _length(self) -> float:
         """|e_k|_M, grown once more as it has since k was half of it; or, where CG was cut short, all that it may be."""
         length, its = self.functional.norm(self.correction), self.ksp.its
         left, half = self._left(), self.lengths.get(its // 2, 0.0)
-        if self.missing > 0:
-            return length + self.missing
         if its >= MOST and left > LEFT * length:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
@@ -110,9 +85,6 @@ class ErrorEstimate:
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
-        self.began = residual if its == 0 else self.began
-        if self.preconditioner.is_uniform and self._will_do(ksp, its, residual):
-            return reasons.CONVERGED_ITS
         every = 1 if self.preconditioner.is_uniform else CHECK_EVERY
         if residual > 0 and (its == 0 or its % max(every // 2, 1)):
             return reasons.ITERATING
@@ -125,35 +97,13 @@ class ErrorEstimate:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
 
-    def _will_do(self, ksp: PETSc.KSP, its: int, residual: float) -> bool:
-        """Whether |e_k|_M, and with it all that may be missing, is less than will do."""
-        if not 0 < self._missing(residual) < self.will_do:
-            return False
-        self.heed(ksp)
-        missing = self._missing(residual)
-        if not self.knows_least or self.functional.norm(ksp.getSolution()) + missing > self.will_do:
-            return False
-        self.missing = missing
-        return True
-
-    def _missing(self, residual: float) -> float:
-        """Bound on what is missing of |e|_M, lambda being what solves have shown: of |e|_H, over sqrt(``lowest``)."""
-        return residual / np.sqrt(self.lowest * self.least)
-
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Whether e is near in the norm of H, as far as CG can show."""
-        self.heed(ksp)
         least = ksp.computeExtremeSingularValues()[1]
         energy = ksp.getSolution().dot(self.right_side)
         close = UNIFORMLY_CLOSE if self.preconditioner.is_uniform and self.lowest == 1.0 else CLOSE
         if not (min(least, energy) > 0 and residual < close * np.sqrt(self.lowest * least * energy)):
             return False
-        if (
-            self.preconditioner.is_uniform
-            and self.knows_least
-            and self._missing(residual) < LEFT * self.lengths[ksp.its]
-        ):
-            return True
         return self._left() < LEFT * self.lengths[ksp.its]
 
     def _left(self) -> float:

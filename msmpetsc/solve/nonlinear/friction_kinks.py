@@ -8,7 +8,6 @@ the last full step took over a kink.
 """
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.model.contact.penalty import Contact, Secants
 
@@ -20,8 +19,7 @@ class FrictionKinks:
     secants : of the next Hessian; None where there is no contact
     """
 
-    def __init__(self, comm: MPI.Comm) -> None:
-        self.comm = comm
+    def __init__(self) -> None:
         self.contact: Contact | None = None
         self.secants: Secants | None = None
         self.is_awaited = False
@@ -40,11 +38,3 @@ class FrictionKinks:
         if self.is_awaited and self.contact:
             self.secants = self.contact.passes_kinks(q, base)
         self.is_awaited = False
-
-    @property
-    def are_any(self) -> bool:
-        """Whether any node's friction has its secant (collective)."""
-        if self.contact is None:
-            return False
-        own = any(bool(some.any()) for some in self.secants or () if some is not None)
-        return self.comm.allreduce(own, MPI.LOR)

@@ -99,7 +99,7 @@ class Stepper:
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
-        self.kinks, self.owned = FrictionKinks(comm), ExitStack()
+        self.kinks, self.owned = FrictionKinks(), ExitStack()
         self.unknowns = Unknowns(comm, lattice, static)
         self.owned.callback(self.unknowns.destroy)
         self.functional = StepFunctional(comm, self.unknowns, Elasticity(comm, lattice), time_step)
@@ -146,7 +146,6 @@ class Stepper:
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
         snes.setFromOptions()
-        ksp.setComputeEigenvalues(True)  # for what the estimate has to know
         return snes, ksp
 
     def _create_control(self, error: float | None) -> tuple[ErrorControl, Minimum]:
@@ -348,8 +347,6 @@ class Stepper:
         iterate = self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
-            if self.preset.true_hessian and not self.projected:
-                control.heed(self.ksp, snes.getSolutionUpdate())
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
         control.now.alarmed |= self.ksp.reason == INDEFINITE
@@ -377,8 +374,7 @@ class Stepper:
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
         if self.preset.inexact and self.options.is_default("ksp_rtol"):
-            has_kinks = self.preset.true_hessian and self.kinks.are_any
-            self.ksp.setTolerances(rtol=self.control.relative_tolerance(has_kinks))
+            self.ksp.setTolerances(rtol=self.control.relative_tolerance())
 
     def _abandon(self) -> None:
         """After an error within PETSc its objects may be in the middle of something, and crash when they are

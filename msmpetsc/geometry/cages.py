@@ -17,7 +17,7 @@ from msmpetsc.geometry.boundary import sampled_cells, touched_cells
 from msmpetsc.geometry.grid import CHUNK, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.share import LEAK, OUTSIDE, Columns, sampled_shares
-from msmpetsc.geometry.surface import Surface, SurfaceReport
+from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -212,8 +212,6 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
     An open surface has no slabs of its own meaning: every rank needs all of it.
     """
-    import igl  # for open surfaces alone
-
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = packed(boundary)
@@ -224,8 +222,7 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
         cells = cells[~np.isin(packed(cells), marked)]
         centres = np.empty(cells.shape)
         centres[:, axes] = cells + 0.5
-        winding = igl.fast_winding_number(surface.points, surface.triangles, grid.node_positions(centres))
-        inside = cells[np.abs(winding) > 0.5]
+        inside = cells[is_inside(surface, grid.node_positions(centres))]
         gaps.append(inside[:, [0, 1, 2, 2]])  # a gap of one cell each
     return np.concatenate(gaps)
 

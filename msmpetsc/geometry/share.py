@@ -23,7 +23,7 @@ import numpy as np
 
 from msmpetsc.geometry.clipping import clip_to_layer, extent, grown
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
-from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.surface import Surface, is_inside
 
 SAMPLES = 6  # a side of a cell of an open surface: a plane through a cell is seen to 0.6% of the cell, rms
 OUTSIDE = 0.5  # a winding number below this
@@ -68,10 +68,10 @@ class Columns:
 
     def corner_shares(self, cells: np.ndarray) -> np.ndarray:
         """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3)."""
-        keys = packed(cells)
-        place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
         if len(self.keys) == 0:
             return np.zeros((len(cells), 2, 2, 2))
+        keys = packed(cells)
+        place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
         found = self.keys[place]
         is_above = (found >= keys) & (found // LIMIT == keys // LIMIT)
         uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
@@ -154,15 +154,12 @@ def _add_sums(p, q, r, cell, sums):
 
 def sampled_shares(surface: Surface, grid: Grid, cells: np.ndarray) -> np.ndarray:
     """Return the shares (c, 2, 2, 2) of the corners of the grid's cells (c, 3), by samples in an open surface."""
-    import igl  # for open surfaces alone
-
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
     shares, step = np.empty((len(cells), 2, 2, 2)), max(1, CHUNK // len(middles))
     for start in range(0, len(cells), step):
         points = grid.node_positions(cells[start : start + step, None, :] + middles).reshape(-1, 3)
-        winding = igl.fast_winding_number(surface.points, surface.triangles, points)
-        inside = (np.abs(winding) > OUTSIDE).reshape(-1, SAMPLES, SAMPLES, SAMPLES)
+        inside = is_inside(surface, points).reshape(-1, SAMPLES, SAMPLES, SAMPLES)
         shares[start : start + step] = 8 * np.einsum("cxyz,ax,by,dz->cabd", inside, along, along, along)
     return shares

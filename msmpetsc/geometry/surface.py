@@ -112,6 +112,13 @@ def _warnings(report: SurfaceReport) -> list[str]:
     return warnings
 
 
+def is_inside(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Return which points (n, 3) are inside: their winding number is above 1/2 in size (Jacobson et al. 2013)."""
+    import igl  # for open surfaces, and scenes with obstacles
+
+    return np.abs(igl.fast_winding_number(surface.points, surface.triangles, points)) > 0.5
+
+
 def merged_triangles(surface: Surface) -> np.ndarray:
     """Return the triangles (g, 3) over merged points.
 

@@ -219,8 +219,6 @@ def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body, outsi
     if not pressing:
         return []
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * (body.bounds[1] - body.bounds[0]).max()
-    obstacles = [Obstacle.of(o, key, outside) for key, o in pressing]
     return [
-        Penalty(obstacle, o.stiffness or usual, o.friction or 0.0, stick)
-        for obstacle, (_, o) in zip(obstacles, pressing, strict=True)
+        Penalty(Obstacle.of(o, key, outside), o.stiffness or usual, o.friction or 0.0, stick) for key, o in pressing
     ]

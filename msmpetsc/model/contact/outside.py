@@ -10,10 +10,10 @@ import numpy as np
 from msmpetsc.comm import Route
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
+from msmpetsc.geometry.surface import is_inside
 from msmpetsc.model.lattice import Lattice
 
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
-INSIDE = 0.5  # a winding number above this in size
 
 
 def distance_outside(body: Body, cages: Cages, lattice: Lattice) -> np.ndarray:
@@ -32,12 +32,11 @@ def distance_outside(body: Body, cages: Cages, lattice: Lattice) -> np.ndarray:
 
 def _distance_outside(body: Body, points: np.ndarray) -> np.ndarray:
     """Return how far points (n, 3) lie outside the surface, which is here (n,) [m]."""
-    import igl  # for scenes with obstacles, and open surfaces
+    import igl  # for scenes with obstacles
 
     surface = body.surface
     assert surface is not None
     if len(points) == 0:
         return np.empty(0)
-    winding = igl.fast_winding_number(surface.points, surface.triangles, points)
     squares = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0]
-    return np.where(np.abs(winding) > INSIDE, 0.0, np.sqrt(squares))
+    return np.where(is_inside(surface, points), 0.0, np.sqrt(squares))

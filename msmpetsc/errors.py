@@ -34,10 +34,15 @@ class StepFailed(MsmpetscError):
 
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
 EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
-    "run": ("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch", "psutil", "tqdm"),
+    "run": (
+        *("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w"),
+        *("trimesh", "igl", "pooch", "psutil", "tqdm", "shtab"),
+    ),
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
     "render": ("pyvista",),
     "study": ("pandas", "matplotlib", "jinja2", "tomlkit"),
+    "contact": ("ipctk",),
+    "movie": ("imageio", "imageio_ffmpeg"),
     "repair": ("pymeshfix",),
     "xarray": ("xarray",),
     "cuda": ("cupy",),

@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.scene.schema import Start, Twist
+from msmpetsc.scene.motion import Start, Twist
 
 InitialState = tuple[np.ndarray, np.ndarray]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.scene.schema import Keyframe
+from msmpetsc.scene.motion import Keyframe
 
 SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
 

@@ -12,7 +12,7 @@ from msmpetsc.comm import sample_of, splitters_of
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.interior import Slab
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.scene.schema import CagesTable
+from msmpetsc.scene.body import CagesTable
 
 MOST = 1 << 40  # cells: the scene's own limit is for runs
 INNER_SPRINGS = 13  # of each cell, where cells have neighbours on all sides

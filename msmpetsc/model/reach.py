@@ -18,7 +18,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import SAME, Anchor, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene.schema import Force, ObstacleTable, Scene, Time
+from msmpetsc.scene.motion import Force, ObstacleTable, Time
+from msmpetsc.scene.schema import Scene
 
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 

@@ -13,7 +13,7 @@ from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.model.lattice import CORNERS, Lattice
 from msmpetsc.model.material import CellMaterial
-from msmpetsc.scene.schema import Material, PartTable, Region
+from msmpetsc.scene.body import Material, PartTable, Region
 
 EDGE = 1e-9  # of the body's longest side: a node this near to a region counts as on its edge, whatever was rounded
 

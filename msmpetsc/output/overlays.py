@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 from msmpetsc.model.loads import Motion, within
 from msmpetsc.model.region import inside
 from msmpetsc.output.camera import Camera, unit
-from msmpetsc.scene.schema import Region, SceneFile
+from msmpetsc.scene.body import Region
+from msmpetsc.scene.schema import SceneFile
 
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.scene.schema import Scene, Solver, Time
+from msmpetsc.scene.motion import Time
+from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State

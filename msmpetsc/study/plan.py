@@ -8,8 +8,8 @@ from pathlib import Path
 from msmpetsc.errors import InputError
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Integrator
 from msmpetsc.scene.statics import STATIC
+from msmpetsc.scene.values import Integrator
 from msmpetsc.study.cases import Case, study_cases
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import ReferenceRun, Study, StudyScene, Sweep

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.problems import problem_lines, rule
 from msmpetsc.scene.reading import read_toml
-from msmpetsc.scene.schema import Count, FileName, Integrator, ListOf, Positive, Preset, Table
+from msmpetsc.scene.values import Count, FileName, Integrator, ListOf, Positive, Preset, Table
 from msmpetsc.solve.petsc.words import unsafe_word
 
 Error = Annotated[float, Field(gt=0, lt=1)]

@@ -12,7 +12,7 @@ from obstacles import box, plane
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.loads import Motion
-from msmpetsc.scene.schema import Keyframe
+from msmpetsc.scene.motion import Keyframe
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset

@@ -16,7 +16,7 @@ from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import Load, Motion, spread_by_mass
 from msmpetsc.model.region import inside
-from msmpetsc.scene.schema import Region
+from msmpetsc.scene.body import Region
 
 WORKER = WORKERS / "cages_worker.py"
 BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 2.0, 3.0]])  # sides 4, 2, 1

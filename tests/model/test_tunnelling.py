@@ -20,8 +20,8 @@ from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.loads import Motion
+from msmpetsc.scene.motion import Keyframe
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Keyframe
 from msmpetsc.solve.energy_balance import Ledger
 from msmpetsc.solve.integrators.contact_faces import MOST_SOLVES
 from msmpetsc.solve.simulate import Simulation

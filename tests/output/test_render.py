@@ -21,7 +21,7 @@ from msmpetsc.output import overlays, render
 from msmpetsc.output.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
 from msmpetsc.output.writer import Begin, ResultFile
-from msmpetsc.scene.schema import Region
+from msmpetsc.scene.body import Region
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.timeout(60)

@@ -17,8 +17,9 @@ from msmpetsc.model.fields import Frame
 from msmpetsc.model.initial_state import at_rest
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.output.reader import Result
+from msmpetsc.scene.motion import Time
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.integrators import verlet
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet

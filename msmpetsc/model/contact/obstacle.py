@@ -11,7 +11,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import Motion, within
 from msmpetsc.model.locate import node_of_greatest
-from msmpetsc.scene.schema import ObstacleTable
+from msmpetsc.scene.motion import ObstacleTable
 
 TOUCHING = 1e-6  # cells: no depth, but what was rounded
 OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other

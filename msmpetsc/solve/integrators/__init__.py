@@ -4,7 +4,8 @@ from mpi4py import MPI
 
 from msmpetsc.model.build import Model
 from msmpetsc.model.environment import Environment
-from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.scene.motion import Time
+from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.protocol import Integrator

@@ -20,7 +20,8 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.scene.schema import Scene, Solver, Time
+from msmpetsc.scene.motion import Time
+from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
 from msmpetsc.solve.integrators.protocol import Integrator

@@ -12,7 +12,8 @@ from mpi4py import MPI
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.environment import Environment
-from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.scene.motion import Time
+from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes, Trace
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.state import State

@@ -22,7 +22,8 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
-from msmpetsc.scene.schema import Solver, Time
+from msmpetsc.scene.motion import Time
+from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.stability_limit import HighestMode
 from msmpetsc.solve.integrators.state import State

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Integrator
+from msmpetsc.scene.values import Integrator
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate

@@ -1,0 +1,180 @@
+"""Tables of what the body is: surface, cells, material, parts, and regions of it."""
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+
+from msmpetsc.scene.problems import rule, unknown_name
+from msmpetsc.scene.values import (
+    Box,
+    Count,
+    Direction,
+    FileName,
+    ListOf,
+    Painted,
+    Positive,
+    Table,
+    UnitVector,
+    Vector,
+    only_for,
+)
+
+MOST_CONTRAST = 1e10  # of parts: at 1e11 errors of 1e-3 were no longer told from rounding
+DEFAULT_STIFFENING = 10.0
+
+
+class Rotate(Table):
+    """A turn about the origin."""
+
+    axis: Direction = Field(description="axis of the turn, of any length but zero [-]")
+    degrees: float = Field(description="angle, right-handed about the axis [degrees]")
+
+
+class StepTable(Table):
+    """A step of mesh preparation that needs a value."""
+
+    one_of = ("simplify", "rotate")
+    simplify: int | None = Field(None, ge=4, lt=2**63, description="triangles to keep [-]")
+    rotate: Rotate | None = Field(None, description="turn the surface")
+
+
+StepName = Literal["merge", "largest_part", "union", "repair", "orient"]
+
+
+def _step(value: Any) -> str | dict[str, Any]:
+    """Return a step name, or a table of one key, checked and plain."""
+    if isinstance(value, dict):
+        return StepTable.model_validate(value).model_dump(exclude_none=True)
+    if not isinstance(value, str):
+        raise rule("must be a step name or a table such as { simplify = 5000 }")
+    if value in StepTable.one_of:
+        raise rule(f"needs a value: {{ {value} = ... }}")
+    if value not in get_args(StepName):
+        raise unknown_name(get_args(StepName))
+    return value
+
+
+Step = Annotated[str | dict[str, Any], BeforeValidator(_step)]
+
+
+class Mesh(Table):
+    """The closed surface."""
+
+    source: FileName = Field(description="registry name, or path beside or below this file")
+    prepare: ListOf[Step] = Field(
+        (),
+        description="steps in this order: merge, largest_part, union, repair, orient, "
+        "{ simplify = triangles [-] }, { rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",
+    )
+    size: Positive | None = Field(None, description="longest side of the bounding box [m]; as in the file if absent")
+    base: Vector | None = Field(None, description="where the middle of the bounding box's bottom face stands [m]")
+
+
+class CagesTable(Table):
+    """The grid cells that fill the surface, and how the surface follows them."""
+
+    one_of = ("count", "cell_size")
+    count: Count | None = Field(None, description="number of valid cells aimed at [-]")
+    cell_size: Positive | None = Field(None, description="edge of a cell [m]")
+    method: Literal["exact", "sample"] = Field("exact", description="triangle-box test, or the paper's sample points")
+    boundary: Literal["fill", "whole"] = Field(
+        "fill",
+        description="boundary cells weigh and resist by the share of them that is inside, or whole, as the paper's",
+    )
+    embedding: Literal["affine", "cages", "mvc"] = Field("affine", description="how the surface follows the nodes")
+    smoothing: float = Field(1.0, gt=0, le=1, description='width h of f_h in Eq. 9, with embedding = "cages" [cells]')
+    max_cells: Count = Field(5_000_000, description="refuse a lattice of more cells than this [-]")
+
+    _has_a_use = field_validator("smoothing")(only_for("embedding", "cages"))
+
+
+class Material(Table):
+    """What the lattice is made of."""
+
+    one_of = ("young_modulus", "stiffness")
+    young_modulus: Positive | None = Field(None, description="Young's modulus; Poisson's ratio is 1/4 [Pa]")
+    stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
+    density: Positive = Field(description="mass density [kg/m^3]")
+    law: Literal["linear", "stiffening"] = Field("linear", description="how a spring pulls at large strain")
+    stiffening: Positive | None = Field(
+        None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
+    )
+
+    _has_a_use = field_validator("stiffening")(only_for("law", "stiffening"))
+
+    @property
+    def law_stiffening(self) -> float:
+        """b of the springs' law, 0 for Hooke's."""
+        return 0.0 if self.law == "linear" else self.stiffening or DEFAULT_STIFFENING
+
+
+class Sphere(Table):
+    """A ball."""
+
+    center: Vector = Field(description="[m], or [-] if relative")
+    radius: Positive = Field(description="[m], or in longest sides of the rest bounding box [-] if relative")
+
+
+class HalfSpace(Table):
+    """All that lies on one side of a plane."""
+
+    point: Vector = Field(description="a point of the plane [m], or [-] if relative")
+    normal: UnitVector = Field(description="towards the side that is meant, normalised on reading [-]")
+
+
+class Region(Table):
+    """A part of space at rest; the nodes in it are meant, or of a part the cells whose centres it holds."""
+
+    one_of = ("box", "sphere", "half_space", "painted")
+    box: Box | None = Field(
+        None, description="two corners, each coordinate of the first the lower [m], or [-] if relative"
+    )
+    sphere: Sphere | None = Field(None, description="a ball [m], or [-] if relative")
+    half_space: HalfSpace | None = Field(None, description="one side of a plane [m], or [-] if relative")
+    painted: Painted | None = Field(
+        None,
+        description="numbers, from 0, of points of the prepared surface (/surface/points of the result), or a "
+        "text file beside this file that lists them: the cells they lie in are meant, or their corners [-]",
+    )
+    relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
+
+    @field_validator("relative")
+    @classmethod
+    def _has_a_use(cls, relative: bool, info: ValidationInfo) -> bool:
+        if relative and info.data.get("painted") is not None:
+            raise rule("has no meaning for painted points", "painted")
+        return relative
+
+
+class PartTable(Table):
+    """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
+
+    region: Region = Field(description="the cells whose centres lie in it")
+    density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
+    young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")
+    stiffness: Positive | None = Field(
+        None, description="of springs; one between cells of several parts has the mean of its cells' [N/m]"
+    )
+
+    @model_validator(mode="after")
+    def _says_something(self) -> "PartTable":
+        if self.density is None and self.young_modulus is None and self.stiffness is None:
+            raise rule("needs density, young_modulus or stiffness")
+        return self
+
+
+def as_the_material(cls, parts: tuple[PartTable, ...], info: ValidationInfo) -> tuple[PartTable, ...]:
+    """Stiffness and Young's modulus are two ways to name all springs: parts must take the material's."""
+    material = info.data.get("material")
+    for number, part in enumerate(parts):
+        for name in Material.one_of:
+            if material is not None and getattr(part, name) is not None and getattr(material, name) is None:
+                raise rule(f"may give {name} only where material does, as part.{number} does", "material")
+    for name in (*Material.one_of, "density"):
+        values = [value for table in (material, *parts) if (value := getattr(table, name, None)) is not None]
+        if values and max(values) > MOST_CONTRAST * min(values):
+            raise rule(
+                f"has {name} of {min(values):g} to {max(values):g} in one body: more than {MOST_CONTRAST:g} to 1 "
+                "cannot be solved in double precision (1e6 to 1 is as good as rigid)"
+            )
+    return parts

@@ -1,0 +1,182 @@
+"""Tables of what moves the body: time, its start, gravity, obstacles, pins, anchors, forces."""
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+
+from msmpetsc.scene.body import Region
+from msmpetsc.scene.problems import rule
+from msmpetsc.scene.statics import no_wait
+from msmpetsc.scene.values import (
+    Box,
+    Direction,
+    Integrator,
+    ListOf,
+    NotNegative,
+    Positive,
+    Table,
+    UnitVector,
+    Vector,
+    after_start,
+    only_for,
+)
+
+MOST_STEPS = 10**9
+
+
+class Time(Table):
+    """Simulated time."""
+
+    step: Positive = Field(description="time step [s]")
+    duration: Positive = Field(description="simulated time [s]")
+    integrator: Integrator = Field(
+        "implicit-euler",
+        description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
+        "state of equilibrium",
+    )
+    substep: Positive | None = Field(
+        None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
+    )
+
+    until: Literal["duration", "rest"] = Field(
+        "duration", description="when the run ends: or as soon as all is at rest"
+    )
+    error: float | None = Field(
+        None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
+    )
+    shortest: Positive | None = Field(None, description="of the steps that error chooses; step / 1024 if absent [s]")
+    longest: Positive | None = Field(None, description="of them; 64 step if absent [s]")
+
+    _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
+    _moves = field_validator("until")(no_wait)
+
+    @field_validator("duration")
+    @classmethod
+    def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
+        step = info.data.get("step", duration)
+        if duration / step > MOST_STEPS:
+            raise rule(f"holds too many steps of {step:g} s", "step")
+        if round(duration / step) < 1:
+            raise rule(f"must hold at least one step of {step:g} s", "step")
+        return duration
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps."""
+        return round(self.duration / self.step)
+
+
+class Twist(Table):
+    """Turned ever further along an axis through the middle of the rest bounding box."""
+
+    axis: Direction = Field(description="of any length but zero [-]")
+    degrees: float = Field(
+        lt=1e6, gt=-1e6, description="turn of the far end against the near one, right-handed about the axis [degrees]"
+    )
+
+
+class Start(Table):
+    """How the body is at time 0, if not at rest in its rest shape; scale, twist, scatter in this order.
+
+    Nodes that are pinned or led stay where they are.
+    """
+
+    scale: Vector = Field(
+        (1.0, 1.0, 1.0),
+        description="factors along the axes, about the middle of the rest bounding box: "
+        "0 collapses, a negative one mirrors [-]",
+    )
+    twist: Twist | None = Field(None, description="a turn that grows along an axis")
+    scatter: float = Field(
+        0.0, ge=0, le=1, description="every node goes so much of the way to a random place in the rest bounding box [-]"
+    )
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s]")
+    spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]")
+
+
+class Gravity(Table):
+    """A uniform field."""
+
+    acceleration: Vector = Field(description="[m/s^2]")
+
+
+class Keyframe(Table):
+    """A place on a path."""
+
+    time: Positive = Field(description="when it is reached [s]")
+    by: Vector = Field(description="displacement from the start [m]")
+
+
+def _ascending(path: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
+    if any(a.time >= b.time for a, b in pairwise(path)):
+        raise rule("must have ascending times")
+    return path
+
+
+Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
+
+
+PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
+
+
+class ObstacleTable(Table):
+    """What nodes bounce off or are pressed by: a plane, or a box; it may move, and act for a while only."""
+
+    shape: Literal["plane", "box"] = Field(description="kind of obstacle")
+    point: Vector | None = Field(None, description="a point of the plane [m]")
+    normal: UnitVector | None = Field(
+        None, description="of the plane, towards its free side, normalised on reading [-]"
+    )
+    box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
+    path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
+    start: NotNegative = Field(0.0, description="is there from this time [s]")
+    stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
+    response: Literal["reflect", "penalty"] = Field("reflect", description="what happens on touching")
+    restitution: float | None = Field(
+        None, ge=0, le=1, description='of "reflect": normal speed after over before the impact; 1 if absent [-]'
+    )
+    stiffness: Positive | None = Field(
+        None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
+    )
+    friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
+
+    _after_start = field_validator("stop")(after_start)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "ObstacleTable":
+        needed = ("box",) if self.shape == "box" else ("point", "normal")
+        missing = [name for name in needed if getattr(self, name) is None]
+        if missing:
+            raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
+        uses = {"point": "plane", "normal": "plane", "box": "box"}
+        uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
+        for name, use in uses.items():
+            if getattr(self, name) is not None and use not in (self.shape, self.response):
+                raise rule(f"has {name}, which is for {use!r} only")
+        return self
+
+
+class Pin(Table):
+    """Nodes that stay where they are."""
+
+    region: Region = Field(description="the nodes held")
+
+
+class Force(Table):
+    """A force on a part of the body."""
+
+    region: Region = Field(description="the nodes pulled")
+    total: Vector = Field(description="sum over the nodes, spread by mass [N]")
+    start: float = Field(0.0, description="acts from this time [s]")
+    stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
+
+    _after_start = field_validator("stop")(after_start)
+
+
+class AnchorTable(Table):
+    """Nodes that are led along a path, each keeping its place among them."""
+
+    region: Region = Field(description="the nodes led")
+    path: Path3 = Field(min_length=1, description=f"how they move: {PATH} [s, m]")
+    stop: Positive | None = Field(None, description="let go at this time [s]; never if absent")

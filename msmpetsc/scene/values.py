@@ -1,0 +1,118 @@
+"""Types of the values of a scene's keys, and the table that all tables are."""
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails
+
+from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
+
+
+def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise rule("must not be the zero vector")
+    return vector
+
+
+def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    longest = max(map(abs, _nonzero(vector)))
+    x, y, z = (c / longest for c in vector)  # or the squares of very large or small components leave the range
+    length = math.hypot(x, y, z)
+    return x / length, y / length, z / length
+
+
+Positive = Annotated[float, Field(gt=0, lt=1e60)]  # so that its fourth power is still a number
+NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
+Count = Annotated[int, Field(gt=0, lt=2**63)]  # TOML's integers have 64 bits
+T = TypeVar("T")
+ListOf = Annotated[tuple[T, ...], Strict(False)]  # not strict: TOML has lists, no tuples
+Vector = Annotated[tuple[float, float, float], Strict(False)]
+Direction = Annotated[Vector, AfterValidator(_nonzero)]
+UnitVector = Annotated[Vector, AfterValidator(_unit)]
+
+
+def _has_a_volume(box: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    if not all(low < high for low, high in zip(*box, strict=True)):
+        raise rule("must have each coordinate of the first corner below that of the second")
+    return box
+
+
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise rule("must be of printable characters")
+    return name
+
+
+def _painted(value: Any) -> str | tuple[int, ...]:
+    """Return a file's name, or numbers of points."""
+    if isinstance(value, str) and 0 < len(value) <= 1000:
+        return _printable(value)
+    numbers = isinstance(value, list | tuple) and all(type(n) is int and 0 <= n < 2**63 for n in value)
+    if not numbers or not value:
+        raise rule("must be a list of point numbers, from 0, or the name of a file that has them")
+    return tuple(value)
+
+
+def after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
+    start = info.data.get("start")
+    if stop is not None and start is not None and stop <= start:
+        raise rule(f"must be > start = {start:g}", "start")
+    return stop
+
+
+def only_for(key: str, value: str) -> Callable[..., Any]:
+    """Return the validator of what has a meaning only where another key of its table has this value."""
+
+    def check(cls, given: Any, info: ValidationInfo) -> Any:
+        if info.data.get(key, value) != value:
+            raise rule(f'is for {key} = "{value}" only', key)
+        return given
+
+    return check
+
+
+def _known_preset(name: str, info: ValidationInfo) -> str:
+    presets = (info.context or {}).get("presets")
+    if presets is not None and name not in presets:
+        raise unknown_name(presets)
+    return name
+
+
+FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
+Integrator = Literal["implicit-euler", "bdf2", "verlet", "static"]
+Preset = Annotated[str, AfterValidator(_known_preset)]
+Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
+Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
+
+
+class Table(BaseModel):
+    """A table of the scene file; ``one_of`` names the keys of which exactly one must be given."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    one_of: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        """Add what pydantic does not check, and lose none of what it does."""
+        known = list(cls.model_fields)
+        problems: list[InitErrorDetails] = one_of_problems(data, cls.one_of, known)
+        try:
+            table = handler(data)
+        except ValidationError as error:
+            problems += restated(error, known)
+        if problems:
+            raise ValidationError.from_exception_data(cls.__name__, problems)
+        return table

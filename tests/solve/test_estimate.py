@@ -15,7 +15,9 @@ from mpi4py import MPI
 from msmpetsc.model.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear import error_control, minimum
+from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
+from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
 from msmpetsc.solve.nonlinear.reference import Reference
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
@@ -44,8 +46,12 @@ SCENES = {
 
 @pytest.mark.parametrize("preset", ["anderson", "newton"])
 @pytest.mark.parametrize("name", SCENES)
-def test_the_estimate_is_within_three_of_the_true_error(tmp_path: Path, name: str, preset: str):
-    """Where the bound alone would do, what is said may be further above; it is never far below."""
+def test_the_estimate_is_within_three_of_the_true_error(
+    tmp_path: Path, name: str, preset: str, monkeypatch: pytest.MonkeyPatch
+):
+    """Without early ends. Where the bound alone would do, what is said may be further above; it is never far below."""
+    for module in (error_control, minimum):
+        monkeypatch.setattr(module, "KNOWN", 0.0)
     scene = load_scene(
         block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]), [f"solver={{preset='{preset}', error=1e-3}}"]
     )
@@ -59,6 +65,36 @@ def test_the_estimate_is_within_three_of_the_true_error(tmp_path: Path, name: st
                 estimated.append(stepper.control.now.corrected)
     ratios, estimated = np.array(ratios), np.array(estimated)
     assert estimated.sum() >= 5 and (ratios[estimated] < 3).all() and (ratios > 1 / 3).all()
+
+
+@pytest.mark.parametrize("preset", ["newton-multigrid", "newton-jacobi"])
+@pytest.mark.parametrize("name", ["is pressed", "swings"])
+def test_an_estimate_that_ends_early_is_a_bound(
+    tmp_path: Path, name: str, preset: str, monkeypatch: pytest.MonkeyPatch
+):
+    """An error that is known to do is estimated in fewer iterations, and not below the true one."""
+    scene = load_scene(
+        block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]), [f"solver={{preset='{preset}', error=1e-3}}"]
+    )
+    model, early, full, ratios = build_model(MPI.COMM_SELF, scene), 0, 0, []
+    plain = ErrorEstimate.__call__
+
+    def both(
+        self: ErrorEstimate, iterate: Iterate, bound: float, enough: float, will_do: float = 0.0, lowest: float = 1.0
+    ) -> float:
+        nonlocal early, full
+        plain(self, iterate, bound, enough, 0.0, lowest)
+        full += self.ksp.its
+        length = plain(self, iterate, bound, enough, will_do, lowest)
+        early += self.ksp.its
+        return length
+
+    monkeypatch.setattr(ErrorEstimate, "__call__", both)
+    with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
+        for frame in simulation.frames():
+            if frame.index and frame.true_error > 1e-9:
+                ratios.append(frame.step_error / frame.true_error)
+    assert len(ratios) >= 5 and min(ratios) > 0.8 and early < 0.8 * full
 
 
 DESCENDING = ("fast-msm", "fast-msm-kronecker", "paper", "lbfgs", "newton", "newton-multigrid")

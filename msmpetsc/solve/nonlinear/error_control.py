@@ -17,7 +17,9 @@ from msmpetsc.solve.nonlinear.rounding import Rounding
 
 DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
+KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
+UNIFORM_RATIO = 30.0  # at least, with multigrid: an estimate that is too early is the next solve's start
 EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
@@ -88,7 +90,7 @@ class ErrorControl:
         if not distance > 0 or not np.isfinite(now.residual):  # the start x = y tells nothing yet
             return 0.0 if now.at_rounding else np.inf
         now.bound = now.residual / distance
-        if now.bound > self.ratio * now.early * now.goal and not now.at_rounding:
+        if now.bound > max(self.ratio, 10.0) * now.early * now.goal and not now.at_rounding:
             return now.bound
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature
@@ -99,11 +101,13 @@ class ErrorControl:
     def _estimated(self, iterate: Iterate, distance: float, goal: float) -> float:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
         now = self.now
-        length = self.estimate(iterate, now.residual, EARLY * goal * distance if goal else np.inf)
+        enough = EARLY * goal * distance if goal else np.inf
+        length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
         if not np.isfinite(length):
             now.alarmed = True
             return now.bound
-        self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
+        if self.estimate.missing is None:
+            self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
         now.early, now.corrected = 1.0, True
         return self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
 

@@ -6,6 +6,9 @@ more. In the norm of H their part is |e_k|_H^2 = e_k^T F, and miss no more than 
 preconditioner and lambda the least eigenvalue of P^(-1) H, of which CG's own Ritz values tell: the solve ends when
 the second is a part of the first and |e_k|_M hardly grows, or when that is over the error that would do. It does not
 end before k is half of sqrt(|F|_(M^-1) / |e_k|_M): modes that are so much stiffer hide the others for that long.
+
+What is missing of e is also no more than |r_k|_(M^-1) where H is no less than M. So the solve ends, too, once |e_k|_M
+and that are together an error that will do; their sum is then the estimate.
 """
 
 import numpy as np
@@ -37,7 +40,8 @@ class ErrorEstimate:
         self.length = np.inf  # the last estimate [m sqrt(kg)]
         self.right_side: PETSc.Vec | None = None  # of the solve in progress, as the next four
         self.bound = self.enough = np.inf
-        self.lowest = 1.0
+        self.lowest, self.will_do = 1.0, 0.0
+        self.missing: float | None = None  # of a length that will do, |r_k|_(M^-1)
         self.lengths: dict[int, float] = {}  # |e_k|_M by iteration
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
@@ -50,16 +54,20 @@ class ErrorEstimate:
         self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._converged)
 
-    def __call__(self, iterate: Iterate, bound: float, enough: float, lowest: float = 1.0) -> float:
+    def __call__(
+        self, iterate: Iterate, bound: float, enough: float, will_do: float = 0.0, lowest: float = 1.0
+    ) -> float:
         """Estimate |x - x*|_M at an iterate (collective); a result over ``enough`` may be too low.
 
-        bound  : on it, |F|_(M^-1) where H is no less than M
-        lowest : eigenvalue of M^(-1) H, as far as is known
+        bound   : on it, |F|_(M^-1) where H is no less than M
+        will_do : an error bounded by that need not be known better
+        lowest  : eigenvalue of M^(-1) H, as far as is known
 
         Infinite where the Hessian is not positive definite: there no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
+        self.will_do, self.missing = will_do, None
         with ESTIMATE:
             self.linearise(iterate.q)
             self.ksp.solve(iterate.f, self.correction)
@@ -69,6 +77,8 @@ class ErrorEstimate:
     def _length(self) -> float:
         """|e_k|_M, grown once more as it has since k was half of it; or, where CG was cut short, all that it may be."""
         length, its = self.functional.norm(self.correction), self.ksp.its
+        if self.missing is not None:
+            return length + self.missing
         left, half = self._left(), self.lengths.get(its // 2, 0.0)
         if its >= MOST and left > LEFT * length:
             return length + left
@@ -89,13 +99,23 @@ class ErrorEstimate:
         if residual > 0 and (its == 0 or its % max(every // 2, 1)):
             return reasons.ITERATING
         length = self.lengths[its] = self.functional.norm(ksp.getSolution())
-        if residual == 0 or its >= MOST or length > self.enough:
+        if residual == 0 or its >= MOST or length > self.enough or self._will_do(length, residual):
             return reasons.CONVERGED_ITS
         if its % every or length > GROWTH * self.lengths.get(its // 2, 0.0):
             return reasons.ITERATING
         if not self.preconditioner.is_uniform and 4 * its**2 * length < self.bound:
             return reasons.ITERATING
         return reasons.CONVERGED_ITS if self._is_close(ksp, residual) else reasons.ITERATING
+
+    def _will_do(self, length: float, residual: float) -> bool:
+        """Whether |e_k|_M, here ``length``, and all that may be missing are together less than will do."""
+        if length + residual > self.will_do:  # as the preconditioner is no more than M^(-1), |r_k|_(M^-1) is no less
+            return False
+        missing = self._left()
+        if length + missing > self.will_do:
+            return False
+        self.missing = missing
+        return True
 
     def _is_close(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Whether e is near in the norm of H, as far as CG can show."""

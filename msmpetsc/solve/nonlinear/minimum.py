@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
 from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
+from msmpetsc.solve.nonlinear.error_control import KNOWN
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.rounding import Rounding
@@ -72,9 +73,20 @@ class Minimum:
         if value < 0:
             return Examination(np.inf, direction, value)
         value = min(value, 1.0)
+        first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
+        if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
+            return Examination(self.rounding.relative(first + rest, functional.distance(nearer.q)))
+        if corrected and estimate.missing is not None and value <= CONVEX:
+            return self.examine(x, self._estimate_closely(x), compression, alarmed, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Examination(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
-        return Examination(self._second_estimate(nearer, functional.dual_norm(self.f) / value, enough, value))
+        return Examination(self._second_estimate(nearer, rest, enough, value))
+
+    def _estimate_closely(self, x: PETSc.Vec) -> bool:
+        """Estimate the error of x without an early end, which says little where g is hardly convex; whether it could be
+        had."""
+        iterate = self.functional.evaluate(x, self.f)
+        return bool(np.isfinite(self.estimate(iterate, self.functional.dual_norm(self.f), np.inf)))
 
     def _bent(self) -> float:
         """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
@@ -86,9 +98,12 @@ class Minimum:
         little but rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
         functional, correction, relative = self.functional, self.estimate.correction, self.rounding.relative
         first, distance = functional.norm(self.first), functional.distance(nearer.q)
-        second = self.estimate(nearer, bound, enough, lowest)
+        will_do = KNOWN * enough - first if lowest > CONVEX else 0.0
+        second = self.estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
+        if self.estimate.missing is not None:
+            return relative(first + second, distance)
         if first > 0 and second > SMALL * first:
             return DOUBTFUL * relative(max(first, second), distance)
         self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)

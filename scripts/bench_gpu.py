@@ -32,7 +32,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.cli.profile import machine, versions
+from msmpetsc.cli.running.profile import machine, versions
 from msmpetsc.model.build import Model, build_model, to_device
 from msmpetsc.model.springs import SpringGather
 from msmpetsc.output.reader import Result

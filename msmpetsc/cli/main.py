@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
             with ending_together(comm):
                 if refused:
                     raise refused
-                return import_module(f"msmpetsc.cli.{args.command}").run(args)
+                return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
         except MsmpetscError as error:
             if comm.rank == 0:
                 print(f"msmpetsc: error: {error}", file=sys.stderr)
@@ -84,8 +84,8 @@ def simulate(
     """
     from mpi4py import MPI
 
+    from msmpetsc.cli.commands.run import RunRequest, run
     from msmpetsc.cli.failure import STATUS_INTERRUPTED, ending_together
-    from msmpetsc.cli.run import RunRequest, run
     from msmpetsc.solve.petsc.words import start_for_runs, words_of
 
     comm = MPI.COMM_WORLD

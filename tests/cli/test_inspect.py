@@ -13,7 +13,7 @@ import pytest
 from conftest import ENVIRONMENT, WORKERS
 from mpi4py import MPI
 
-from msmpetsc.cli.inspect import largest
+from msmpetsc.cli.commands.inspect import largest
 from msmpetsc.cli.main import main
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
@@ -218,7 +218,7 @@ def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Pat
 
 
 def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, own_log, monkeypatch):
-    monkeypatch.setattr("msmpetsc.cli.inspect.MOST_BUILT", 1000)
+    monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):
         fill_cages(read_body(SELF, load_scene(scene)), load_scene(scene, [many]))
@@ -246,7 +246,7 @@ def test_times_are_measured_once_and_kept(scene: Path, capsys, own_log, monkeypa
 
 
 def test_memory_is_that_of_the_process_not_of_its_parent():
-    code = "from msmpetsc.cli.profile import peak_memory; print(peak_memory())"
+    code = "from msmpetsc.cli.running.profile import peak_memory; print(peak_memory())"
     large = np.ones(75_000_000)  # 600 MB
     told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert 2e7 < int(told.stdout) < large.nbytes

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from msmpetsc.cli import fetch as command
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import fetch as command
 from msmpetsc.errors import InputError
 from msmpetsc.geometry import registry
 from msmpetsc.geometry.prepare import STEPS

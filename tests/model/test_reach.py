@@ -14,7 +14,7 @@ from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
 
 from msmpetsc.cli.main import main
-from msmpetsc.cli.march import log_model, taken
+from msmpetsc.cli.running.march import log_model, taken
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_body
 from msmpetsc.model.reach import Reach

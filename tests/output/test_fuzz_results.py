@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import msmpetsc
-from msmpetsc.cli import compare
+from msmpetsc.cli.commands import compare
 from msmpetsc.errors import InputError
 from msmpetsc.output.reader import refuse_deadly
 from msmpetsc.output.restart import Earlier

@@ -13,8 +13,8 @@ from mpi4py import MPI
 from PIL import Image
 from scipy.sparse import csr_array
 
-from msmpetsc.cli import render as command
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import Frame
 from msmpetsc.output import overlays, render

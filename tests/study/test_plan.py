@@ -8,7 +8,7 @@ import pytest
 from block_scene import block_scene
 from study_files import own_log  # noqa: F401 (fixtures)
 
-from msmpetsc.cli import plan
+from msmpetsc.cli.commands import plan
 from msmpetsc.cli.main import main
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.plan import Candidate, Trial, cheapest, plan_step, plan_trajectory

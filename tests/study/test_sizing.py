@@ -14,7 +14,7 @@ import pytest
 from conftest import ENVIRONMENT, ROOT
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
-from msmpetsc.cli import plan as plan_command
+from msmpetsc.cli.commands import plan as plan_command
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene

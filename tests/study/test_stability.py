@@ -25,7 +25,7 @@ from study_files import (
 )
 from study_stand_in import blank_frame
 
-from msmpetsc.cli.study import log_failures
+from msmpetsc.cli.commands.study import log_failures
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.output.writer import ResultFile

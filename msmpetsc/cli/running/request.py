@@ -9,7 +9,7 @@ from typing import Any
 from mpi4py import MPI
 
 from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
-from msmpetsc.cli.resume import examined, options_to_keep
+from msmpetsc.cli.running.resume import examined, options_to_keep
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
 from msmpetsc.output.restart import Earlier

@@ -7,7 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.cli.arguments import option_names
-from msmpetsc.cli.request import RunRequest, earlier_run
+from msmpetsc.cli.running.request import RunRequest, earlier_run
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
 from msmpetsc.scene.schema import Solver
@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
         from msmpetsc.backend.compiling import cache_is_empty
 
         kernels_are_new = cache_is_empty()
-        from msmpetsc.cli.march import finish, march, prepare, tell_done  # PETSc, which has its options now
+        from msmpetsc.cli.running.march import finish, march, prepare, tell_done  # PETSc, which has its options now
 
         plan = prepare(comm, request, earlier, kernels_are_new)
         if plan.is_done:
@@ -39,7 +39,7 @@ def show_options(comm: MPI.Comm, request: RunRequest) -> int:
     earlier = earlier_run(comm, request) if request.scene or request.resume else None
     request = request.going_on_from(earlier)
     with lent_options(comm, request.petsc_options):
-        from msmpetsc.cli.march import read_scene
+        from msmpetsc.cli.running.march import read_scene
         from msmpetsc.solve.instrumentation import Probes
         from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
         from msmpetsc.solve.petsc.device import choose

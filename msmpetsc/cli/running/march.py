@@ -17,10 +17,10 @@ from msmpetsc import __version__
 from msmpetsc.backend.compiling import compilation_logged
 from msmpetsc.cli.arguments import option_names
 from msmpetsc.cli.failure import ending_together
-from msmpetsc.cli.observers import STATUS, Checkpoints, FrameWriter, Interval, Observer, ProgressLine, Signals
-from msmpetsc.cli.profile import Cost, refuse_unwritable, versions
-from msmpetsc.cli.request import RunRequest
-from msmpetsc.cli.resume import Resumed, stored_scene
+from msmpetsc.cli.running.observers import STATUS, Checkpoints, FrameWriter, Interval, Observer, ProgressLine, Signals
+from msmpetsc.cli.running.profile import Cost, refuse_unwritable, versions
+from msmpetsc.cli.running.request import RunRequest
+from msmpetsc.cli.running.resume import Resumed, stored_scene
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from msmpetsc.cli.arguments import interrupt, option_names, refuse_below_one, refuse_ranks
-from msmpetsc.cli.profile import peak_memory
+from msmpetsc.cli.running.profile import peak_memory
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene

@@ -5,18 +5,21 @@ What is imported at the top starts neither MPI nor PETSc, so that ``--help`` ans
 
 import argparse
 import os
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import msmpetsc
+from msmpetsc.cli.options.examples import EXAMPLES, EXAMPLES_HEAD, ExamplesKept
 from msmpetsc.cli.options.planning import add_inspect, add_plan, add_study
+from msmpetsc.cli.options.program import add_completion, add_doctor
 from msmpetsc.cli.options.results import add_compare, add_render
 from msmpetsc.cli.options.run import add_run
-from msmpetsc.cli.options.scenes import add_fetch
-from msmpetsc.cli.options.values import Commands
-from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.cli.options.scenes import add_fetch, add_keys, add_new, add_schema
+from msmpetsc.cli.options.values import Commands, add_verbosity
+from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
 TAKE_PETSC_OPTIONS = ("run", "inspect")
@@ -52,6 +55,7 @@ def parsed_apart(ours: list[str], petsc: list[str], words: list[str]) -> argpars
 
     Raises InputError.
     """
+    _refuse_unknown_command(ours)
     _refuse_one_dash(ours, petsc)
     given = argparse.Namespace(petsc_options=tuple(petsc), words=tuple(words))
     args, unknown = command_parser().parse_known_args(ours, given)
@@ -78,10 +82,20 @@ def _is_petsc_option(word: str) -> bool:
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
 
 
+def _refuse_unknown_command(ours: list[str]) -> None:
+    """Raise InputError for a word that is no command, with the one that may be meant."""
+    if not ours or ours[0] in COMMANDS or ours[0].startswith("-"):
+        return
+    word = printable(ours[0], 60)
+    if word.endswith(SCENE_NAMES):
+        raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
+    raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
+
+
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
     """Raise InputError for options of ours that lack a dash, and for any of PETSc's where there is no use for them."""
     name = ours[0] if ours else ""
-    if name not in COMMANDS:  # argparse says so
+    if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return
     valid = option_names(name)
     for word in petsc:
@@ -103,24 +117,46 @@ class Parser(argparse.ArgumentParser):
             super()._print_message(message, file)
 
 
+class Version(argparse.Action):
+    """Print the versions and leave; PETSc and MPI are loaded only here."""
+
+    def __init__(self, option_strings: list[str], dest: str, help: str):
+        super().__init__(option_strings, dest, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from msmpetsc.cli.versions import library_versions
+
+        libraries = ", ".join(library_versions())
+        parser._print_message(f"msmpetsc {msmpetsc.__version__} ({libraries})\n", sys.stdout)
+        parser.exit()
+
+
 def command_parser() -> Parser:
     """Make the parser of the whole program."""
     parser = Parser(prog="msmpetsc", description=msmpetsc.__doc__)
-    parser.add_argument("--version", action="version", version=f"msmpetsc {msmpetsc.__version__}")
+    parser.add_argument("--version", action=Version, help="show the versions of msmpetsc, PETSc and MPI")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in COMMANDS.values():
-        add(commands)
+    for name in COMMANDS:
+        add_command(commands, name)
+    return parser
+
+
+def add_command(commands: Commands, name: str) -> Parser:
+    """Add a command with its own arguments, with those that all have, and with its examples."""
+    COMMANDS[name](commands)
+    parser = commands.choices[name]
+    add_verbosity(parser)
+    parser.epilog, parser.formatter_class = "\n  ".join((EXAMPLES_HEAD, *EXAMPLES[name])), ExamplesKept
     return parser
 
 
 def option_names(command: str) -> list[str]:
     """List the options of a command: "--preset"."""
-    commands = Parser().add_subparsers()
-    COMMANDS[command](commands)
-    return list(commands.choices[command]._option_string_actions)
+    return list(add_command(Parser().add_subparsers(), command)._option_string_actions)
 
 
 COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module of its name
+    "new": add_new,
     "run": add_run,
     "inspect": add_inspect,
     "study": add_study,
@@ -128,6 +164,10 @@ COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module
     "compare": add_compare,
     "render": add_render,
     "fetch": add_fetch,
+    "keys": add_keys,
+    "schema": add_schema,
+    "doctor": add_doctor,
+    "completion": add_completion,
 }
 
 
@@ -135,6 +175,7 @@ COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module
 
 RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
+SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
 NO_FOLDERS = (
     *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES,
     ".csv", ".gif", ".html", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"

@@ -19,13 +19,27 @@ from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
 if TYPE_CHECKING:  # MPI takes 0.3 s to start, which --help need not wait for
     from mpi4py import MPI
 
+WITHOUT_MPI = ("doctor", "completion")  # which must work where MPI does not
+LINE = "msmpetsc: %(levelname)s: %(message)s"
+
+
+class TimedFormatter(logging.Formatter):
+    """Formats a line of the log with the seconds since the program started."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        record.levelname = f"{record.levelname} [{record.relativeCreated / 1000:.2f} s]"
+        return super().format(record)
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return 0, 2 for bad input, 3 for a step that failed (collective)."""
     words = sys.argv[1:] if arguments is None else arguments
-    refused = None
+    refused, verbose, level = None, False, logging.INFO
     try:
         args = parsed(words)  # --help and --version leave from here
+        verbose, level = args.verbose, logging.WARNING if args.quiet else logging.INFO
+        if args.command in WITHOUT_MPI:
+            return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
     except InputError as error:
         refused = error
     from mpi4py import MPI
@@ -33,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
     from msmpetsc.cli.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
 
     comm = MPI.COMM_WORLD
-    with logged_on_root(comm):
+    with logged_on_root(comm, level, verbose):
         try:
             with ending_together(comm):
                 if refused:
@@ -41,6 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
                 return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
         except MsmpetscError as error:
             if comm.rank == 0:
+                if verbose:
+                    traceback.print_exc()
                 print(f"msmpetsc: error: {error}", file=sys.stderr)
             return error.exit_status
         except KeyboardInterrupt:
@@ -128,14 +144,14 @@ def toml_value(value: Any) -> str:
 
 
 @contextmanager
-def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO) -> Iterator[None]:
-    """Let rank 0 alone write the log to stderr, from this level on."""
+def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
+    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with the seconds since the start."""
     log = logging.getLogger("msmpetsc")
     before = log.handlers, log.level
     logging.addLevelName(logging.WARNING, "warning")
     logging.addLevelName(logging.INFO, "note")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("msmpetsc: %(levelname)s: %(message)s"))
+    handler.setFormatter((TimedFormatter if timed else logging.Formatter)(LINE))
     log.handlers = [handler]
     log.setLevel(level if comm.rank == 0 else logging.CRITICAL)
     try:

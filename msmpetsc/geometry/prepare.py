@@ -56,7 +56,7 @@ def merge(surface: Surface) -> Surface:
 
 def largest_part(surface: Surface) -> Surface:
     """Keep the connected part of the largest area."""
-    labels = _part_labels(surface)
+    labels = part_labels(surface)
     a, b, c = surface.points[surface.triangles].swapaxes(0, 1)
     areas = np.bincount(labels, np.linalg.norm(np.cross(b - a, c - a), axis=1))
     return compact(surface.points, surface.triangles[labels == areas.argmax()])
@@ -67,7 +67,7 @@ def union(surface: Surface) -> Surface:
     import manifold3d  # of the extra "mesh"
 
     surface = merge(surface)
-    labels = _part_labels(surface)
+    labels = part_labels(surface)
     parts = [
         _solid(Surface(surface.points, surface.triangles[labels == part]), part) for part in range(labels.max() + 1)
     ]
@@ -179,7 +179,7 @@ def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
-def _part_labels(surface: Surface) -> np.ndarray:
+def part_labels(surface: Surface) -> np.ndarray:
     """Return the number (f,) of the connected part of each triangle; points of equal position connect."""
     triangles = first_of_equal(surface.points)[surface.triangles]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T

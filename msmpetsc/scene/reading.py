@@ -15,6 +15,7 @@ from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import Scene, SceneFile
 from msmpetsc.scene.toml import DEEPEST, toml_of
 
+OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
 
@@ -47,6 +48,8 @@ def scene_of(
     to_read: whether the files that it names are to be read
     """
     overrides, data = list(overrides), _parse(path, file_text)
+    if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
+        raise InputError(f"{path} is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
     try:
         checked = SceneFile.model_validate(data, context={"presets": presets})

@@ -97,10 +97,18 @@ Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volu
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 
 
+def _one_of_in_schema(schema: dict[str, Any], table: type["Table"]) -> None:
+    """Say in a table's JSON schema of which keys exactly one must be given."""
+    if table.one_of:
+        schema["oneOf"] = [{"required": [name]} for name in table.one_of]
+
+
 class Table(BaseModel):
     """A table of the scene file; ``one_of`` names the keys of which exactly one must be given."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, json_schema_extra=_one_of_in_schema
+    )
     one_of: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="wrap")

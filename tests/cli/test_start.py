@@ -1,6 +1,7 @@
 """How a command starts: help and refusals import little, and a command imports what it needs itself."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -28,9 +29,19 @@ def imports(code: str, *arguments: str) -> set[str]:
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "run --help", "study --help", "fetch -h"])
+@pytest.mark.parametrize("words", ["--help", "run --help", "study --help", "fetch -h", "new --help"])
 def test_help_starts_neither_mpi_nor_petsc_nor_a_compiler(words: str):
     assert imports(IMPORTS, *words.split()) & SLOW == set()
+
+
+def test_the_version_names_petsc_and_mpi_and_loads_no_more_than_them():
+    assert imports(IMPORTS, "--version") & (SLOW - {"numpy", "mpi4py", "petsc4py"}) == set()
+    done = subprocess.run(
+        [sys.executable, "-m", "msmpetsc", "--version"], env=ALONE, capture_output=True, text=True, timeout=60
+    )
+    assert re.fullmatch(r"msmpetsc [\d.]+ \(PETSc 3\.\d+\.\d+, .*MPI.* v?\d.*, Python 3[\d.]+\)\n", done.stdout), (
+        done.stdout
+    )
 
 
 def test_the_package_itself_imports_nothing_slow():

@@ -1,6 +1,9 @@
 """``msmpetsc compare``: do two results agree, and if not, from which frame and node on."""
 
 import argparse
+import json
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -23,22 +26,27 @@ def run(args: argparse.Namespace) -> int:
     refuse_deadly(args.first)
     refuse_deadly(args.second)
     with Result(args.first) as first, Result(args.second) as second:
-        comparison = compared(first, second, names)
-        print_what_is_not_shared(first, second, comparison)
-        for line in (HEAD, *(row(field, comparison, args.rtol) for field in comparison.fields)):
-            print(line)
-        differs = print_first_difference(first, comparison, args.rtol)
+        comparison, notes = compared(first, second, names)
+        differs = any(field.first_above(args.rtol) is not None for field in comparison.fields)
         most = max(len(first.frames.time), len(second.frames.time))
         apart = len(comparison.pairs) < most and not args.shared
-        if apart:
+        if args.json:
+            print(
+                json.dumps({"agree": not (differs or apart), **record(comparison, args.rtol), "notes": notes}, indent=1)
+            )
+        else:
+            print("\n".join([*notes, *not_shared(first, second, comparison), HEAD]))
+            print("\n".join(row(field, comparison, args.rtol) for field in comparison.fields))
+            print("\n".join(first_difference(first, comparison, args.rtol)))
+        if apart and not args.json:
             print("they have not the same times, which counts as different without --shared")
     return DIFFERENT if differs or apart else SAME
 
 
-def compared(first: Result, second: Result, names: list[str] | None) -> Comparison:
-    """Compare two results, of different lattices by their surfaces alone, which is said."""
+def compared(first: Result, second: Result, names: list[str] | None) -> tuple[Comparison, list[str]]:
+    """Compare two results, of different lattices by their surfaces alone; return what is to be said of that, too."""
     try:
-        return compare(first, second, names)
+        return compare(first, second, names), []
     except DifferentLattices as error:
         differ = str(error)
     if names not in (None, ["surface"]):
@@ -47,21 +55,35 @@ def compared(first: Result, second: Result, names: list[str] | None) -> Comparis
         comparison = compare_surfaces(first, second)
     except InputError as error:
         raise InputError(f"{differ}; {error}") from None
-    print(f"{differ}: their surfaces alone are compared")
     mean = next(field for field in comparison.fields if field.name == MEAN)
     overall = np.sqrt(np.mean(mean.errors**2))
-    print(f"surface error {overall:.3g}: rms over the surface and time, of the largest displacement in {second.path}")
-    return comparison
+    return comparison, [
+        f"{differ}: their surfaces alone are compared",
+        f"surface error {overall:.3g}: rms over the surface and time, of the largest displacement in {second.path}",
+    ]
 
 
-def print_what_is_not_shared(first: Result, second: Result, comparison: Comparison) -> None:
-    """Print which frames and fields one run alone has."""
+def record(comparison: Comparison, rtol: float) -> dict[str, Any]:
+    """Return what the table says, for a program: frames are numbered as in the first file."""
+    fields = {}
+    for field in comparison.fields:
+        index, first = int(np.argmax(field.errors)), field.first_above(rtol)
+        fields[field.name] = {
+            "error": float(field.errors[index]), "frame": int(comparison.pairs[index, 0]),
+            "first_above": None if first is None else int(comparison.pairs[first, 0]),
+            "scale": float(field.scale), "unit": field.unit,
+        }  # fmt: skip
+    return {"rtol": rtol, "frames": len(comparison.pairs), "fields": fields, "left_out": list(comparison.left_out)}
+
+
+def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterator[str]:
+    """Yield which frames and fields one run alone has."""
     counts, shared = [len(result.frames.time) for result in (first, second)], len(comparison.pairs)
     if counts != [shared, shared]:
         span = f"from {comparison.times[0]:g} s to {comparison.times[-1]:g} s"
-        print(f"{counts[0]} and {counts[1]} frames, of which {shared} have the same time, {span}: these are compared")
+        yield f"{counts[0]} and {counts[1]} frames, of which {shared} have the same time, {span}: these are compared"
     for name in comparison.left_out:
-        print(f"{name} is in {first.path if name in first.frames else second.path} only: not compared")
+        yield f"{name} is in {first.path if name in first.frames else second.path} only: not compared"
 
 
 def row(field: FieldError, comparison: Comparison, rtol: float) -> str:
@@ -72,29 +94,25 @@ def row(field: FieldError, comparison: Comparison, rtol: float) -> str:
     return f"{field.name:16} {field.errors[index]:14.3g} {comparison.pairs[index, 0]:8} {since:>11} {scale:>11}"
 
 
-def print_first_difference(result: Result, comparison: Comparison, rtol: float) -> bool:
-    """Print the first frame at which anything differs, and the node that is farthest off when positions first do.
-
-    Returns whether anything differs.
-    """
+def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
+    """Yield the first frame at which anything differs, and the node that is farthest off when positions first do."""
     firsts = {field.name: first for field in comparison.fields if (first := field.first_above(rtol)) is not None}
     if not firsts:
-        print(f"they agree to {rtol:g} at these {len(comparison.pairs)} frames")
-        return False
+        yield f"they agree to {rtol:g} at these {len(comparison.pairs)} frames"
+        return
     first = min(firsts.values())
     names = ", ".join(name for name, index in firsts.items() if index == first)
-    print(f"they differ from frame {comparison.pairs[first, 0]} on, t = {comparison.times[first]:g} s: {names}")
+    yield f"they differ from frame {comparison.pairs[first, 0]} on, t = {comparison.times[first]:g} s: {names}"
     for field in comparison.fields:
         if field.name in ("position", "surface") and field.name in firsts:
-            print_node(result, comparison, field, firsts[field.name])
+            yield farthest(result, comparison, field, firsts[field.name])
             break
-    return True
 
 
-def print_node(result: Result, comparison: Comparison, field: FieldError, first: int) -> None:
-    """Print which node or surface point is farthest off at a frame, and where it is at rest."""
+def farthest(result: Result, comparison: Comparison, field: FieldError, first: int) -> str:
+    """Return which node or surface point is farthest off at a frame, and where it is at rest."""
     number, rest_rows = field.worst[first], rest_of(result, field.name)
     rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
     off = f"{field.errors[first] * field.scale:.3g} m off at frame {comparison.pairs[first, 0]}"
-    print(f"{kind} {number}{rest}, is {off}, farther than any other")
+    return f"{kind} {number}{rest}, is {off}, farther than any other"

@@ -1,10 +1,11 @@
 """``msmpetsc inspect``: what a scene would need on so many ranks, without running it there."""
 
 import argparse
+import json
 import shlex
 import signal
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -51,11 +52,19 @@ def run(args: argparse.Namespace) -> int:
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
-    print_counts(args, scene, partition, counted)
-    print_budget(scene)
+    report = {"scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition)}
+    if not args.json:
+        print_counts(args, scene, partition, report)
+        print_budget(scene)
     if not args.no_times:
-        print_needs(args, scene, body.surface, partition, mesh)
-    print_limits(partition)
+        report["needs"] = needs_of(args, scene, body.surface, partition, mesh)
+        if not args.json:
+            print_needs(report["needs"])
+    report["limits"] = limits_of(partition)
+    if args.json:
+        print(json.dumps(report, indent=1))
+    else:
+        print_limits(report["limits"], partition)
     return 0
 
 
@@ -70,11 +79,8 @@ def refuse_bad_numbers(args: argparse.Namespace) -> None:
         raise InputError(f"--bandwidth must be more than 0, not {args.bandwidth:g}")
 
 
-def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition", counted: int) -> None:
-    """Print a table of what there is, and what a rank has of it."""
-    how = "counted" if counted == partition.cells.sum() else f"scaled from a lattice of {counted} cells"
-    print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
-    print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
+def counts_of(scene: Scene, partition: "Partition") -> dict[str, dict[str, float]]:
+    """Return how many there are of each thing in all, and of a rank in the mean and at the most."""
     rows = {
         "cells": partition.cells,
         "nodes": partition.nodes,
@@ -83,11 +89,30 @@ def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition",
         "ghosts": partition.ghosts,
         "messages an exchange": partition.neighbours,
     }
-    for name, values in rows.items():
-        total = partition.all_springs if name == SPRINGS else values.sum()
-        print(f"{name:{WIDTH}}{total:15.0f}{values.mean():15.1f}{values.max():15.0f}")
+    counts = {name: over_ranks(values) for name, values in rows.items()}
+    counts[SPRINGS]["all"] = float(partition.all_springs)
+    counts[f"positions of {scene.stored} frames, file [byte]"] = {
+        "all": float(24 * scene.stored * partition.nodes.sum())
+    }
+    return counts
+
+
+def over_ranks(values: np.ndarray) -> dict[str, float]:
+    """Return sum, mean and maximum of what the ranks have."""
+    return {"all": float(values.sum()), "mean": float(values.mean()), "most": float(values.max())}
+
+
+def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition", report: dict[str, Any]) -> None:
+    """Print a table of what there is, and what a rank has of it."""
+    counted, counts = report["counted"], dict(report["counts"])
+    how = "counted" if counted == partition.cells.sum() else f"scaled from a lattice of {counted} cells"
+    print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
+    print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
+    _, file = counts.popitem()
+    for name, row in counts.items():
+        print(f"{name:{WIDTH}}{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}")
     positions = f"positions of {scene.stored} frames, file [GB]"
-    print(f"{positions:{WIDTH}}{24 * scene.stored * partition.nodes.sum() / GB:15.3g}")
+    print(f"{positions:{WIDTH}}{file['all'] / GB:15.3g}")
 
 
 def print_budget(scene: Scene) -> None:
@@ -103,10 +128,10 @@ def print_budget(scene: Scene) -> None:
         print(f"  expected of {budget.count} cells and steps of {budget.time_step:g} s, not of what the scene has now")
 
 
-def print_needs(
+def needs_of(
     args: argparse.Namespace, scene: Scene, surface: "Surface", partition: "Partition", mesh: float
-) -> None:
-    """Print memory and time, and what they rest on; ``mesh``: bytes that preparing the surface took."""
+) -> dict[str, Any]:
+    """Return memory [byte] and time of a frame [s], and what they rest on; ``mesh``: bytes that its surface took."""
     from msmpetsc.study.forecast import Network, forecast
 
     options, cells = shlex.join(args.petsc_options), partition.cells.sum()
@@ -118,25 +143,34 @@ def print_needs(
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
     memory = expected.memory(partition, len(surface.points) if scene.output.surface else 0, mesh)
-    print(f"{'memory [GB]':{WIDTH}}{memory.sum() / GB:15.3g}{memory.mean() / GB:15.3g}{memory.max() / GB:15.3g}")
     every, network = scene.output.every, Network(args.latency, args.bandwidth)
-    computing, messages = every * expected.computing(partition), every * expected.messages(partition, network)
     trials = expected.coarse, expected.fine
     explicit = scene.time.integrator == "verlet"
     first, second = (f"{t.iterations if explicit else t.its:.1f} on {t.cells:.0f}" for t in trials)
     work = f"{expected.iterations(cells):.1f} {'substeps' if explicit else 'outer ones'} a step"
     work = work if explicit else f"{expected.its(cells):.1f} KSP iterations and {work}"
+    return {
+        "memory": over_ranks(memory),
+        "computing": float(every * expected.computing(partition)),
+        "messages": float(every * expected.messages(partition, network)),
+        "rests on": f"  expected with {work}: the first {args.frames} took {first} cells and {second},\n"
+        f"  on cores, and memory for each, as here; messages of {network.latency:g} s and {network.bandwidth:g} byte/s "
+        "(--latency, --bandwidth)",
+    }
+
+
+def print_needs(needs: dict[str, Any]) -> None:
+    """Print memory and time, and what they rest on."""
+    memory, computing, messages = needs["memory"], needs["computing"], needs["messages"]
+    print(f"{'memory [GB]':{WIDTH}}{memory['all'] / GB:15.3g}{memory['mean'] / GB:15.3g}{memory['most'] / GB:15.3g}")
     print(
         f"\ntime of a frame {computing + messages:.3g} s: computing {computing:.3g} s, messages {messages:.3g} s; "
-        "without writing it\n"
-        f"  expected with {work}: the first {args.frames} took {first} cells and {second},\n"
-        f"  on cores, and memory for each, as here; messages of {network.latency:g} s and {network.bandwidth:g} byte/s "
-        "(--latency, --bandwidth)"
+        f"without writing it\n{needs['rests on']}"
     )
 
 
-def print_limits(partition: "Partition") -> None:
-    """Print at how many cells of this body, on as many ranks, integers end."""
+def limits_of(partition: "Partition") -> dict[str, dict[str, Any]]:
+    """Return at how many cells of this body, on as many ranks, integers end."""
     from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
 
     petsc = f"{BITS}-bit PetscInt"
@@ -145,11 +179,18 @@ def print_limits(partition: "Partition") -> None:
         "nonzeros of A on a rank": (lambda s: s.nonzeros.max(), LARGEST, petsc),
         "nodes of a rank in one MPI call": (lambda s: (s.nodes + s.ghosts).max(), LARGEST_COUNT, "MPI's int"),
     }
+    return {
+        name: {"limit": limit, "integer": integer, "cells": largest(partition, count, limit)}
+        for name, (count, limit, integer) in ends.items()
+    }
+
+
+def print_limits(limits: dict[str, dict[str, Any]], partition: "Partition") -> None:
+    """Print where integers end, and whether that is before the cells of this scene."""
     print()
-    for name, (count, limit, integer) in ends.items():
-        cells = largest(partition, count, limit)
-        too_few = "" if cells >= partition.cells.sum() else ", fewer than here: run refuses or fails"
-        print(f"{name} end at {limit} ({integer}): {cells:.3g} cells{too_few}")
+    for name, end in limits.items():
+        too_few = "" if end["cells"] >= partition.cells.sum() else ", fewer than here: run refuses or fails"
+        print(f"{name} end at {end['limit']} ({end['integer']}): {end['cells']:.3g} cells{too_few}")
 
 
 def largest(partition: "Partition", count: Callable[["Partition"], float], limit: int) -> float:

@@ -1,14 +1,17 @@
 """``msmpetsc plan``: the cheapest way to simulate a scene to an error."""
 
 import argparse
+import json
 import shlex
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msmpetsc.cli.arguments import (
     PICTURE_NAMES,
@@ -43,9 +46,13 @@ def run(args: argparse.Namespace) -> int:
     if args.surface_error is None and (args.cells or args.chart):
         raise InputError("--cells and --chart are for --surface-error only")
     try:
-        return run_methods(args, target) if args.surface_error is None else run_sizes(args, target)
+        with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
+            met, record = (run_methods if args.surface_error is None else run_sizes)(args, target)
     except OSError as error:  # of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename}: {error.strerror}") from None
+    if args.json:
+        print(json.dumps({"met": met, "target": target, **record}, indent=1))
+    return 0 if met else NOTHING_MEETS
 
 
 @contextmanager
@@ -63,39 +70,41 @@ def bench() -> Iterator["Bench"]:
             processes.stop()
 
 
-def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables" = MappingProxyType({})) -> None:
-    """Print lines to paste and a command that says the same, or change the file."""
+def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables" = MappingProxyType({})) -> str:
+    """Print lines to paste and a command that says the same, or change the file; return the command."""
     from msmpetsc.study.cases import launcher
     from msmpetsc.study.scene_lines import lines, overrides, put_into
 
     print(f"\n{lines(method, more)}\n")
     changes = [word for change in overrides(args.scene, method, more) for word in ("--set", change)]
     options = shlex.split(method.options)
-    print(shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes, *options]), flush=True)
+    command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes, *options])
+    print(command, flush=True)
     if args.write:
         try:
             put_into(args.scene, method, more)
         except OSError as error:
             raise InputError(f"{args.scene}: cannot be written: {error.strerror}") from None
         print(f"\nwritten into {args.scene}")
+    return command
 
 
 # For an error of the trajectory or of a step
 
 
-def run_methods(args: argparse.Namespace, target: float) -> int:
-    """Try methods on the scene's own lattice; return the exit status."""
+def run_methods(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, Any]]:
+    """Try methods on the scene's own lattice; return whether any meets the error, and all as a record."""
     from msmpetsc.study.plan import cheapest
 
     trials = try_all(args, target)
     best = cheapest(trials, target)
     if best is None:
         print_nearest(trials, target)
-        return NOTHING_MEETS
+        return False, {"trials": list(map(asdict, trials))}
     print(f"\ncheapest: {best.cost:.3g} computing seconds a simulated second, error {best.error:.1e}")
     print("each was tried once: how much its time varies is not known")
-    print_command(args, best.method)
-    return 0
+    command = print_command(args, best.method)
+    return True, {"choice": asdict(best), "command": command, "trials": list(map(asdict, trials))}
 
 
 def try_all(args: argparse.Namespace, target: float) -> list:
@@ -136,8 +145,8 @@ def print_nearest(trials: Sequence, target: float) -> None:
 # For an error of the surface
 
 
-def run_sizes(args: argparse.Namespace, target: float) -> int:
-    """Try lattices and steps; return the exit status."""
+def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, Any]]:
+    """Try lattices and steps; return whether the choice meets the error, and all as a record."""
     plan = size_all(args, target)
     if args.chart:
         draw(plan, args.chart, target)
@@ -150,9 +159,9 @@ def run_sizes(args: argparse.Namespace, target: float) -> int:
             "count": choice.cells, "time_step": choice.method.time_step,
         },
     }  # fmt: skip
-    if plan.met:
-        print_command(args, choice.method, more)
-    return 0 if plan.met else NOTHING_MEETS
+    command = print_command(args, choice.method, more) if plan.met else None
+    record = {"choice": asdict(choice), "bounds": plan.bounds, "check": plan.check, "command": command}
+    return plan.met, json.loads(json.dumps(record, default=str))  # of paths the names
 
 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":

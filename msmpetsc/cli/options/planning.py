@@ -1,6 +1,6 @@
 """The arguments of what tries a scene before it is run: ``inspect``, ``plan`` and ``study``."""
 
-from msmpetsc.cli.options.values import Commands, add_set, file_argument, path_argument
+from msmpetsc.cli.options.values import Commands, add_json, add_set, file_argument, path_argument
 
 
 def add_inspect(commands: Commands) -> None:
@@ -19,6 +19,7 @@ def add_inspect(commands: Commands) -> None:
     parser.add_argument("--no-times", action="store_true", help="make none: counts and limits only")
     parser.add_argument("--latency", type=float, default=2e-6, metavar="S", help="of a message [s] (2e-6)")
     parser.add_argument("--bandwidth", type=float, default=1e10, metavar="B", help="of a rank [byte/s] (1e10)")
+    add_json(parser)
 
 
 def add_plan(commands: Commands) -> None:
@@ -44,6 +45,7 @@ def add_plan(commands: Commands) -> None:
     parser.add_argument(
         "--chart", type=file_argument, metavar="OUT.png", help="of --surface-error: draw error over cost of all trials"
     )
+    add_json(parser)
 
 
 def add_study(commands: Commands) -> None:

@@ -1,6 +1,6 @@
 """The arguments of what is done with results: ``compare`` and ``render``."""
 
-from msmpetsc.cli.options.values import Commands, file_argument
+from msmpetsc.cli.options.values import Commands, add_json, file_argument
 
 
 def add_compare(commands: Commands) -> None:
@@ -20,6 +20,7 @@ def add_compare(commands: Commands) -> None:
     parser.add_argument(
         "--shared", action="store_true", help="times that only one of them has do not count as different"
     )
+    add_json(parser)
 
 
 def add_render(commands: Commands) -> None:

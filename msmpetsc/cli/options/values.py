@@ -1,4 +1,4 @@
-"""What the arguments of several commands share: types of their values, and ``--set``."""
+"""What the arguments of several commands share: types of their values, ``--set``, and how much is said."""
 
 import argparse
 import os
@@ -41,3 +41,15 @@ def add_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000"
     )
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``, for programs that read what a command prints."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+
+
+def add_verbosity(parser: argparse.ArgumentParser) -> None:
+    """Add ``--quiet`` and ``--verbose``, which every command has."""
+    said = parser.add_mutually_exclusive_group()
+    said.add_argument("--quiet", action="store_true", help="no notes and no progress; warnings and errors stay")
+    said.add_argument("--verbose", action="store_true", help="notes with the time [s]; of an error where it arose, too")

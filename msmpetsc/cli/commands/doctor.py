@@ -1,0 +1,203 @@
+"""``msmpetsc doctor``: what is installed, and the command that brings what is not.
+
+What could end the process, libraries that do not fit together above all, is loaded in one of its own.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import msmpetsc
+from msmpetsc.cli.arguments import on_first_rank
+from msmpetsc.cli.versions import PYTHON
+from msmpetsc.errors import EXTRAS, one_line
+
+OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
+PATIENCE = 60  # [s] that a library may take to load
+PETSC = """
+import json, numpy
+from petsc4py import PETSc
+has = lambda package: bool(PETSc.Sys.hasExternalPackage(package)) if hasattr(PETSc.Sys, "hasExternalPackage") else None
+print(json.dumps({
+    "version": ".".join(map(str, PETSc.Sys.getVersion())), "bits": 8 * numpy.dtype(PETSc.IntType).itemsize,
+    "scalar": numpy.dtype(PETSc.ScalarType).name, **{name: has(name) for name in ("mumps", "hypre", "cuda")}}))
+"""
+RANKS = "from mpi4py import MPI; print(MPI.COMM_WORLD.size, MPI.Get_library_version().splitlines()[0].strip(chr(0)))"
+DEVICE = """
+import json, cupy
+print(json.dumps([cupy.cuda.runtime.getDeviceProperties(i)["name"].decode()
+                  for i in range(cupy.cuda.runtime.getDeviceCount())]))
+"""
+CACHE = """
+import os
+from pathlib import Path
+import msmpetsc
+from msmpetsc.backend.compiling import cache_is_empty
+print("empty" if cache_is_empty() else "filled", os.environ["NUMBA_CACHE_DIR"])
+"""
+MESHES = """
+from msmpetsc.geometry.registry import MODELS, find
+print(*(name for name in MODELS if find(name)))
+"""
+NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
+
+Finding = tuple[str, str, str]  # what, its state, and in words
+
+
+class Failed(Exception):
+    """A probe that did not end well; the line says how."""
+
+
+def run(_: argparse.Namespace) -> int:
+    """Print a line for each thing; return 1 where a run lacks something that it needs."""
+    if not on_first_rank():
+        return 0
+    needed = (petsc, ranks, results, packages)
+    states = set()
+    for examine in (petsc, ranks, solvers, device, results, kernels, packages, meshes):
+        for what, state, words in examined(examine):
+            print(f"{state:8} {what:16} {words}", flush=True)
+            states |= {state} if examine in needed and what not in OPTIONAL else set()
+    return int(states != {OK})
+
+
+OPTIONAL = {f"extra {name}" for name in EXTRAS if name != "run"}
+
+
+def examined(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """Yield the findings of an examination, whatever happens in it."""
+    try:
+        yield from examine()
+    except Failed as error:
+        yield examine.__name__, BROKEN, str(error)
+    except Exception as error:  # whatever is broken in an installation: it must be named, not end this
+        yield examine.__name__, BROKEN, one_line(error)
+
+
+def installed(package: str) -> bool:
+    """Return whether Python finds a package, without importing it."""
+    try:
+        return find_spec(package) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def said(code: str, *launcher: str) -> str:
+    """Return what a Python of its own prints. Raises Failed."""
+    command = [*launcher, sys.executable, "-c", code]
+    alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
+    try:
+        done = subprocess.run(
+            command, env=alone, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=PATIENCE
+        )
+    except FileNotFoundError:
+        raise Failed(
+            f"there is no {command[0]}: apt install openmpi-bin, or load the module of the cluster's MPI"
+        ) from None
+    except subprocess.TimeoutExpired:
+        raise Failed(f"does not answer within {PATIENCE} s: {' '.join(launcher)}") from None
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        raise Failed(lines[-1][:160] if lines else f"ends with status {done.returncode}")
+    return done.stdout
+
+
+def petsc_facts() -> dict[str, Any]:
+    """Return what PETSc says of itself. Raises Failed."""
+    return json.loads(said(PETSC).splitlines()[-1])
+
+
+def petsc() -> Iterator[Finding]:
+    """PETSc, its integers and its numbers."""
+    if not installed("petsc4py"):
+        yield "PETSc", MISSING, "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'"
+        return
+    facts = petsc_facts()
+    words = f"{facts['version']}, {facts['bits']}-bit integers, {facts['scalar']}"
+    if facts["scalar"] != "float64":
+        yield "PETSc", BROKEN, f"{words}: a PETSc of real double numbers is needed (--with-scalar-type=real)"
+    else:
+        yield "PETSc", OK, words
+
+
+def ranks() -> Iterator[Finding]:
+    """MPI: whether two ranks meet."""
+    if not installed("mpi4py"):
+        yield "MPI", MISSING, "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'"
+        return
+    oversubscribed = ("--oversubscribe",) if "Open MPI" in said(RANKS) else ()
+    sizes = said(RANKS, "mpiexec", *oversubscribed, "-n", "2").splitlines()
+    size, _, library = sizes[-1].partition(" ")
+    if size == "2":
+        yield "MPI", OK, f"{library.partition(',')[0]}, mpiexec starts ranks that meet"
+    else:
+        yield "MPI", BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI than mpiexec's"
+
+
+def solvers() -> Iterator[Finding]:
+    """Packages that PETSc was configured with: those of some presets."""
+    facts = petsc_facts()
+    uses = {"MUMPS": "the presets fast-msm", "hypre": "-pc_type hypre alone, which no preset has"}
+    for name, use in uses.items():
+        if facts[name.lower()]:
+            yield name, OK, f"for {use}"
+        else:
+            yield name, MISSING, f"for {use}: configure PETSc with --download-{name.lower()}"
+
+
+def device() -> Iterator[Finding]:
+    """A CUDA GPU, and a PETSc that uses it."""
+    if not petsc_facts()["cuda"]:
+        yield "PETSc with CUDA", MISSING, "only for --device cuda: scripts/build_petsc_cuda builds one"
+    else:
+        yield "PETSc with CUDA", OK, "for --device cuda"
+    if not installed("cupy"):
+        yield "GPU", MISSING, "only for --device cuda: pip install 'msmpetsc[cuda]'"
+        return
+    names = json.loads(said(DEVICE))
+    yield "GPU", OK if names else MISSING, ", ".join(names) or "no CUDA device on this machine"
+
+
+def results() -> Iterator[Finding]:
+    """HDF5, as h5py has it."""
+    if not installed("h5py"):
+        yield "HDF5", MISSING, "pip install h5py"
+        return
+    version, parallel = said("import h5py; print(h5py.version.hdf5_version, h5py.get_config().mpi)").split()
+    yield "HDF5", OK, f"{version}, {'with' if parallel == 'True' else 'without'} MPI (either will do)"
+
+
+def kernels() -> Iterator[Finding]:
+    """The cache of compiled kernels."""
+    state, folder = said(CACHE).strip().split(" ", 1)
+    nearest = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
+    if not os.access(nearest, os.W_OK):
+        yield "kernels", MISSING, f"{nearest} cannot be written, each run compiles anew: export NUMBA_CACHE_DIR=FOLDER"
+    else:
+        yield "kernels", OK, "compiled" if state == "filled" else "not yet compiled: the first run takes a minute more"
+
+
+def packages() -> Iterator[Finding]:
+    """The packages of each extra."""
+    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {Path(msmpetsc.__file__).parent}, {PYTHON}"
+    for extra, names in EXTRAS.items():
+        gone = [name for name in names if not installed(name)]
+        if gone and not (extra in NO_INSTALL and len(gone) == len(names)):
+            yield f"extra {extra}", MISSING, f"{', '.join(gone)}: pip install 'msmpetsc[{extra}]'"
+        elif not gone:
+            yield f"extra {extra}", OK, ", ".join(names)
+
+
+def meshes() -> Iterator[Finding]:
+    """Models of the registry that lie on this machine."""
+    names = said(MESHES).split()
+    if names:
+        yield "meshes", OK, f"{len(names)} named models: {', '.join(names)}"
+    else:
+        yield "meshes", MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list"

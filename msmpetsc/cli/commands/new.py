@@ -1,0 +1,73 @@
+"""``msmpetsc new``: a first scene for a mesh of one's own, or a copy of one that comes with msmpetsc."""
+
+import argparse
+import json
+from pathlib import Path
+
+from msmpetsc.cli.arguments import SCENE_NAMES, refuse_other_format, refuse_ranks
+from msmpetsc.errors import InputError, printable
+from msmpetsc.geometry.registry import MODELS, load
+from msmpetsc.geometry.surface import check_encloses, examine
+from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
+from msmpetsc.scene.reading import lies_below, scene_of
+from msmpetsc.scene.shipped import shipped_text, shipped_titles
+from msmpetsc.study.drafting.draft import draft
+from msmpetsc.study.drafting.measures import measured
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the scene, or list those that come with msmpetsc; return the exit status."""
+    refuse_ranks("new", "it measures a mesh on one process")
+    if args.list:
+        titles = shipped_titles()
+        print("\n".join(f"{name:{max(map(len, titles))}}  {title}" for name, title in titles.items()))
+        return 0
+    if args.scene is None or (args.mesh is None) == (args.from_scene is None):
+        raise InputError(
+            "new takes the scene's name and --mesh MESH or --from NAME: msmpetsc new my.toml --mesh my.ply"
+        )
+    refuse_other_format("new", args.scene, SCENE_NAMES)
+    if args.scene.exists() and not args.overwrite:
+        raise InputError(f"{args.scene} exists already: --overwrite replaces it")
+    if args.from_scene is not None:
+        text = f"#:schema {SCHEMA_FILE}\n{shipped_text(args.from_scene)}"
+    else:
+        text = drafted(args.mesh, args.scene)
+    scene_of(args.scene, text, to_read=False)  # so that nothing is written that run would refuse
+    write(args.scene, text)
+    print(f"{args.scene}\nto run it: msmpetsc run {args.scene} --picture")
+    return 0
+
+
+def drafted(mesh: str, scene: Path) -> str:
+    """Return the text of a scene for a mesh, a file or a registry name. Raises InputError."""
+    if mesh in MODELS:
+        source, suffix, surface = mesh, "", load(mesh, scene.parent)
+    else:
+        source, suffix = beside(mesh, scene), Path(mesh.removesuffix(".gz")).suffix
+        surface = load(source, scene.parent)
+    check_encloses(surface, examine(surface))
+    return draft(source, scene.stem, measured(surface, suffix))
+
+
+def beside(mesh: str, scene: Path) -> str:
+    """Return the path of a mesh from the folder of its scene, in or below which it must be. Raises InputError."""
+    folder, path = scene.parent, Path(mesh)
+    if not path.exists():
+        load(mesh, Path())  # says what it is not
+    if not lies_below(folder, str(path.resolve())):
+        raise InputError(
+            f"{printable(mesh)} is not in {folder.resolve()}, nor below it, where a scene has its meshes: "
+            "write the scene beside its mesh"
+        )
+    return str(path.resolve().relative_to(folder.resolve()))
+
+
+def write(path: Path, text: str) -> None:
+    """Write the scene, and beside it the schema that its first line names. Raises InputError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        path.with_name(SCHEMA_FILE).write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be written: {error.strerror}") from None

@@ -1,0 +1,166 @@
+"""A first scene for a mesh: each value with its reason, to run at once and to be changed.
+
+The body either falls on the ground or, long and lying, is clamped at one end and bends under its weight. Young's
+modulus follows from the size, so that any body deforms visibly; the step from the period of its slowest motion.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.scene.keys import SCHEMA_FILE
+from msmpetsc.study.drafting.measures import MeshMeasures
+
+G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]
+USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
+SLENDER = 2.5  # times its other sides: so long a body is a beam
+DROP = 0.2  # of the height, that a body falls
+ACROSS, CELLS = 3, (1000, 8000)  # cells across the mean thickness, within these counts
+SINKING = 50  # rho g H in Young's modulus, of a body that falls
+SAG, CLAMPED = 0.15, 0.05  # of a beam's length: what its end sinks by, what is clamped
+STEPS_A_PERIOD, PERIODS = 40, 3
+DEBRIS = 0.01  # of the area: all parts but the largest together
+COLUMN = 39  # where comments begin
+MOST_PLAIN = 10_000  # larger numbers have an exponent
+GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
+
+
+@dataclass(frozen=True)
+class Body:
+    """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
+
+    sides: np.ndarray
+    thickness: float
+    volume: float
+
+    @property
+    def axis(self) -> int | None:
+        """The horizontal axis along which the body is a beam; None for any other."""
+        along = int(np.argmax(self.sides))
+        return along if along < 2 and self.sides[along] >= SLENDER * np.delete(self.sides, along).max() else None
+
+
+def draft(source: str, title: str, mesh: MeshMeasures) -> str:
+    """Return the text of a scene for a mesh, ``source`` as the scene will name it."""
+    unit = mesh.unit or USUAL_SIZE / mesh.sides.max()
+    sides = unit * (mesh.sides[[0, 2, 1]] if mesh.y_up else mesh.sides)
+    body = Body(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
+    head = [
+        f"#:schema {SCHEMA_FILE}",
+        "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
+        f"title = {quoted(title)}",
+    ]
+    mesh_lines, cages = _mesh(source, mesh, body), _cages(body)
+    moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
+    return "\n".join([*head, "", *mesh_lines, "", *cages, "", *moved]) + "\n"
+
+
+def _mesh(source: str, mesh: MeshMeasures, body: Body) -> list[str]:
+    """Return the table of the mesh, and what is wrong with it."""
+    report, longest = mesh.report, float(body.sides.max())
+    parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
+    state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
+    lines = ["[mesh]", line(f"source = {quoted(source)}", f"{mesh.triangles} triangles, {state}, {parts}")]
+    steps, reasons = [], []
+    if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
+        steps.append('"largest_part"')
+        reasons.append(f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area")
+    if report.inconsistent_edges or report.volume < 0:
+        steps.append('"orient"')
+        reasons.append("faces are wound inwards, or against each other")
+    if mesh.y_up:
+        steps.append("{ rotate = { axis = [1, 0, 0], degrees = 90 } }")
+        reasons.append("y seems to point upwards in the file, and z does here")
+    if steps:
+        lines += [*(f"# {reason}" for reason in reasons), f"prepare = [{', '.join(steps)}]"]
+    if not report.closed:
+        lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
+    if len(mesh.parts) > 1 and '"largest_part"' not in steps:
+        lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
+    guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
+    lines.append(line(f"size = {plain(longest, 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}"))
+    if body.axis is None:
+        drop = plain(DROP * body.sides[2], 2)
+        lines.append(
+            line(f"base = [0, 0, {drop}]", "middle of the bottom at the start [m]: it falls a fifth of its height")
+        )
+    return lines
+
+
+def _cages(body: Body) -> list[str]:
+    aim = body.volume * (ACROSS / body.thickness) ** 3
+    count = int(plain(min(max(aim, CELLS[0]), CELLS[1]), 1))
+    across = body.thickness * (count / body.volume) ** (1 / 3)
+    return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
+
+
+def _falling(body: Body) -> list[str]:
+    """Return the tables of a body that falls on the ground."""
+    height = float(body.sides[2])
+    young = SINKING * DENSITY * G * height
+    period = 4 * height / math.sqrt(young / DENSITY)  # of waves along the height
+    fall = math.sqrt(2 * DROP * height / G)
+    ground = [
+        "[[obstacle]]",
+        line('shape = "plane"', "the ground: the body is no beam that lies, so it falls rather than hangs"),
+        line("point = [0, 0, 0]", "[m]"),
+        line("normal = [0, 0, 1]", "towards the free side"),
+        line('response = "penalty"', 'or "reflect", from which it leaps'),
+        line("friction = 0.5", "Coulomb's coefficient"),
+    ]
+    material = _material(young, f"its own weight presses it together by about {100 / SINKING:g}%")
+    return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
+
+
+def _clamped(body: Body, axis: int) -> list[str]:
+    """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
+    length, thick = float(body.sides[axis]), float(body.sides[2])
+    young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight
+    period = 2 * math.pi * length**2 / (3.516 * thick) * math.sqrt(12 * DENSITY / young)
+    normal = ["0", "0", "0"]
+    normal[axis] = "-1"
+    point = ["0", "0", "0"]
+    point[axis] = f"{CLAMPED:g}"
+    region = f"half_space = {{ point = [{', '.join(point)}], normal = [{', '.join(normal)}] }}, relative = true"
+    pin = [line("[[pin]]", "the body is long and lies: one end does not move"), f"region = {{ {region} }}"]
+    material = _material(young, f"its end would sink by about {100 * SAG:g}% of its length")
+    return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]
+
+
+def _material(young: float, effect: str) -> list[str]:
+    return [
+        "[material]",
+        line(f"young_modulus = {plain(young, 1)}", f"[Pa]; {effect}"),
+        line(f"density = {plain(DENSITY, 4)}", "[kg/m^3], as water"),
+    ]
+
+
+def _time(duration: float, period: float) -> list[str]:
+    """Return the table of time for a motion whose slowest part has this period [s]."""
+    step = float(plain(period / STEPS_A_PERIOD, 1))
+    return [
+        "[time]",
+        line(f"step = {step:g}", f"[s]; the slowest motion takes about {period:.2g} s"),
+        line(f"duration = {step * math.ceil(duration / step):.6g}", "[s]"),
+    ]
+
+
+def line(setting: str, comment: str) -> str:
+    """Return a line of TOML with a comment, which begins in its column where there is room."""
+    return f"{setting:{COLUMN - 1}} # {comment}"
+
+
+def plain(value: float, digits: int) -> str:
+    """Return a number of so many digits as a person writes it in TOML: 3000, 0.12, 3e5."""
+    rounded = float(f"{value:.{digits}g}")
+    if abs(rounded) < MOST_PLAIN:
+        return f"{rounded:.{max(digits, 4)}g}"
+    mantissa, exponent = f"{rounded:e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
+
+
+def quoted(text: str) -> str:
+    """Return a text as a string of TOML."""
+    return json.dumps(text, ensure_ascii=False)

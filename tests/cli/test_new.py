@@ -1,0 +1,139 @@
+"""``msmpetsc new``: what it measures of a mesh, and that the scene which it writes runs at once."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ROOT
+
+import msmpetsc
+from msmpetsc.cli.main import main
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.study.drafting.measures import measured, unit_of
+
+
+def surface(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+
+
+def bottle(axis: int) -> trimesh.Trimesh:
+    """A cone that stands on its base, its tip along this axis."""
+    cone = trimesh.creation.cone(radius=1, height=2)
+    turn = {1: trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]), 2: np.eye(4)}[axis]
+    return cone.apply_transform(turn)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_the_upward_axis_is_the_one_on_which_the_body_stands(axis: int):
+    assert measured(surface(bottle(axis))).y_up == (axis == 1)
+
+
+def test_gltf_has_y_upwards_by_definition_and_a_ball_has_z():
+    ball = surface(trimesh.creation.icosphere(subdivisions=2))
+    assert measured(ball, ".glb").y_up and not measured(ball, ".ply").y_up
+
+
+@pytest.mark.parametrize(("side", "unit"), [(0.3, 1.0), (15.0, 1.0), (150.0, 1e-3), (1e-5, None), (1e6, None)])
+def test_the_unit_is_the_one_in_which_the_body_has_a_usual_size(side: float, unit: float | None):
+    assert unit_of(side) == unit
+
+
+def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
+    two = trimesh.util.concatenate(
+        [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
+    )
+    assert measured(surface(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
+    assert measured(surface(trimesh.creation.box([6, 6, 6]))).thickness == pytest.approx(
+        2
+    )  # 2 V / A of a cube: a third
+
+
+BODIES = {
+    "ball": (trimesh.creation.icosphere(subdivisions=2, radius=0.1), ["obstacle"], "as in the file"),
+    "mm": (trimesh.creation.icosphere(subdivisions=2, radius=40), ["obstacle"], "the file has mm"),
+    "bar": (trimesh.creation.box([0.1, 0.5, 0.1]), ["pin"], "as in the file"),
+    "inwards": (trimesh.creation.box([0.1, 0.1, 0.1]), ["obstacle"], "wound inwards"),
+}
+
+
+@pytest.mark.timeout(200)
+@pytest.mark.parametrize("name", BODIES)
+def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mesh, tables, words = BODIES[name]
+    if name == "inwards":
+        mesh.invert()
+    mesh.export(f"{name}.stl")
+    assert main(["new", "my.toml", "--mesh", f"{name}.stl"]) == 0
+    assert "msmpetsc run my.toml" in capsys.readouterr().out
+    text = Path("my.toml").read_text()
+    assert text.startswith(f"#:schema {SCHEMA_FILE}\n") and words in text
+    assert json.loads(Path(SCHEMA_FILE).read_text()) == json.loads(json.dumps(json_schema()))
+    scene = load_scene("my.toml")
+    assert [kind for kind in ("obstacle", "pin") if getattr(scene, kind)] == tables
+    size = scene.mesh.size
+    assert size is not None and 0.01 < size < 1
+    assert main(["run", "my.toml", "-o", "my.h5", "--set", "cages.count=300", "--quiet"]) == 0
+    with msmpetsc.open("my.h5") as run:
+        moved = np.linalg.norm(run.frames.position[-1] - run.lattice.nodes[:], axis=1).max()
+        fallen = 0.2 * size if tables == ["obstacle"] else 0.05 * size
+        assert fallen * 0.5 < moved < size, "it falls on the ground, or its end sinks"
+
+
+def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Path, monkeypatch, capsys):
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path / "there")
+    shutil.copy(ball, "ball.ply")
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export("flat.ply")
+    refused = {
+        "which": ["new", "my.toml"],
+        "takes": ["new", "--mesh", "ball.ply"],
+        "is named *.toml": ["new", "my.txt", "--mesh", "ball.ply"],
+        "no file": ["new", "my.toml", "--mesh", "gone.ply"],
+        "encloses no volume": ["new", "my.toml", "--mesh", "flat.ply"],
+        "nor below it": ["new", "my.toml", "--mesh", str(ball)],
+        "did you mean 'bunny_fall'": ["new", "my.toml", "--from", "bunny_fal"],
+    }
+    refused["takes the scene's name"] = refused.pop("which")
+    for words, command in refused.items():
+        assert main(command) == 2, command
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1 and words in told[0], told
+    assert sorted(os.listdir()) == ["ball.ply", "flat.ply"]
+    Path("my.toml").write_text("mine")
+    assert main(["new", "my.toml", "--mesh", "ball.ply"]) == 2 and Path("my.toml").read_text() == "mine"
+    assert main(["new", "my.toml", "--mesh", "ball.ply", "--overwrite"]) == 0
+
+
+def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
+    assert main(["new", "--list"]) == 0 and "bunny_fall " in capsys.readouterr().out
+    assert main(["new", str(tmp_path / "my.toml"), "--from", "bunny_fall"]) == 0
+    shipped = (ROOT / "scenes" / "bunny_fall.toml").read_text()
+    assert (tmp_path / "my.toml").read_text() == f"#:schema {SCHEMA_FILE}\n{shipped}"
+
+
+def test_the_wheel_holds_the_scenes_though_the_clone_has_them_once(tmp_path: Path):
+    assert (ROOT / "msmpetsc" / "shipped").is_symlink()
+    tree = tmp_path / "tree"
+    shutil.copytree(ROOT, tree, symlinks=True, ignore=lambda folder, names: [
+        name for name in names if name.startswith(".") or name in ("out", "tests", "build", "__pycache__")
+        or name.endswith((".egg-info", ".png"))
+    ])  # fmt: skip
+    project = (tree / "pyproject.toml").read_text()  # an older setuptools knows no licence by its name
+    (tree / "pyproject.toml").write_text(re.sub(r"^license.*\n", "", project, flags=re.M))
+    build = "from setuptools import build_meta; build_meta.build_wheel('..')"
+    done = subprocess.run([sys.executable, "-c", build], cwd=tree, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
+    for path in (ROOT / "scenes").glob("*.toml"):
+        assert f"msmpetsc/shipped/{path.name}" in names

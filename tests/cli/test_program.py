@@ -1,0 +1,164 @@
+"""What is about the program itself: doctor, completion, examples, quiet and verbose, mistaken words."""
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from block_scene import block_scene
+from conftest import ENVIRONMENT
+from test_extras import without
+
+from msmpetsc.cli.arguments import COMMANDS, command_parser, option_names, parsed
+from msmpetsc.cli.commands import doctor
+from msmpetsc.cli.main import main
+from msmpetsc.cli.options.examples import EXAMPLES
+
+ONCE = {"step": 0.01, "duration": 0.01}
+
+
+def test_every_command_has_examples_that_are_command_lines(capsys):
+    assert set(EXAMPLES) == set(COMMANDS)
+    for name, examples in EXAMPLES.items():
+        for example in examples:
+            words = shlex.split(example.partition(" > ")[0])
+            assert words[0] == "msmpetsc" and parsed(words[1:]).command == name
+        with pytest.raises(SystemExit):
+            parsed([name, "--help"])
+        shown = capsys.readouterr().out
+        assert all(f"\n  {example}\n" in shown for example in examples), "the lines are kept whole"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["rnu", "scene.toml"], "rnu is no command, did you mean 'run'?"),
+        (["comparee"], "did you mean 'compare'?"),
+        (["scene.toml"], "did you mean 'msmpetsc run scene.toml'?"),
+        (["xyzzy"], "xyzzy is no command: new, run, "),
+        ([], "required: COMMAND"),
+    ],
+)
+def test_a_mistaken_command_is_told_the_one_that_is_meant(words: list[str], expected: str, capsys):
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert expected in line
+
+
+def test_a_study_given_to_run_is_named_as_one(tmp_path: Path, capsys):
+    study = tmp_path / "study.toml"
+    study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
+    assert main(["run", str(study)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(f"{study} is a study, no scene: msmpetsc study {study}")
+
+
+def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
+    scene = str(block_scene(tmp_path, time=ONCE))
+    assert main(["run", scene, "-o", str(tmp_path / "q.h5"), "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--verbose"]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if "note" in line]
+    assert notes and all(line.startswith("msmpetsc: note [") and " s]: " in line for line in notes)
+    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--verbose"]) == 2
+    shown = capsys.readouterr().err
+    assert "Traceback" in shown and "InputError" in shown, "where the refusal arose"
+    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--quiet", "--verbose"]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_knows_all_commands_and_options_and_the_shell_takes_it(shell: str, tmp_path: Path, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(name in script for name in COMMANDS)
+    dashes = (name.removeprefix("--") if shell == "fish" else name for name in option_names("run"))
+    assert all(name in script for name in dashes if not name.startswith("-h"))
+    if shutil.which(shell):
+        (tmp_path / "script").write_text(script)
+        assert subprocess.run([shell, "-n", str(tmp_path / "script")]).returncode == 0
+
+
+def test_bash_completes_commands_and_files(tmp_path: Path, capsys):
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    (tmp_path / "my_scene.toml").write_text("")
+    function = "source ./script; complete -p msmpetsc | sed 's/.*-F \\([^ ]*\\).*/\\1/'"
+    ask = f"f=$({function}); source ./script; COMP_WORDS=(msmpetsc run my_); COMP_CWORD=2; $f; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split() == ["my_scene.toml"], done.stderr
+    done = subprocess.run(
+        ["bash", "-c", ask.replace("run my_", "insp").replace("COMP_CWORD=2", "COMP_CWORD=1")],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["inspect"], done.stderr
+
+
+@pytest.mark.timeout(200)
+def test_doctor_finds_a_sound_installation_sound():
+    done = subprocess.run(
+        [sys.executable, "-m", "msmpetsc", "doctor"], env=ENVIRONMENT, capture_output=True, text=True, timeout=180
+    )
+    states = {line[9:26].strip(): line[:8].strip() for line in done.stdout.splitlines()}
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {"PETSc", "MPI", "MUMPS", "hypre", "PETSc with CUDA", "GPU", "HDF5", "kernels", "meshes"} <= set(states)
+    assert all(states[name] == "ok" for name in ("PETSc", "MPI", "HDF5", "extra run")) and "BROKEN" not in done.stdout
+
+
+def test_doctor_names_what_is_missing_and_does_not_crash():
+    done = without(("mpi4py", "petsc4py", "pyvista", "h5py"), "doctor")
+    assert done.returncode == 1 and done.stderr == "", done.stderr
+    assert "Traceback" not in done.stdout
+    lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
+    assert lines["PETSc"].startswith("missing") and "apt install python3-petsc4py" in lines["PETSc"]
+    assert lines["MPI"].startswith("missing") and lines["HDF5"].startswith("missing")
+    assert "pip install 'msmpetsc[render]'" in lines["extra render"]
+
+
+def test_a_probe_that_dies_is_one_line(monkeypatch):
+    monkeypatch.setattr(doctor, "PETSC", "import os, sys; print('cannot load libpetsc', file=sys.stderr); os.abort()")
+    assert list(doctor.examined(doctor.petsc)) == [("petsc", doctor.BROKEN, "cannot load libpetsc")]
+    monkeypatch.setattr(doctor, "PATIENCE", 0.5)
+    monkeypatch.setattr(doctor, "PETSC", "import time; time.sleep(60)")
+    ((_, state, words),) = doctor.examined(doctor.petsc)
+    assert state == doctor.BROKEN and "does not answer within" in words
+
+
+def test_ranks_that_do_not_meet_are_noticed(monkeypatch):
+    monkeypatch.setattr(doctor, "RANKS", "print(1, 'Open MPI v9')")
+    ((_, state, words),) = doctor.ranks()
+    assert state == doctor.BROKEN and "another MPI" in words
+
+
+def test_all_commands_have_quiet_and_verbose():
+    assert all({"--quiet", "--verbose"} <= set(option_names(name)) for name in COMMANDS)
+    assert command_parser().parse_args(["run", "x.toml"]).quiet is False
+
+
+def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
+    scene = str(block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0, 0, -1]}))
+    files = [str(tmp_path / f"{name}.h5") for name in "ab"]
+    for file, frames in zip(files, "21", strict=True):
+        assert main(["run", scene, "-o", file, "--frames", frames, "--quiet"]) == 0
+    assert main(["compare", files[0], files[0], "--json"]) == 0
+    same = json.loads(capsys.readouterr().out)
+    assert same["agree"] and same["frames"] == 3 and same["fields"]["position"]["error"] == 0
+    assert main(["compare", *files, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["agree"] is False, "one lacks a frame"
+    assert main(["inspect", scene, "--ranks", "2", "--no-times", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["counts"]["cells"]["all"] == 32 and shown["counts"]["cells"]["mean"] == 16
+    assert all(end["cells"] > 1e6 for end in shown["limits"].values())
+
+
+@pytest.mark.timeout(200)
+def test_a_plan_says_its_choice_as_json_and_its_trials_on_stderr(tmp_path: Path, capfd):
+    scene = str(block_scene(tmp_path, time={"step": 0.01, "duration": 0.05}, start={"scale": [1.0, 1.0, 1.1]}))
+    assert main(["plan", scene, "--step-error", "0.1", "--frames", "2", "--json"]) == 0
+    out, err = capfd.readouterr()
+    plan = json.loads(out)
+    assert plan["met"] and plan["choice"] in plan["trials"] and plan["choice"]["error"] < 0.1
+    assert plan["command"].startswith("msmpetsc run") and "step error" in err

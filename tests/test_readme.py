@@ -31,7 +31,7 @@ ELSEWHERE = {"pip", "python", "module", "export", "./configure", "eval"}
 SMALLER = {  # a command's words -> those of the test
     "cages.count=3000": "cages.count=400 --frames 4",
     "run scenes/bunny_fall.toml --overwrite": "run scenes/bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
-    "scene.toml --picture": "scene.toml --picture --overwrite --frames 2 --set cages.count=200",
+    "my.toml --picture": "my.toml --picture --frames 2 --set cages.count=200",
     "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500 --no-times",
     "--frames 0,100,200": "--frames 0,2,4",
     "--count 12": "--count 3",
@@ -145,7 +145,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.timeout(300)
 def test_commands_of_the_front_door_run(clone: Path):
     names = {path.name for path in (clone / "out").iterdir()}
-    assert {"coarse.h5", "coarse.xdmf", "coarse.png", "loose.h5", "scene.h5", "scene.png", "bunny_fall.h5"} <= names
+    assert {"coarse.h5", "coarse.xdmf", "coarse.png", "loose.h5", "my.h5", "my.png", "bunny_fall.h5"} <= names
 
 
 @pytest.mark.slow

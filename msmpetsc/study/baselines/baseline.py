@@ -1,0 +1,183 @@
+"""Numbers of a scene that are stored, and held against those of a later run.
+
+Each step is solved to 1e-9, so that neither the number of ranks nor the way in which a step is solved shows. Counts
+must be equal, the numbers of the last frame within the tolerance.
+
+Tolerance. A step solved to the relative error e leaves e |x* - y| in x, |x* - y| being at most about the largest
+displacement D. What goes on from there carries it along in y = 2 q_n - q_(n-1): after N steps it is e D N (N + 1) / 2.
+Ten times as much is allowed, for contact and buckling make differences grow; twice that in energies and momentum, in
+which errors of x count double. Positions are relative to D, energies to the largest of the run (the potential one
+counted from the start), momentum to that of the whole mass at the largest kinetic energy.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import msmpetsc
+from msmpetsc.errors import InputError
+from msmpetsc.study.process import environment, last_error
+
+ERROR = 1e-9  # of each step, relative
+GROWTH = 10  # of an error, by contact and buckling
+ENERGIES = ("kinetic", "elastic", "potential", "contact")
+NODES = 5  # whose places are stored, evenly spread by their numbers
+HEAD = f"{'scene':20} {'cells':>6} {'nodes':>6} {'springs':>8} {'off by':>9} {'allowed':>9} {'time':>7}"
+Numbers = dict[str, Any]  # as stored: "run", "counts", "scales" by unit, "numbers" by name
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a scene is run for its numbers.
+
+    cells   : valid cells asked for; None where the scene's own are meant
+    steps   : from the start
+    changes : of the scene, as ``--set`` takes them
+    """
+
+    cells: int | None
+    steps: int
+    changes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, stored: Numbers) -> "Recipe":
+        """Return the recipe by which stored numbers were made."""
+        run = stored["run"]
+        return cls(run["cells asked for"], int(run["steps"]), tuple(run["changes"]))
+
+    def record(self) -> dict[str, Any]:
+        """Return it as it is stored."""
+        return {
+            "cells asked for": self.cells, "error": ERROR, "steps": self.steps, "changes": list(self.changes),
+        }  # fmt: skip
+
+
+def simulate(scene: Path, recipe: Recipe, path: Path, ranks: int) -> None:
+    """Run a scene by its recipe into a result file. Raises RuntimeError with the last line where the run fails."""
+    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+    cells = [] if recipe.cells is None else [f"cages.count={recipe.cells}"]
+    options = [*cells, "output.surface=false", *recipe.changes]
+    command = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", path, "--overwrite", "--frames", recipe.steps]
+    command += ["--error", ERROR, *(word for option in options for word in ("--set", option))]
+    done = subprocess.run(
+        [*launcher, *map(str, command)], env=environment(), stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise RuntimeError(last_error(done.stderr) or f"exit status {done.returncode}")
+
+
+def summary(path: Path, recipe: Recipe) -> Numbers:
+    """Return what is stored of a run: its recipe, counts, what errors are relative to, the last frame's numbers."""
+    with msmpetsc.open(path) as result:
+        lattice, frames = result.lattice, result.frames
+        rest, mass = lattice.nodes[:], lattice.mass[:]
+        moved = max(np.linalg.norm(q - rest, axis=1).max() for q in frames.position)
+        energies, q = {name: frames[name][:] for name in ENERGIES}, frames.position[-1]
+        counts = {name: len(lattice[name]) for name in ("cells", "nodes", "springs", "pinned")}
+        counts["frames"] = len(frames.time)
+        momentum = frames.momentum[-1]
+    scales = {
+        "m": moved,
+        "J": max(np.abs(values - (values[0] if name == "potential" else 0)).max() for name, values in energies.items()),
+        "kg m/s": np.sqrt(2 * mass.sum() * energies["kinetic"].max()),
+    }
+    numbers = _numbers(q, mass, energies, momentum)
+    return {
+        "run": recipe.record(),
+        "counts": counts,
+        "scales": {unit: float(scale) for unit, scale in scales.items()},
+        "numbers": {
+            name: {"unit": unit, "value": np.asarray(value).tolist()} for name, (unit, value) in numbers.items()
+        },
+    }
+
+
+def _numbers(
+    q: np.ndarray, mass: np.ndarray, energies: dict[str, np.ndarray], momentum: np.ndarray
+) -> dict[str, tuple[str, Any]]:
+    """Return unit and value of each number of the last frame; q (n, 3) [m], mass (n,) [kg]."""
+    some = np.linspace(0, len(q) - 1, NODES).astype(int)
+    numbers: dict[str, tuple[str, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
+    numbers |= {"momentum": ("kg m/s", momentum), "centre of mass": ("m", mass @ q / mass.sum())}
+    numbers |= {"lowest corner": ("m", q.min(axis=0)), "highest corner": ("m", q.max(axis=0))}
+    return numbers | {f"node {node}": ("m", q[node]) for node in some}
+
+
+def allowed(steps: int, unit: str) -> float:
+    """Return the relative difference that the errors of so many steps may come to."""
+    return GROWTH * ERROR * steps * (steps + 1) / 2 * (1 if unit == "m" else 2)
+
+
+def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
+    """Yield of each number what it is called, how far it is off, relative, and how much is allowed."""
+    steps = stored["run"]["steps"]
+    for name in found["numbers"].keys() | stored["numbers"].keys():
+        one, other = found["numbers"].get(name), stored["numbers"].get(name)
+        if (
+            one is None
+            or other is None
+            or one["unit"] != other["unit"]
+            or np.shape(one["value"]) != np.shape(other["value"])
+        ):
+            yield name, np.inf, 0.0
+            continue
+        apart = np.abs(np.subtract(one["value"], other["value"], dtype=float)).max()
+        scale = stored["scales"][one["unit"]]
+        relative = 0.0 if apart == 0 else float(apart / scale) if scale > 0 else np.inf
+        yield name, np.inf if np.isnan(relative) else relative, allowed(steps, one["unit"])
+
+
+def judged(found: Numbers, stored: Numbers) -> dict[str, str]:
+    """Return for each count and number what is wrong with it, nothing for what is as stored."""
+    lines = {}
+    for name in found["counts"].keys() | stored["counts"].keys():
+        now, then = found["counts"].get(name), stored["counts"].get(name)
+        lines[name] = "" if now == then else f"{name}: {now}, stored {then}"
+    for name, off, most in differences(found, stored):
+        now, then = (shown(numbers["numbers"].get(name)) for numbers in (found, stored))
+        lines[name] = f"{name}: {now}, stored {then}: {off:.2g} off, {most:.2g} allowed" if off > most else ""
+    return dict(sorted(lines.items()))
+
+
+def nearest_to_limit(found: Numbers, stored: Numbers) -> tuple[float, float]:
+    """Return how far off the number is that comes nearest to what is allowed of it, and how much that is."""
+    _, off, most = max(differences(found, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf)
+    return off, most
+
+
+def shown(number: dict[str, Any] | None) -> str:
+    """Return a number with its unit."""
+    if number is None:
+        return "not there"
+    return f"{np.array2string(np.asarray(number['value']), precision=9)} {number['unit']}"
+
+
+def row(name: str, counts: dict[str, int], off: tuple[float, float], seconds: float, verdict: str) -> str:
+    """Return the line of a scene under HEAD; ``off``: by how much, and how much is allowed."""
+    sizes = f"{counts['cells']:6} {counts['nodes']:6} {counts['springs']:8}"
+    return f"{name:20} {sizes} {off[0]:9.1e} {off[1]:9.1e} {seconds:5.1f} s {verdict}"
+
+
+def write(path: Path, numbers: Numbers) -> None:
+    """Store numbers. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(numbers, indent=1) + "\n")
+
+
+def read(path: Path) -> Numbers:
+    """Return stored numbers. Raises InputError for what are none."""
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        judged(stored, stored)
+        Recipe.of(stored)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{path} has no numbers of a scene") from None
+    return stored

@@ -1,0 +1,98 @@
+"""``msmpetsc baseline`` and ``msmpetsc check``: a scene of one's own guarded by its numbers."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from block_scene import block_scene
+
+from msmpetsc.cli.main import main
+from msmpetsc.study.baselines.baseline import Recipe, allowed, judged
+
+pytestmark = pytest.mark.timeout(200)
+STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A block on its way down, and its stored numbers."""
+    folder = tmp_path_factory.mktemp("own")
+    fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": {"acceleration": [0, 0, -9.81]}}
+    path = block_scene(folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}])
+    assert main(["baseline", str(path), "--frames", str(STEPS), "--set", "material.density=900.0"]) == 0
+    return path
+
+
+@pytest.fixture
+def numbers(scene: Path) -> Path:
+    """The file of the numbers, which is put back afterwards."""
+    path = scene.with_suffix(".baseline.json")
+    text = path.read_text()
+    yield path
+    path.write_text(text)
+
+
+def test_the_numbers_say_how_they_were_made(numbers: Path):
+    stored = json.loads(numbers.read_text())
+    assert Recipe.of(stored) == Recipe(None, STEPS, ("material.density=900.0",))
+    springs = (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32  # edges, diagonals of faces, of the 4 x 4 x 2 cells
+    assert stored["counts"] == {"cells": 32, "nodes": 75, "springs": springs, "pinned": 25, "frames": STEPS + 1}
+    assert all(not line for line in judged(stored, stored).values())
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_the_same_scene_has_the_same_numbers_on_any_ranks(scene: Path, ranks: int, tmp_path: Path, capfd):
+    junit = tmp_path / "out" / "check.xml"
+    assert main(["check", str(scene), "--ranks", str(ranks), "--junit", str(junit)]) == 0
+    assert capfd.readouterr().out.endswith(" same\n")
+    (suite,) = ElementTree.parse(junit).getroot()
+    assert suite.get("failures") == "0" and int(suite.get("tests")) == len(suite) > 10
+
+
+def test_what_differs_is_named_and_counted(scene: Path, numbers: Path, tmp_path: Path, capfd):
+    stored = json.loads(numbers.read_text())
+    stored["numbers"]["elastic"]["value"] += 2 * allowed(STEPS, "J") * stored["scales"]["J"]
+    stored["numbers"]["highest corner"]["value"][2] += 0.5 * allowed(STEPS, "m") * stored["scales"]["m"]
+    stored["counts"]["pinned"] += 1
+    numbers.write_text(json.dumps(stored))
+    junit = tmp_path / "check.xml"
+    assert main(["check", str(scene), "--json", "--junit", str(junit)]) == 1
+    shown = json.loads(capfd.readouterr().out)
+    wrong = shown["differences"][str(scene)]
+    assert not shown["same"] and [line.partition(":")[0] for line in wrong] == ["elastic", "pinned"]
+    (suite,) = ElementTree.parse(junit).getroot()
+    failed = [case.get("name") for case in suite if case.find("failure") is not None]
+    assert suite.get("failures") == "2" and failed == ["elastic", "pinned"]
+
+
+def test_a_changed_scene_differs(scene: Path, capfd):
+    text = scene.read_text()
+    scene.write_text(text.replace("young_modulus = 100000.0", "young_modulus = 100010.0"))
+    try:
+        assert scene.read_text() != text and main(["check", str(scene)]) == 1
+    finally:
+        scene.write_text(text)
+    out = capfd.readouterr().out
+    assert "DIFFERS" in out and f"{scene}: elastic: " in out
+
+
+def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Path, tmp_path: Path, capsys):
+    other = block_scene(tmp_path, time={"step": 0.01, "duration": 1.0, "error": 1e-2})
+    few = ("--set", "time={step=1e-2, duration=1}")
+    refused = {
+        "nothing is stored of": ["check", str(other)],
+        "--overwrite": ["baseline", str(scene)],
+        "time.error": ["baseline", str(other)],
+        "is named *.xml": ["check", str(scene), "--junit", "x.txt"],
+        "--frames must be at least 1": ["baseline", str(other), "--frames", "0"],
+        "the run failed": ["baseline", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
+    }
+    for words, command in refused.items():
+        assert main(command) == 2, words
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1 and words in told[0], told
+    for text in ("{}", "[1]", "nonsense", '{"run": 1, "counts": {}, "numbers": {}}'):
+        numbers.write_text(text)
+        assert main(["check", str(scene)]) == 2
+        assert f"{numbers} has no numbers of a scene" in capsys.readouterr().err

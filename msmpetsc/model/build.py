@@ -20,9 +20,10 @@ from msmpetsc.model.contact.penalty import Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.initial_state import InitialState, initial_state
 from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.model.loads import Anchor, Load, Motion, spread_by_mass
+from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, spread_by_mass
 from msmpetsc.model.reach import Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
+from msmpetsc.scene.motion import ForceTable
 from msmpetsc.scene.schema import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
@@ -202,7 +203,11 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
     for number, force in enumerate(scene.force):
         where = masks[f"force.{number}"][: lattice.owned]
-        loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
+        if isinstance(force.total, ForceTable):
+            share = spread_by_mass(comm, (1.0,), where, lattice.mass)
+            loads.append(Load(share, force.start, force.stop, LoadTable.of(force.total)))
+        else:
+            loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
 
 

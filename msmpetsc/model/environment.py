@@ -28,25 +28,39 @@ class Environment:
         self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
         nodes = self.lattice.nodes
         self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
-        self._acting: list[bool] = []
+        self._states_of_loads: list[bool | tuple[float, ...]] = []
         self._load = np.zeros((self.lattice.owned, 3), like=nodes)
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
         paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
         times = [time for path in paths for time in path.times.tolist()]
-        times += [time for load in self.loads for time in (load.start, load.stop) if time is not None]
+        times += [time for load in self.loads for time in load.events]
         times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
         return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
 
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
-        acting = [load.acts_at(time) for load in self.loads]
-        if acting != self._acting:
-            self._acting, self._load = acting, np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
-            for load in compress(self.loads, acting):
-                self._load += load.force
+        states = [load.state_at(time) for load in self.loads]
+        if states != self._states_of_loads:
+            self._states_of_loads = states
+            self._load = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
+            for load in compress(self.loads, states):
+                self._load += load.force_at(time)
         return self._load
+
+    def load_beyond(self, time: float, end: float) -> np.ndarray | None:
+        """Return how much more forces (owned, 3) [N] that change pull at a time than at the end of its step; or None.
+
+        None stands for a scene without such forces.
+        """
+        beyond = None
+        for load in self.loads:
+            if load.table is not None:
+                beyond = np.zeros_like(self._load) if beyond is None else beyond
+                if load.acts_at(time) and load.acts_at(end):
+                    beyond += load.force_at(time) - load.force_at(end)
+        return beyond
 
     def anchors_at(self, time: float) -> list[Anchor]:
         """Return the anchors that have not let go."""
@@ -70,7 +84,7 @@ class Environment:
         """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
 
         def at(time: float) -> list:
-            loads = [load.acts_at(time) for load in self.loads]
+            loads = [load.state_at(time) for load in self.loads]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.at(time)) for anchor in self.anchors]
             return [*loads, *anchors, *(o.acts_at(time) and tuple(o.path.at(time)) for o in self.obstacles)]
 
@@ -78,7 +92,7 @@ class Environment:
 
     def last_change(self, until: float) -> float:
         """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
-        times = [time for load in self.loads for time in (load.start, load.stop)]
+        times: list[float | None] = [time for load in self.loads for time in load.events]
         times += [time for anchor in self.anchors for time in (*anchor.path.times.tolist(), anchor.stop)]
         times += [time for o in self.obstacles for time in (*o.path.times.tolist(), o.start, o.stop)]
         return max((time for time in times if time is not None and time <= until), default=0.0)

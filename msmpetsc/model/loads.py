@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.scene.motion import Keyframe
+from msmpetsc.backend.arrays import like
+from msmpetsc.scene.motion import ForceTable, Keyframe
+from msmpetsc.scene.values import Vector
 
 SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
 
@@ -14,6 +16,11 @@ SAME = 1e-12  # relative: a number of steps may come out a little less than the 
 def within(time: float, start: float, stop: float | None) -> bool:
     """Return whether start <= time < stop [s], whatever was rounded; a stop of None never comes."""
     return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
+
+
+def interpolated(time: float, times: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the vector (3,) at a time on straight lines through vectors (k, 3) at ascending times (k,)."""
+    return np.array([np.interp(time, times, along) for along in vectors.T])
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class Motion:
 
     def at(self, time: float) -> np.ndarray:
         """Return the displacement (3,) [m] at a time [s]; after the last time it is that of the last."""
-        return np.array([np.interp(time, self.times, along) for along in self.displacements.T])
+        return interpolated(time, self.times, self.displacements)
 
 
 @dataclass(frozen=True)
@@ -57,23 +64,61 @@ class Anchor:
 
 
 @dataclass(frozen=True)
+class LoadTable:
+    """Total forces (k, 3) [N] at ascending times (k,) [s], straight lines between them."""
+
+    times: np.ndarray
+    totals: np.ndarray
+
+    @classmethod
+    def of(cls, total: Vector | ForceTable) -> "LoadTable":
+        """Return the table of a scene's force; of one that is always the same a table of one time."""
+        if isinstance(total, ForceTable):
+            return cls(np.array(total.times), np.array(total.values))
+        return cls(np.zeros(1), np.array([total]))
+
+    def at(self, time: float) -> np.ndarray:
+        """Return the total force (3,) [N] at a time [s]; before the first and after the last time that of those."""
+        return interpolated(time, self.times, self.totals)
+
+
+@dataclass(frozen=True)
 class Load:
-    """A force of nodes: force (owned, 3) [N], acting while start <= time < stop [s]; None: to the end."""
+    """A force of nodes, acting while start <= time < stop [s]; None: to the end.
+
+    force : (owned, 3) [N]; with a table each node's share (owned, 1) [-] of its total
+    """
 
     force: np.ndarray
     start: float
     stop: float | None
+    table: LoadTable | None = None
 
     def acts_at(self, time: float) -> bool:
         """Return whether the force acts at a time [s]."""
         return within(time, self.start, self.stop)
 
+    def force_at(self, time: float) -> np.ndarray:
+        """Return the force (owned, 3) [N] that acts at a time [s]."""
+        return self.force if self.table is None else self.force * like(self.force, self.table.at(time))
 
-def spread_by_mass(comm: MPI.Comm, total: tuple[float, ...], where: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    def state_at(self, time: float) -> bool | tuple[float, ...]:
+        """Return what tells the force at a time from that at another: whether it acts, and of a table the total."""
+        acts = self.acts_at(time)
+        return tuple(self.table.at(time).tolist()) if acts and self.table is not None else acts
+
+    @property
+    def events(self) -> list[float]:
+        """Times [s] at which the force begins, ends or turns."""
+        turns = [] if self.table is None else self.table.times.tolist()
+        return [self.start, *([] if self.stop is None else [self.stop]), *turns]
+
+
+def spread_by_mass(comm: MPI.Comm, total: Iterable[float], where: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """Spread a total force [N] over nodes in proportion to their mass, (owned, 3) [N] (collective).
 
     where, mass : (owned,) bool, the nodes; (owned,) [kg]
     """
     loaded = np.where(where, mass, 0.0)
     whole = comm.allreduce(loaded.sum())
-    return loaded[:, None] / whole * np.asarray(total)
+    return loaded[:, None] / whole * np.array([*total])

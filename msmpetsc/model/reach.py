@@ -72,7 +72,7 @@ def reach_of(
         where = masks[f"force.{number}"]
         reach = Reach(f"force.{number}", count(where), count(where & _held_while(force, lattice.pinned, anchors)))
         reaches.append(reach)
-        if reach.held == reach.nodes and any(force.total):
+        if reach.held == reach.nodes and force.pulls:
             raise InputError(
                 f"{reach.key} moves nothing: of the {_nodes(reach.nodes)} in its region none is free while it acts, "
                 "pins and anchors hold all"

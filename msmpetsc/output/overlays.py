@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from msmpetsc.model.loads import Motion, within
+from msmpetsc.model.loads import LoadTable, Motion, within
 from msmpetsc.model.region import inside
 from msmpetsc.output.camera import Camera, unit
 from msmpetsc.scene.body import Region
@@ -142,9 +142,10 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
     length = ARROW * np.ptp(rest.bounds, axis=0).max()
     arrows = []
     for force in scene.force:
-        if within(time, force.start, force.stop) and any(force.total) and (where := rest.find(force.region)).any():
+        total = LoadTable.of(force.total).at(time)
+        if within(time, force.start, force.stop) and any(total) and (where := rest.find(force.region)).any():
             tail = position[where].mean(axis=0)
-            arrows.append(np.array([tail, tail + length * unit(force.total)]))
+            arrows.append(np.array([tail, tail + length * unit(total)]))
     return arrows
 
 

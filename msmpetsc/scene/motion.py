@@ -1,9 +1,20 @@
 """Tables of what moves the body: time, its start, gravity, obstacles, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
@@ -163,15 +174,57 @@ class Pin(Table):
     region: Region = Field(description="the nodes held")
 
 
+class ForceTable(Table):
+    """A force that changes with time: straight lines between values, the first before them and the last after them."""
+
+    times: ListOf[NotNegative] = Field(description="ascending [s]")
+    values: ListOf[Vector] = Field(description="one for each time [N]")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "ForceTable":
+        if any(a >= b for a, b in pairwise(self.times)):
+            raise rule("must have ascending times")
+        if not self.times or len(self.times) != len(self.values):
+            raise rule(f"has {len(self.times)} times and {len(self.values)} values: one value a time")
+        return self
+
+
+VECTOR = TypeAdapter(Vector, config=ConfigDict(strict=True, allow_inf_nan=False))
+
+
+def _total(value: Any) -> tuple[float, float, float] | ForceTable:
+    """Return a vector, or a table that has been checked: a plain union would report both for a mistake in one."""
+    if isinstance(value, dict | ForceTable):
+        return ForceTable.model_validate(value)
+    return VECTOR.validate_python(value)
+
+
+Total = Annotated[
+    Vector | ForceTable,
+    PlainValidator(_total),
+    PlainSerializer(lambda total: total.model_dump() if isinstance(total, ForceTable) else total),
+    WithJsonSchema({"anyOf": [VECTOR.json_schema(), ForceTable.model_json_schema()]}),
+]
+
+
 class Force(Table):
     """A force on a part of the body."""
 
     region: Region = Field(description="the nodes pulled")
-    total: Vector = Field(description="sum over the nodes, spread by mass [N]")
+    total: Total = Field(
+        description="sum over the nodes, spread by mass, always the same, or { times = [s], values = [N] } with "
+        "straight lines between [N]"
+    )
     start: float = Field(0.0, description="acts from this time [s]")
     stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
 
     _after_start = field_validator("stop")(after_start)
+
+    @property
+    def pulls(self) -> bool:
+        """Whether it is ever anything but nothing."""
+        values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
+        return any(map(any, values))
 
 
 class AnchorTable(Table):

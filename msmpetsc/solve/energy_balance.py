@@ -10,7 +10,8 @@ impulse times their velocity. What the left side has more, and what later steps 
 What nodes gain when they bounce off a solved step counts to the next step, which mostly loses it before a frame shows
 it. Solved loosely, or where springs are pressed, steps do gain a little; a run that is out of hand gains without end.
 
-Verlet counts in W what moving obstacles push, so that C(q'_n) is that of where they stand at the start. The energy of
+Verlet counts in W what moving obstacles push, so that C(q'_n) is that of where they stand at the start, and what forces
+that change pull in its substeps beyond f_ext of the end. The energy of
 its steps and of BDF2's swings about what it should be: what they lose, up to a share, they may gain again.
 In a linear body Verlet's, of substeps dt, swings just as dt^2/8 |M^(-1) (f_ext - grad E)|_M^2 does (Hairer, Lubich and
 Wanner, Geometric Numerical Integration, IX): only what was gained with and without that is worth a word.

@@ -64,7 +64,8 @@ class Verlet:
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.sides = environment.no_sides[:, :owned]
-        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside
+        self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
+        self.end = 0.0  # of the step [s]
         self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
         self.anchors: int | None = None  # how many hold
         self.fixed = environment.fixed_at(self.time_step)[:owned]
@@ -123,7 +124,7 @@ class Verlet:
 
         Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body.
         """
-        start = time - self.time_step
+        start, self.end = time - self.time_step, time
         self._begin(state, start)
         pushed = self._pushed(start, time)
         squared = pushed + (self.highest.squared or self._elastic_squared())
@@ -195,8 +196,11 @@ class Verlet:
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
-        load = self.environment.load(time)
+        beyond = self.environment.load_beyond(time, self.end)
+        load, before = self.environment.load(time), None if beyond is None else self.v.copy()
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
+        if beyond is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
+            self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
         self.environment.apply_friction(
             self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides

@@ -40,6 +40,7 @@ class Model:
     embedding : None where the scene stores no surface
     loads     : gravity first, where there is any
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
+    damping   : of velocities, by the mass [1/s]
     body, reaches : what the first lines of a run say of the surface, and of pins, anchors and forces
     """
 
@@ -53,6 +54,7 @@ class Model:
     start: InitialState
     body: Body | None = None
     reaches: tuple[Reach, ...] = ()
+    damping: float = 0.0
 
 
 def build_model(comm: MPI.Comm, scene: Scene) -> Model:
@@ -79,6 +81,7 @@ def build_model(comm: MPI.Comm, scene: Scene) -> Model:
         start=initial_state(comm, scene.start, lattice, fixed, body.bounds),
         body=body,
         reaches=reaches,
+        damping=scene.material.damping,
     )
 
 

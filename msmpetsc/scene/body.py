@@ -11,6 +11,7 @@ from msmpetsc.scene.values import (
     Direction,
     FileName,
     ListOf,
+    NotNegative,
     Painted,
     Positive,
     Table,
@@ -98,6 +99,10 @@ class Material(Table):
     law: Literal["linear", "stiffening"] = Field("linear", description="how a spring pulls at large strain")
     stiffening: Positive | None = Field(
         None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
+    )
+
+    damping: NotNegative = Field(
+        0.0, description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]"
     )
 
     _has_a_use = field_validator("stiffening")(only_for("law", "stiffening"))

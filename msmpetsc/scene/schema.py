@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable, as_the_material
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, Start, Time
-from msmpetsc.scene.statics import no_impact, no_motion
+from msmpetsc.scene.statics import no_damping, no_impact, no_motion
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
 
 
@@ -79,6 +79,7 @@ class SceneFile(Table):
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
     _of_one_kind = field_validator("part")(as_the_material)
+    _is_damped_in_motion = field_validator("time")(no_damping)
     _starts_at_rest = field_validator("start")(no_motion)
     _only_presses = field_validator("obstacle")(no_impact)
 

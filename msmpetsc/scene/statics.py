@@ -20,6 +20,13 @@ def no_wait(cls: Any, until: str, info: ValidationInfo) -> str:
     return until
 
 
+def no_damping(cls: Any, time: Any, info: ValidationInfo) -> Any:
+    """Refuse damping where nothing moves (a validator of ``time``)."""
+    if time.integrator == STATIC and getattr(info.data.get("material"), "damping", 0.0):
+        raise rule(f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves', "material")
+    return time
+
+
 def no_motion(cls: Any, start: Any, info: ValidationInfo) -> Any:
     """Refuse a start in motion (a validator of ``start``)."""
     if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):

@@ -2,6 +2,14 @@
 
 Implicit Euler and BDF2 both look for the x where  M (x - y) + tau^2 (grad E(x) - f_ext) = 0;  they differ in y, what
 x were without forces, and in tau, a share of the time step t.
+
+Damping by the mass adds -alpha M v to the forces. With v = (x - c) / tau, the velocity that belongs to x, and
+y = c + tau w
+
+    M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0,
+
+which is the same problem after division by 1 + alpha tau: of y = c + tau w / (1 + alpha tau), and with
+tau^2 / (1 + alpha tau) for tau^2. So a step costs as much, and what nothing else moves slows down by 1 + alpha tau.
 """
 
 from dataclasses import replace
@@ -48,6 +56,7 @@ class ImplicitEuler:
     ):
         self.comm, self.model, self.environment, self.prefix = comm, model, environment, prefix
         self.time_step = time.step
+        self.damping = model.damping
         self.tau = self._first_tau()
         self.solver, self.probes = solver, probes
         self.anchors = environment.anchors_at(self.time_step)
@@ -60,6 +69,15 @@ class ImplicitEuler:
         return self.SHARE * self.time_step
 
     @property
+    def damped_tau(self) -> float:
+        """The tau of the problem that is solved, tau where nothing is damped [s]."""
+        return self.tau / float(np.sqrt(1 + self.damping * self.tau))
+
+    def _carried(self, duration: float) -> float:
+        """Return how far a velocity carries in a time step [s] under damping."""
+        return duration / (1 + self.damping * duration)
+
+    @property
     def unknowns(self) -> int:
         return self.stepper.unknowns.size
 
@@ -70,7 +88,10 @@ class ImplicitEuler:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
         q, time_step = state.q, self.time_step
-        result, sides = self._solve(q, 2 * q - state.q_previous, time, time_step, state.sides)
+        y = 2 * q - state.q_previous
+        if self.damping:
+            y = q + self._carried(time_step) / time_step * (q - state.q_previous)
+        result, sides = self._solve(q, y, time, time_step, state.sides)
         after, before, work = self.environment.reflect(
             result.position, result.previous, time, time_step, self.stepper.lattice.pinned, sides
         )
@@ -101,7 +122,7 @@ class ImplicitEuler:
         if self.reference is None:
             lattice = self.stepper.lattice
             self.reference = Reference(
-                self.comm, lattice, self.tau, touches=bool(self.model.penalties), static=self.STATIC
+                self.comm, lattice, self.damped_tau, touches=bool(self.model.penalties), static=self.STATIC
             )
         trace, self.trace, self.stepper.observer = self.trace, None, None
         assert self.problem is not None, "no step was taken"
@@ -115,7 +136,7 @@ class ImplicitEuler:
         return Stepper(
             self.comm,
             self.model.lattice.pin(self.environment.fixed_at(time)),
-            self.tau,
+            self.damped_tau,
             find_preset(solver.preset),
             solver.error,
             solver.max_iterations,
@@ -182,7 +203,7 @@ class Bdf2(ImplicitEuler):
         if history is None:
             history, its, products = self._history(q, v, time, state.sides)
         q_0, v_0 = history
-        y = (4 * q - q_0 + self.tau * (4 * v - v_0)) / 3
+        y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
         result, sides = self._solve(q, y, time, self.time_step, state.sides)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
@@ -204,6 +225,6 @@ class Bdf2(ImplicitEuler):
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
         which is the true one but for a part of first order; the KSP iterations and products that this takes."""
         t, tau = self.time_step, self.tau
-        result, _ = self._solve(q, q + tau * v, time - t + tau, tau, sides)
+        result, _ = self._solve(q, q + self._carried(tau) * v, time - t + tau, tau, sides)
         a = ((result.position - q) / tau - v) / tau
         return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its, result.products

@@ -64,6 +64,7 @@ class Verlet:
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.sides = environment.no_sides[:, :owned]
+        self.damping = model.damping
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
         self.end = 0.0  # of the step [s]
         self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
@@ -196,15 +197,22 @@ class Verlet:
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
+        self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
         if beyond is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
+        self._damp(0.5 * duration)
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
         self.environment.apply_friction(
             self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides
         )
+
+    def _damp(self, duration: float) -> None:
+        """Slow the free nodes down as damping by the mass does in this time [s]."""
+        if self.damping:
+            self.v[self.free] *= np.exp(-self.damping * duration)
 
     def _drift(self, begin: float, end: float) -> None:
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""

@@ -2,13 +2,47 @@
 
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from msmpetsc.api.simulation import Simulation, frames
+    from msmpetsc.extensions import register_force, register_preset
+    from msmpetsc.model.fields import Frame
     from msmpetsc.output.reader import Result
+    from msmpetsc.scene.schema import Scene
 
 __version__ = "0.1.0"
+__all__ = ["Frame", "Result", "Scene", "Simulation", "frames", "open", "register_force", "register_preset", "run"]
+FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
+    "Frame": "msmpetsc.model.fields",
+    "Result": "msmpetsc.output.reader",
+    "Scene": "msmpetsc.scene.schema",
+    "Simulation": "msmpetsc.api.simulation",
+    "frames": "msmpetsc.api.simulation",
+    "register_force": "msmpetsc.extensions",
+    "register_preset": "msmpetsc.extensions",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on its first use. Raises InputError naming the extra that brings a missing package."""
+    if name not in FROM:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    from msmpetsc.errors import as_expected
+
+    try:
+        return getattr(import_module(FROM[name]), name)
+    except ModuleNotFoundError as error:
+        raise as_expected(error) or error from None
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those not imported yet included."""
+    return sorted({*globals(), *FROM})
 
 
 def _kernel_folder() -> Path:
@@ -39,7 +73,9 @@ def open(path: str | Path) -> "Result":
     return Result(path)
 
 
-def run(scene: str | Path | None = None, output: str | Path | None = None, **options: Any) -> Path:
+def run(
+    scene: "str | Path | Mapping[str, Any] | Scene | None" = None, output: str | Path | None = None, **options: Any
+) -> Path:
     """Simulate a scene as ``msmpetsc run`` does, on all ranks, and return the path of the result (cli.main.simulate).
 
         path = msmpetsc.run("scenes/bunny_fall.toml", "out/b.h5", frames=10, petsc_options={"ksp_rtol": 1e-5})

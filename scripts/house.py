@@ -22,13 +22,13 @@ from clone import PYTHON, ROOT, parser
 
 LAYERS = (
     "errors",
-    "scene scene_reading scene_problems comm backend place",
+    "scene scene_reading scene_problems comm backend place extensions",
     "geometry",
     "model",
     "solve",
     "output",
     "study",
-    "cli __main__",
+    "cli api __main__",
 )
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names.split()}
 LONGEST = 35  # lines of a function, docstrings not counted

@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
 LAYERS = [
-    {"errors"}, {"scene", "comm", "backend"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
-    {"study"}, {"cli", "__main__"},
+    {"errors"}, {"scene", "comm", "backend", "extensions"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
+    {"study"}, {"cli", "api", "__main__"},
 ]  # fmt: skip
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
 ONLY_IN = {"petsc4py": {"solve", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}

@@ -1,13 +1,12 @@
 """The front doors: the command line, whose failures are one line and an exit status, and the same from Python."""
 
 import dataclasses
-import json
 import logging
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -15,9 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from msmpetsc.cli.arguments import parsed, parsed_apart
 from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
+from msmpetsc.scene.toml import overrides_of
 
 if TYPE_CHECKING:  # MPI takes 0.3 s to start, which --help need not wait for
     from mpi4py import MPI
+
+    from msmpetsc.model.fields import Frame
+    from msmpetsc.scene.schema import Scene
 
 WITHOUT_MPI = ("doctor", "completion")  # which must work where MPI does not
 LINE = "msmpetsc: %(levelname)s: %(message)s"
@@ -82,15 +85,18 @@ def entry_point() -> None:
 
 
 def simulate(
-    scene: str | os.PathLike[str] | None = None,
+    scene: "str | os.PathLike[str] | Mapping[str, Any] | Scene | None" = None,
     output: str | os.PathLike[str] | None = None,
     *,
     petsc_options: str | Mapping[str, Any] = "",
     quiet: bool = False,
+    on_frame: "Callable[[Frame], object] | None" = None,
     **options: Any,
 ) -> Path:
     """Run a scene as ``msmpetsc run`` does, and return the path of its result (collective).
 
+    scene         : a file's path; or a Scene, or its tables, which give the result no name: output does
+    on_frame      : called on all ranks with each frame, once that is written
     petsc_options : "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3, "ksp_view": None}; for this run alone
     quiet         : print no notes and no progress; warnings stay
     options       : those of the command by their names: frames=10, checkpoint_every="5min", set={"cages.count": 3000}
@@ -102,18 +108,21 @@ def simulate(
 
     from msmpetsc.cli.commands.run import RunRequest, run
     from msmpetsc.cli.failure import STATUS_INTERRUPTED, ending_together
+    from msmpetsc.scene.schema import Scene
     from msmpetsc.solve.petsc.words import start_for_runs, words_of
 
     comm = MPI.COMM_WORLD
     with logged_on_root(comm, logging.WARNING if quiet else logging.INFO), ending_together(comm):
-        valid = {field.name for field in dataclasses.fields(RunRequest)} - {"petsc_options", "command"}
+        valid = {field.name for field in dataclasses.fields(RunRequest)} - {"petsc_options", "command", "made"}
         for name in options.keys() - valid:
             raise InputError(f"run has no option {name!r}{did_you_mean(name, valid)}")
-        positional = [] if scene is None else [os.fspath(scene)]
+        made = Scene.of(scene) if isinstance(scene, Mapping) else scene
+        positional = [] if made is None or isinstance(made, Scene) else [os.fspath(made)]
         named = {"output": output, **options}
         ours = ["run", *positional, *(word for item in named.items() for word in command_words(*item))]
         petsc = words_of(petsc_options)
         args = parsed_apart(ours, petsc, [*ours, *petsc])
+        args.made, args.on_frame = None if positional else made, on_frame
         start_for_runs(comm, petsc)
         status = run(args)
     if status:
@@ -129,18 +138,9 @@ def command_words(name: str, value: Any) -> list[str]:
     if value is True:
         return [option]
     if isinstance(value, Mapping):
-        value = [f"{key}={toml_value(changed)}" for key, changed in value.items()]
+        value = overrides_of(value)
     values = value if isinstance(value, list | tuple) else [value]
     return [f"{option}={one_value}" for one_value in values]
-
-
-def toml_value(value: Any) -> str:
-    """Return a value as it stands in a line of TOML."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {toml_value(inner)}" for key, inner in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
-    return json.dumps(value, default=str)
 
 
 @contextmanager

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
+from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
@@ -19,8 +20,8 @@ from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.initial_state import InitialState, initial_state
-from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, spread_by_mass
+from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
+from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
 from msmpetsc.model.reach import Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
 from msmpetsc.scene.motion import ForceTable
@@ -39,6 +40,7 @@ class Model:
 
     embedding : None where the scene stores no surface
     loads     : gravity first, where there is any
+    own_forces : forces that are functions of the state that starts a step
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
     damping   : of velocities, by the mass [1/s]
     body, reaches : what the first lines of a run say of the surface, and of pins, anchors and forces
@@ -55,26 +57,66 @@ class Model:
     body: Body | None = None
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
+    own_forces: tuple[OwnForce, ...] = ()
 
 
-def build_model(comm: MPI.Comm, scene: Scene) -> Model:
-    """Build everything of a scene but its solver (collective). Raises InputError on all ranks."""
-    body = read_body(comm, scene)
-    cages = fill_cages(body, scene)
+class Shape:
+    """What mesh and cages alone decide, which runs of other materials, loads and times may share.
+
+    body, cages, topology : surface, valid cells, and the nodes and springs that these make
+    """
+
+    def __init__(self, comm: MPI.Comm, scene: Scene):
+        """Read the mesh and fill it (collective). Raises InputError on all ranks."""
+        self.source = scene.folder, scene.mesh, scene.cages
+        self.body = read_body(comm, scene)
+        self.cages = fill_cages(self.body, scene)
+        self.topology = topology_of(self.cages)
+        self._outside: np.ndarray | None = None
+
+    def fits(self, scene: Scene) -> bool:
+        """Return whether a scene has this mesh and these cages."""
+        return self.source == (scene.folder, scene.mesh, scene.cages)
+
+    @cached_property
+    def embedding(self) -> Embedding:
+        """How the surface follows the nodes (collective)."""
+        points = np.empty((0, 3)) if self.body.surface is None else self.body.surface.points
+        _, _, cages = self.source
+        return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
+
+    def outside(self, lattice: Lattice) -> np.ndarray | None:
+        """Return how far nodes (l,) stick out of the surface [m]; None where cells count whole (collective).
+
+        lattice : of this shape, of any material
+        """
+        if self._outside is None and self.cages.share is not None:
+            self._outside = distance_outside(self.body, self.cages, lattice)
+        return self._outside
+
+
+def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Model:
+    """Build everything of a scene but its solver (collective). Raises InputError on all ranks.
+
+    shape : of the scene's mesh and cages, where it is known already
+    """
+    shape = shape or Shape(comm, scene)
+    body, cages = shape.body, shape.cages
     finder = Finder(body, cages, scene.folder)
-    lattice = _lattice(scene, cages, finder)
+    lattice = _lattice(scene, shape, finder)
     masks = regions(scene, lattice, finder)
     lattice = lattice.pin(_any_of(masks, "pin", lattice.pinned))
     anchors = _anchors(scene, lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
-    outside = distance_outside(body, cages, lattice) if scene.obstacle and cages.share is not None else None
+    outside = shape.outside(lattice) if scene.obstacle else None
     return Model(
         surface=body.surface,
         lattice=lattice,
-        embedding=_embedding(scene, body, cages, lattice),
+        embedding=shape.embedding if scene.output.surface else None,
         loads=_loads(comm, scene, lattice, masks),
+        own_forces=_own_forces(scene, lattice, masks),
         anchors=anchors,
         reflections=_reflections(scene, outside),
         penalties=_penalties(comm, scene, lattice, body, outside),
@@ -160,23 +202,17 @@ def fill_cages(body: Body, scene: Scene) -> Cages:
     return fill(body, cell_size, cages.method, cages.max_cells, cages.boundary)
 
 
-def _lattice(scene: Scene, cages: Cages, finder: Finder) -> Lattice:
+def _lattice(scene: Scene, shape: Shape, finder: Finder) -> Lattice:
     material = scene.material
     return build_lattice(
-        cages,
+        shape.cages,
         material.density,
         young_modulus=material.young_modulus,
         stiffness=material.stiffness,
         stiffening=material.law_stiffening,
         of_cells=cell_materials(material, scene.part, finder),
+        topology=shape.topology,
     )
-
-
-def _embedding(scene: Scene, body: Body, cages: Cages, lattice: Lattice) -> Embedding | None:
-    if not scene.output.surface:
-        return None
-    points = np.empty((0, 3)) if body.surface is None else body.surface.points
-    return embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
 
 
 def _any_of(masks: Regions, kind: str, where: np.ndarray) -> np.ndarray:
@@ -205,6 +241,8 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
     if scene.gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
     for number, force in enumerate(scene.force):
+        if force.total is None:
+            continue
         where = masks[f"force.{number}"][: lattice.owned]
         if isinstance(force.total, ForceTable):
             share = spread_by_mass(comm, (1.0,), where, lattice.mass)
@@ -212,6 +250,18 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
         else:
             loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
+
+
+def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
+    """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
+    forces = []
+    for number, force in enumerate(scene.force):
+        if force.function is not None:
+            key = f"force.{number}"
+            rows = np.flatnonzero(masks[key][: lattice.owned])
+            function = FORCES.find(force.function)
+            forces.append(OwnForce(key, function, rows, lattice.mass[rows], force.start, force.stop))
+    return tuple(forces)
 
 
 def _reflections(scene: Scene, outside: np.ndarray | None) -> list[Reflection]:

@@ -9,7 +9,7 @@ from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle, depths
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
-from msmpetsc.model.loads import Anchor
+from msmpetsc.model.loads import Anchor, Load, OwnForce
 
 
 class Environment:
@@ -22,6 +22,8 @@ class Environment:
 
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
+        self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
+        self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.reflections = model.penalties, model.reflections
         self.obstacles = [p.obstacle for p in self.penalties] + [r.obstacle for r in self.reflections]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
@@ -35,12 +37,29 @@ class Environment:
         """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
         paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
         times = [time for path in paths for time in path.times.tolist()]
-        times += [time for load in self.loads for time in load.events]
+        times += [time for load in self.pulling for time in load.events]
         times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
         return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
 
+    def begin_step(self, q: np.ndarray, v: np.ndarray, time: float) -> None:
+        """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
+
+        So a step is explicit in them: they are of first order in its length, whatever the integrator.
+        """
+        owned = self.lattice.owned
+        for number, force in enumerate(self.own_forces):
+            self._own[number] = like(q, force.at(to_host(q[:owned]), to_host(v[:owned]), time))
+
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
+        load = self.given_load(time)
+        for force, own in zip(self.own_forces, self._own, strict=True):
+            if force.acts_at(time) and len(own):
+                load = load + own
+        return load
+
+    def given_load(self, time: float) -> np.ndarray:
+        """Return the part of f_ext that has a potential, (owned, 3) [N]: gravity and forces that are no functions."""
         states = [load.state_at(time) for load in self.loads]
         if states != self._states_of_loads:
             self._states_of_loads = states
@@ -84,7 +103,7 @@ class Environment:
         """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
 
         def at(time: float) -> list:
-            loads = [load.state_at(time) for load in self.loads]
+            loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.at(time)) for anchor in self.anchors]
             return [*loads, *anchors, *(o.acts_at(time) and tuple(o.path.at(time)) for o in self.obstacles)]
 
@@ -92,7 +111,7 @@ class Environment:
 
     def last_change(self, until: float) -> float:
         """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
-        times: list[float | None] = [time for load in self.loads for time in load.events]
+        times: list[float | None] = [time for load in self.pulling for time in load.events]
         times += [time for anchor in self.anchors for time in (*anchor.path.times.tolist(), anchor.stop)]
         times += [time for o in self.obstacles for time in (*o.path.times.tolist(), o.start, o.stop)]
         return max((time for time in times if time is not None and time <= until), default=0.0)

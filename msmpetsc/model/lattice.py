@@ -90,6 +90,7 @@ def build_lattice(
     stiffness: float | None = None,
     stiffening: float = 0.0,
     of_cells: Callable[[np.ndarray], CellMaterial] | None = None,
+    topology: "Topology | None" = None,
 ) -> Lattice:
     """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
 
@@ -98,23 +99,22 @@ def build_lattice(
     stiffness     : [N/m] for every spring, as in the paper
     stiffening    : of the springs' law (model.springs) [-]
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.region)
+    topology      : that of the cages, where it is known already
     """
     h = cages.grid.cell_size
-    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
-    table = SortedKeys(cages.table.comm, corner_keys.ravel())
-    net = _network(cages, table)
+    net = topology or topology_of(cages)
     given = young_modulus if stiffness is None else stiffness
     mass, of_spring, of_cell = _sums(net, h, density, given, of_cells)
     if stiffness is None:
         of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
     kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)
     return Lattice(
-        table=table,
+        table=net.table,
         cell_size=h,
         nodes=cages.grid.node_positions(net.ijk),
         ghosts=net.ghosts,
         mass=mass,
-        cells=table.find(corner_keys),
+        cells=net.corners,
         cell_kind=cages.kind,
         cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
@@ -129,9 +129,10 @@ def build_lattice(
     )
 
 
-class _Network(NamedTuple):
+class Topology(NamedTuple):
     """Nodes, cells and springs of a rank before they are of a material. Fields as in Lattice, or as said here.
 
+    corners : (c, 8) global corner nodes of the cells this rank owns
     ijk     : (l, 3) grid index of the nodes, owned and ghosts
     octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
     cells   : (c, 8) local corner nodes of all cells around the owned nodes
@@ -140,6 +141,8 @@ class _Network(NamedTuple):
     sharing : (s,) number of cells that share each spring
     """
 
+    table: SortedKeys
+    corners: np.ndarray
     ijk: np.ndarray
     octants: np.ndarray
     ghosts: np.ndarray
@@ -151,19 +154,22 @@ class _Network(NamedTuple):
     sharing: np.ndarray
 
 
-def _network(cages: Cages, table: SortedKeys) -> _Network:
+def topology_of(cages: Cages) -> Topology:
     """Return this rank's nodes, cells and springs (collective)."""
+    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
+    table = SortedKeys(cages.table.comm, corner_keys.ravel())
+    corners = table.find(corner_keys)
     owned = len(table.keys)
     ijk, cells, octants = _local_cells(cages, table)
     ghosts = table.find(encode_morton(ijk[owned:]))
     share = cages.share_of(ijk[cells[:, 0]])
     share = None if share is None else share[:, *CORNERS.T]
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return _Network(ijk, octants, ghosts, cells, share, *_springs(cells, numbers, owned))
+    return Topology(table, corners, ijk, octants, ghosts, cells, share, *_springs(cells, numbers, owned))
 
 
 def _sums(
-    net: _Network, h: float, density: float, given: float | None, of_cells: Callable[[np.ndarray], CellMaterial] | None
+    net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[np.ndarray], CellMaterial] | None
 ) -> tuple[np.ndarray, float | np.ndarray, float | np.ndarray]:
     """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
 

@@ -7,6 +7,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import like
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import ForceFunction
 from msmpetsc.scene.motion import ForceTable, Keyframe
 from msmpetsc.scene.values import Vector
 
@@ -112,6 +114,54 @@ class Load:
         """Times [s] at which the force begins, ends or turns."""
         turns = [] if self.table is None else self.table.times.tolist()
         return [self.start, *([] if self.stop is None else [self.stop]), *turns]
+
+
+@dataclass(frozen=True)
+class OwnForce:
+    """A force that is a function of the user's (extensions.register_force), acting as a Load does.
+
+    key      : of its table in the scene, for messages
+    function : of positions (k, 3) [m], velocities (k, 3) [m/s] and time [s]; returns (k, 3) [N/kg]
+    rows     : (k,) owned nodes in its region
+    mass     : (k,) [kg]
+    """
+
+    key: str
+    function: ForceFunction
+    rows: np.ndarray
+    mass: np.ndarray
+    start: float
+    stop: float | None
+
+    def acts_at(self, time: float) -> bool:
+        """Return whether the force acts at a time [s]."""
+        return within(time, self.start, self.stop)
+
+    def state_at(self, time: float) -> bool:
+        """Return whether the force acts at a time, by which it is told from that at another."""
+        return self.acts_at(time)
+
+    @property
+    def events(self) -> list[float]:
+        """Times [s] at which the force begins or ends."""
+        return [self.start, *([] if self.stop is None else [self.stop])]
+
+    def at(self, q: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
+        """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""
+        force = np.zeros((len(q), 3))
+        if not len(self.rows):
+            return force
+        with np.errstate(all="warn"):  # it is the user's own
+            per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
+        try:
+            force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
+        except ValueError:
+            raise InputError(
+                f"{self.key}.function: returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
+            ) from None
+        if not np.isfinite(force).all():
+            raise InputError(f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)")
+        return force
 
 
 def spread_by_mass(comm: MPI.Comm, total: Iterable[float], where: np.ndarray, mass: np.ndarray) -> np.ndarray:

@@ -142,7 +142,7 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
     length = ARROW * np.ptp(rest.bounds, axis=0).max()
     arrows = []
     for force in scene.force:
-        total = LoadTable.of(force.total).at(time)
+        total = LoadTable.of(force.total or (0.0, 0.0, 0.0)).at(time)  # a function has no one direction
         if within(time, force.start, force.stop) and any(total) and (where := rest.find(force.region)).any():
             tail = position[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))

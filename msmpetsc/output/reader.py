@@ -11,6 +11,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -88,6 +89,17 @@ class Result:
             return f"<closed {self.path}>"
         nodes, frames = self.lattice.nodes.shape[0], len(self.frames.time)
         return f"<{self.path}: {frames} frames of {nodes} nodes, {self.attributes.get('command', 'no command')}>"
+
+    def _repr_html_(self) -> str:
+        """Return the result as a notebook shows it: what it is of, and its arrays."""
+        title = self.scene.get("title") if "scene" in self.attributes else None
+        lines = [f"<b>{escape(str(title))}</b>"] if title else []
+        lines.append(f"<code>{escape(repr(self))}</code>")
+        if self.file and len(self.frames.time):
+            lines.append(f"t = {self.frames.time[0]:g} s to {self.frames.time[-1]:g} s")
+        arrays = [repr(group) for group in (self.frames, self.lattice, self.surface) if group] if self.file else []
+        listed = "\n".join(arrays)
+        return "<br>".join(lines) + (f"<details><summary>arrays</summary><pre>{escape(listed)}</pre></details>")
 
     def __contains__(self, name: str) -> bool:
         return name in self._datasets

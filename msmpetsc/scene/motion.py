@@ -22,6 +22,7 @@ from msmpetsc.scene.statics import no_wait
 from msmpetsc.scene.values import (
     Box,
     Direction,
+    FunctionName,
     Integrator,
     ListOf,
     NotNegative,
@@ -210,10 +211,15 @@ Total = Annotated[
 class Force(Table):
     """A force on a part of the body."""
 
+    one_of = ("total", "function")
     region: Region = Field(description="the nodes pulled")
-    total: Total = Field(
+    total: Total | None = Field(
+        None,
         description="sum over the nodes, spread by mass, always the same, or { times = [s], values = [N] } with "
-        "straight lines between [N]"
+        "straight lines between [N]",
+    )
+    function: FunctionName | None = Field(
+        None, description="name of a force of positions, velocities and time, registered in Python or installed"
     )
     start: float = Field(0.0, description="acts from this time [s]")
     stop: float | None = Field(None, description="acts until this time [s]; to the end if absent")
@@ -223,6 +229,8 @@ class Force(Table):
     @property
     def pulls(self) -> bool:
         """Whether it is ever anything but nothing."""
+        if self.total is None:
+            return True  # a function, which may
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)
         return any(map(any, values))
 

@@ -1,7 +1,7 @@
 """Scene file (TOML) and what the command line changes in it -> a checked Scene."""
 
 import tomllib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from msmpetsc.errors import InputError
 from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import Scene, SceneFile
-from msmpetsc.scene.toml import DEEPEST, toml_of
+from msmpetsc.scene.toml import DEEPEST, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
@@ -51,13 +51,36 @@ def scene_of(
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path} is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
-    try:
-        checked = SceneFile.model_validate(data, context={"presets": presets})
-    except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, file_text, keys))) from None
+    checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else ())
     return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+
+
+def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] = ()) -> Scene:
+    """Check a scene that Python has as tables; its files are the user's own words, and may lie anywhere.
+
+    folder : where the paths that it names start
+
+    Raises InputError naming every problem, one a line.
+    """
+    path, data = folder / "scene", plain(tables)
+    keys = {_override(data, override): override for override in overrides}
+    checked = _checked(path, data, None, "", keys)
+    try:
+        return Scene(**dict(checked), text=tomli_w.dumps(data), folder=folder)
+    except TypeError as error:
+        raise InputError(f"{path}: cannot be written as TOML: {error}") from None
+
+
+def _checked(
+    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[tuple[str | int, ...], str]
+) -> SceneFile:
+    """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
+    try:
+        return SceneFile.model_validate(data, context={"presets": presets})
+    except ValidationError as error:
+        raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
 
 
 def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:

@@ -1,14 +1,17 @@
 """The schema of a scene: frozen, validated tables. What a key means and its unit stand in its description."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from html import escape
+from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
 from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable, as_the_material
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, Start, Time
-from msmpetsc.scene.statics import no_damping, no_impact, no_motion
+from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion
+from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
 
 
@@ -82,6 +85,7 @@ class SceneFile(Table):
     _is_damped_in_motion = field_validator("time")(no_damping)
     _starts_at_rest = field_validator("start")(no_motion)
     _only_presses = field_validator("obstacle")(no_impact)
+    _is_given = field_validator("force")(no_functions)
 
     @property
     def stored(self) -> int:
@@ -103,7 +107,43 @@ class SceneFile(Table):
 
 
 class Scene(SceneFile):
-    """A scene file as read: its tables, its TOML text as run, and the folder its paths start from."""
+    """A scene as read: its tables, its TOML text as run, and the folder its paths start from.
+
+        scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
+        softer = scene.changed({"material.young_modulus": 2e4})
+
+    Changes are those of ``--set``: any key of a scene, items of lists by their numbers ("pin.0.region").
+    """
 
     text: str = Field("", description="the TOML text, overrides included")
     folder: Path = Field(Path(), description="folder of the file")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], changes: Mapping[str, Any] | None = None) -> "Scene":
+        """Read a scene file. Raises InputError naming every problem, one a line."""
+        from msmpetsc.scene.reading import load_scene  # which makes scenes
+
+        return load_scene(Path(path), overrides_of(changes or {}))
+
+    @classmethod
+    def of(
+        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Mapping[str, Any] | None = None
+    ) -> "Scene":
+        """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
+
+        folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
+
+        Raises InputError naming every problem, one a line.
+        """
+        from msmpetsc.scene.reading import scene_in
+
+        return scene_in(Path(folder), tables, overrides_of(changes or {}))
+
+    def changed(self, changes: Mapping[str, Any]) -> "Scene":
+        """Return this scene with changes, checked as a whole. Raises InputError."""
+        return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
+
+    def _repr_html_(self) -> str:
+        """Return the scene as a notebook shows it: its title over its text."""
+        title = f"<b>{escape(self.title)}</b>" if self.title else ""
+        return f"{title}<pre>{escape(self.text)}</pre>"

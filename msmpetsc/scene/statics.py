@@ -50,3 +50,15 @@ def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
                 "time",
             )
     return obstacles
+
+
+def no_functions(cls: Any, forces: Any, info: ValidationInfo) -> Any:
+    """Refuse forces that go by the state (a validator of ``force``)."""
+    for number, force in enumerate(forces if _is_static(info) else ()):
+        if force.function is not None:
+            raise rule(
+                f'may be no function where time.integrator = "{STATIC}", as force.{number} is: it is that of the state '
+                "before, which is not at rest under it",
+                "time",
+            )
+    return forces

@@ -127,7 +127,7 @@ class EnergyBalance:
             0.5 * np.vdot(momenta * free[:, None], v),
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
-            -np.vdot(environment.load(time), at),
+            -np.vdot(environment.given_load(time), at),
             *momenta.sum(axis=0),
         )
         return Energies(

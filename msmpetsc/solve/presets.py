@@ -6,11 +6,15 @@ options always mean the linear solve with A (or with the true Hessian, for ``new
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.extensions import PRESETS as ADDED
+from msmpetsc.solve.petsc.words import options_of, words_of
 
 
 @dataclass(frozen=True)
@@ -191,11 +195,30 @@ SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls",
 in_use: Counter[str] = Counter()  # by how many solvers: the options in PETSc's database that are not the user's
 
 
+def preset_names() -> list[str]:
+    """Return the names of all presets, those that were registered or installed last."""
+    return [*PRESETS, *ADDED.names()]
+
+
 def find_preset(name: str) -> Preset:
     """Raises InputError with the nearest name for an unknown one."""
-    if name not in PRESETS:
-        raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}")
-    return PRESETS[name]
+    if name in PRESETS:
+        return PRESETS[name]
+    if name not in ADDED.names():
+        raise InputError(f"solver.preset: unknown preset {name!r}{did_you_mean(name, preset_names())}")
+    return _made_of(name, ADDED.find(name))
+
+
+def _made_of(name: str, added: Mapping[str, Any]) -> Preset:
+    """Return a preset of what was registered or installed: {"options": ..., "based_on": ..., "about": ...}."""
+    try:
+        base = PRESETS[added.get("based_on", "newton")]
+        words = options_of(words_of(added["options"]))
+        return replace(base, about=str(added.get("about", "")), options=base.options | words)
+    except (KeyError, TypeError, AttributeError):
+        raise InputError(
+            f'the preset {name!r} is no table of "options", "based_on" (one of {", ".join(PRESETS)}) and "about"'
+        ) from None
 
 
 def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:

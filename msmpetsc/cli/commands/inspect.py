@@ -39,11 +39,11 @@ def run(args: argparse.Namespace) -> int:
     from msmpetsc.model.build import read_body
     from msmpetsc.model.partition import partition_of
     from msmpetsc.solve.options import refuse_early
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import preset_names
 
     refuse_early(MPI.COMM_WORLD, option_names("inspect"))
     signal.signal(signal.SIGTERM, interrupt)
-    scene = load_scene(args.scene, args.set, PRESETS)
+    scene = load_scene(args.scene, args.set, preset_names())
     before = peak_memory()
     body = read_body(MPI.COMM_WORLD, scene)
     assert body.surface is not None  # which rank 0 has

@@ -109,11 +109,13 @@ def run_methods(args: argparse.Namespace, target: float) -> tuple[bool, dict[str
 
 def try_all(args: argparse.Namespace, target: float) -> list:
     """Make the trials, and print each when it is done."""
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.plan import Planner
 
     with bench() as runs:
-        planner = Planner(args.scene, runs, presets=PRESETS, frames=args.frames, ranks=args.ranks, report=print_trial)
+        planner = Planner(
+            args.scene, runs, presets=preset_names(), frames=args.frames, ranks=args.ranks, report=print_trial
+        )
         print(HEAD, flush=True)
         trials = planner.for_step(target) if args.error is None else planner.for_trajectory(target)
         if not planner.deforms():
@@ -166,13 +168,13 @@ def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, 
 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
     """Make the trials, and print each when it is done."""
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.sizing.trials import Sizer
 
     with bench() as runs:
         sizer = Sizer(
-            args.scene, runs, target=target, presets=PRESETS, frames=args.frames, cells=args.cells, ranks=args.ranks,
-            report=print_size_trial,
+            args.scene, runs, target=target, presets=preset_names(), frames=args.frames, cells=args.cells,
+            ranks=args.ranks, report=print_size_trial,
         )  # fmt: skip
         print(SIZE_HEAD, flush=True)
         return sizer.plan()

@@ -15,7 +15,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_below_one(jobs=args.jobs)
     refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.runner import run_study
 
     signal.signal(signal.SIGTERM, interrupt)
@@ -26,7 +26,9 @@ def run(args: argparse.Namespace) -> int:
         print_cases(args, folder)
         return 0
     try:
-        rows = run_study(args.study, folder, PRESETS, full=args.full, jobs=args.jobs, restart=args.restart, part=part)
+        rows = run_study(
+            args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
+        )
     except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
         raise InputError(f"{error.filename or folder}: {error.strerror}") from None
     log_failures(rows)
@@ -54,11 +56,11 @@ def part_of(text: str | None):
 
 def print_cases(args: argparse.Namespace, folder: Path) -> None:
     """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.cases import shown_command
     from msmpetsc.study.runner import list_study
 
-    listed = list_study(args.study, folder, PRESETS, args.full)
+    listed = list_study(args.study, folder, preset_names(), args.full)
     for number, (case, done) in enumerate(listed, 1):
         print(f"{number:4} {'done' if done else 'open'}  {case.scene}: {case.label}  {shown_command(case)}")
     print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")

@@ -74,9 +74,10 @@ class ListPresets(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from msmpetsc.solve.presets import PRESETS
+        from msmpetsc.solve.presets import find_preset, preset_names
 
-        width = max(map(len, PRESETS))
-        lines = [f"{name:{width}} {preset.about}\n" for name, preset in PRESETS.items()]
+        names = preset_names()
+        width = max(map(len, names))
+        lines = [f"{name:{width}} {find_preset(name).about}\n" for name in names]
         parser._print_message("".join(lines), sys.stdout)
         parser.exit()

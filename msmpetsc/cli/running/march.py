@@ -17,7 +17,16 @@ from msmpetsc import __version__
 from msmpetsc.backend.compiling import compilation_logged
 from msmpetsc.cli.arguments import option_names
 from msmpetsc.cli.failure import ending_together
-from msmpetsc.cli.running.observers import STATUS, Checkpoints, FrameWriter, Interval, Observer, ProgressLine, Signals
+from msmpetsc.cli.running.observers import (
+    STATUS,
+    Callback,
+    Checkpoints,
+    FrameWriter,
+    Interval,
+    Observer,
+    ProgressLine,
+    Signals,
+)
 from msmpetsc.cli.running.profile import Cost, refuse_unwritable, versions
 from msmpetsc.cli.running.request import RunRequest
 from msmpetsc.cli.running.resume import Resumed, stored_scene
@@ -29,13 +38,14 @@ from msmpetsc.output.progress import duration
 from msmpetsc.output.restart import Earlier
 from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
-from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.reading import load_scene, scene_in
 from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.toml import toml_of
 from msmpetsc.solve.instrumentation import Probes, begin_timing
 from msmpetsc.solve.options import refuse_early
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
-from msmpetsc.solve.presets import PRESETS
+from msmpetsc.solve.presets import preset_names
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
 MOST_NAMED = 12  # tables whose nodes are counted one by one
@@ -117,6 +127,7 @@ def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
                 set_up.close()
                 with ProgressLine.shown(comm, simulation.steps) as progress:
                     observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
+                    observers += [Callback(plan.request.on_frame)] if plan.request.on_frame else []
                     signals.begin()
                     for frame in simulation.advance():
                         with cost.of_output():
@@ -168,10 +179,12 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     """Read the scene with what the request changes; --set comes last and wins."""
 
     def changed(changes: list[str]) -> Scene:
+        if request.made is not None:
+            return scene_in(request.made.folder, toml_of(request.made.text), changes)
         if request.scene is not None:
-            return load_scene(request.scene, changes, PRESETS)
+            return load_scene(request.scene, changes, preset_names())
         assert earlier is not None  # as earlier_run sees to
-        return stored_scene(earlier, changes, PRESETS)
+        return stored_scene(earlier, changes, preset_names())
 
     changes = [] if request.preset is None else [f"solver.preset={json.dumps(request.preset)}"]
     changes += [] if request.error is None else [f"solver.error={request.error}"]
@@ -194,6 +207,7 @@ def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
     """Return what the file says of the run that made it; PETSc's options are the user's, before ours are among them."""
     options = PETSc.Options().getAll().items()
+    file = request.made.folder / "scene" if request.made else request.scene  # where its paths start
     return {
         "msmpetsc_version": __version__,
         "petsc_version": versions()["petsc"],
@@ -201,7 +215,7 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
         "ranks": comm.size,
         "command": request.command,
         "scene": scene.text,
-        "scene_file": str(request.scene.resolve()) if request.scene else "",
+        "scene_file": str(file.resolve()) if file else "",
         "true_error": request.true_error or 0,
     }
 

@@ -6,7 +6,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
@@ -49,6 +49,18 @@ class FrameWriter:
             if self.frames >= self.file.finished:
                 self.file.append(frame)
             self.frames += 1
+        return False
+
+
+class Callback:
+    """Call a function of the user's with each frame, once that is written."""
+
+    def __init__(self, function: Callable[[Frame], object]):
+        self.function = function
+
+    def after_step(self, frame: Frame | None) -> bool:
+        if frame is not None:
+            self.function(frame)
         return False
 
 

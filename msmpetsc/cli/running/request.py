@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one
 from msmpetsc.cli.running.resume import examined, options_to_keep
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
+from msmpetsc.model.fields import Frame
 from msmpetsc.output.restart import Earlier
+from msmpetsc.scene.schema import Scene
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,7 @@ class RunRequest:
 
     petsc_options : words of PETSc's options
     command       : the command line, as the result file and ``--measure`` record it
+    made, on_frame : from Python alone: the scene itself in place of its file, and what is called with each frame
     """
 
     scene: Path | None = None
@@ -42,6 +46,8 @@ class RunRequest:
     measure: Path | None = None
     petsc_options: tuple[str, ...] = ()
     command: str = "msmpetsc run"
+    made: Scene | None = None
+    on_frame: Callable[[Frame], object] | None = None
 
     @classmethod
     def from_args(cls, args: argparse.Namespace) -> "RunRequest":
@@ -60,6 +66,8 @@ class RunRequest:
         if self.resume and (self.overwrite or self.output not in (None, self.resume)):
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
         refuse_below_one(true_error=self.true_error, trace=self.trace, frames=self.frames)
+        if self.made and not (self.output or self.resume):
+            raise InputError("a scene that is no file gives its result no name: say output")
         if self.trace is not None and self.measure is None:
             raise InputError("--trace needs --measure, the file that it is written to")
 
@@ -82,11 +90,11 @@ class RunRequest:
 def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
     """Return what is to be resumed, None for a run from the start (collective). Raises InputError."""
     if request.resume is None:
-        if request.scene is None:
+        if request.scene is None and request.made is None:
             raise InputError("a SCENE is needed, or --resume OUT.h5")
         return None
     path = request.resume
-    if request.scene and not comm.bcast(on_root(comm, path.exists)):
+    if (request.scene or request.made) and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None  # the first start of a job that may be started again
     return comm.bcast(on_root(comm, lambda: examined(path)))

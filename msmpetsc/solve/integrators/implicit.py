@@ -88,6 +88,7 @@ class ImplicitEuler:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
         q, time_step = state.q, self.time_step
+        self.environment.begin_step(q, state.velocity(time_step), time - time_step)
         y = 2 * q - state.q_previous
         if self.damping:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
@@ -199,6 +200,7 @@ class Bdf2(ImplicitEuler):
         """
         self._let_go(time)
         q, v, its, products = state.q, state.velocity(self.time_step), 0, 0
+        self.environment.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
             history, its, products = self._history(q, v, time, state.sides)

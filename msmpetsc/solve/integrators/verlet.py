@@ -126,6 +126,7 @@ class Verlet:
         Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body.
         """
         start, self.end = time - self.time_step, time
+        self.environment.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
         pushed = self._pushed(start, time)
         squared = pushed + (self.highest.squared or self._elastic_squared())

@@ -1,0 +1,202 @@
+"""Forces and presets of the user's own: by their discrete formulas, in the energy balance, by name, installed."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import G, block_scene
+from conftest import ENVIRONMENT, run
+
+import msmpetsc as msm
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import FORCES, PRESETS
+
+STEP, SPEED, RATE = 0.01, 1.0, 8.0
+ALL = {"half_space": {"point": [0, 0, -9], "normal": [0, 0, 1]}}
+INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays():
+    """Take out again what a test registers."""
+    yield
+    for extensions in (FORCES, PRESETS):
+        extensions._registered.clear()
+
+
+def flying(folder: Path, name: str, steps: int = 10, step: float = STEP, begin: float = 0.0, **tables) -> Path:
+    """A block without gravity that flies upwards, under the force of this name from a time on."""
+    time = {"step": step, "duration": steps * step, **tables.pop("time", {})}
+    own = [{"region": ALL, "function": name, "start": begin}]
+    return block_scene(folder, time=time, force=own, **{"start": {"velocity": [0, 0, SPEED]}} | tables)
+
+
+def heights(scene: Path) -> np.ndarray:
+    """How far the block, which no such force deforms, has come in each frame [m]."""
+    positions = np.array([frame.position for frame in msm.frames(scene)])
+    assert np.ptp(positions - positions[0], axis=1).max() < 1e-9
+    return (positions - positions[0]).mean(axis=1)[:, 2]
+
+
+def test_drag_is_that_of_the_velocity_that_starts_a_step(tmp_path: Path):
+    msm.register_force("drag", lambda x, v, t: -RATE * v)
+    velocities = SPEED * (1 - RATE * STEP) ** np.arange(1, 11)  # v_(n+1) = v_n - t c v_n
+    assert np.allclose(heights(flying(tmp_path, "drag")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9)
+
+
+def test_the_time_is_that_which_starts_a_step(tmp_path: Path):
+    msm.register_force("ramp", lambda x, v, t: [0, 0, 1000 * t])  # one for all nodes will do
+    velocities = SPEED + STEP * np.cumsum(1000 * STEP * np.arange(10))
+    assert np.allclose(heights(flying(tmp_path, "ramp")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_constant_function_is_gravity(tmp_path: Path, integrator: str):
+    msm.register_force("gravity", lambda x, v, t: np.tile([0, 0, -G], (len(x), 1)))
+    held = {"pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}], "time": {"integrator": integrator}}
+    own = [frame.position for frame in msm.frames(flying(tmp_path, "gravity", 5, **held))]
+    scene = flying(tmp_path, "gravity", 5, gravity={"acceleration": [0, 0, -G]}, **held)
+    known = [frame.position for frame in msm.frames(scene, set={"force": []})]
+    assert np.allclose(own, known, atol=1e-9) and np.ptp(own[-1] - own[0]) > 1e-4
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_it_is_of_first_order_in_the_step(tmp_path: Path, integrator: str):
+    errors, below = [], np.array([0, 0, -0.1])  # so that it pulls from the start
+    for halvings in range(2):
+        step, start = STEP / 2**halvings, {}
+        msm.register_force("spring", lambda x, v, t, at=start: RATE**2 * (at.setdefault("x", x.copy()) + below - x))
+        *_, last = heights(flying(tmp_path, "spring", 20 * 2**halvings, step, time={"integrator": integrator}))
+        turn = RATE * 20 * STEP
+        errors.append(abs(last - SPEED / RATE * np.sin(turn) + 0.1 * (1 - np.cos(turn))))
+    assert 1.7 < errors[0] / errors[1] < 2.4
+
+
+def test_its_work_is_no_energy_from_nowhere(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    msm.register_force("motor", lambda x, v, t: RATE * v)
+    frames = list(msm.frames(flying(tmp_path, "motor", 20)))
+    assert frames[-1].kinetic > 15 * frames[0].kinetic  # (1 + 0.08)^40 = 21.7
+    assert max(frame.energy_gained for frame in frames) < 1e-6 * frames[-1].kinetic
+    assert all(frame.potential == 0 for frame in frames)
+    assert "nowhere" not in caplog.text
+
+
+def test_it_acts_on_its_region_and_in_its_time(tmp_path: Path):
+    seen = []
+
+    def force(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
+        seen.append((len(x), x[:, 0].max(), round(t, 6)))
+        return np.zeros_like(x)
+
+    msm.register_force("eye", force)
+    region = {"box": [[-1, -1, -1], [0.2, 2, 2]]}
+    scene = flying(tmp_path, "eye", 3)
+    list(msm.frames(scene, set={"force.0.region": region}))
+    assert seen == [(2 * 5 * 3, 0.125, 0.0), (30, 0.125, 0.01), (30, 0.125, 0.02)]  # once a step
+    msm.register_force("late", lambda x, v, t: [0, 0, 1.0])
+    late = heights(flying(tmp_path, "late", 4, begin=0.03))  # in the steps that end from then on
+    assert np.allclose(np.diff(late), STEP * (SPEED + STEP * np.array([0, 0, 1, 2])))
+
+
+WRONG = {
+    "no force 'drga' is registered, or installed under msmpetsc.forces, did you mean 'drag'?": {"function": "drga"},
+    "force.0.function: returned numbers of shape (2,), not (75, 3)": {"function": "flat"},
+    "force.0.function: returned numbers that are not finite (t = 0 s)": {"function": "nan"},
+    "must give exactly one of total, function; has total and function": {"function": "drag", "total": [0, 0, 1.0]},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_is_no_force_is_said_in_one_line(tmp_path: Path, words: str):
+    msm.register_force("drag", lambda x, v, t: -v)
+    msm.register_force("flat", lambda x, v, t: np.zeros(2))
+    msm.register_force("nan", lambda x, v, t: np.full_like(x, np.nan))
+    scene = flying(tmp_path, "drag")
+    with pytest.raises(InputError) as raised:
+        list(msm.frames(scene, set={"force": [{"region": ALL, **WRONG[words]}]}))
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_statics_have_no_functions(tmp_path: Path):
+    msm.register_force("drag", lambda x, v, t: -v)
+    with pytest.raises(InputError, match="may be no function where"):
+        msm.frames(flying(tmp_path, "drag", start={}), set={"time.integrator": "static"})
+
+
+def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    msm.register_preset("tight", {"ksp_rtol": 1e-8, "ksp_max_it": 400}, about="a narrow one")
+    msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])  # it bends the block
+    scene = flying(tmp_path, "drag", 2)
+    tight, usual = ([frame for frame in msm.frames(scene, preset=name)] for name in ("tight", "newton"))
+    assert np.allclose(tight[-1].position, usual[-1].position, atol=1e-8)
+    assert tight[-1].ksp_its > usual[-1].ksp_its  # its option has a say
+    path = msm.run(scene, tmp_path / "x.h5", preset="tight", quiet=True)
+    with msm.open(path) as result:
+        assert result.scene["solver"]["preset"] == "tight"
+    with pytest.raises(SystemExit):
+        main(["run", "--list-presets"])
+    assert "tight" in (listed := capsys.readouterr().out) and "a narrow one" in listed
+    msm.register_preset("wrong", {}, based_on="none")
+    with pytest.raises(InputError, match="the preset 'wrong' is no table of"):
+        list(msm.frames(scene, preset="wrong"))
+
+
+PLUGIN = """
+RIBBON = {"options": {"ksp_rtol": 1e-7}, "based_on": "newton", "about": "installed"}
+def drag(x, v, t):
+    return -8.0 * v
+"""
+POINTS = """
+[msmpetsc.forces]
+installed_drag = plugin:drag
+broken = plugin:none
+[msmpetsc.presets]
+ribbon = plugin:RIBBON
+"""
+
+
+def test_a_scene_file_names_what_is_installed(tmp_path: Path):
+    (tmp_path / "plugin.py").write_text(PLUGIN)
+    installed = tmp_path / "plugin-1.0.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Metadata-Version: 2.1\nName: plugin\nVersion: 1.0\n")
+    (installed / "entry_points.txt").write_text(POINTS)
+    scene = flying(tmp_path, "installed_drag", solver={"preset": "ribbon", "error": 1e-9})
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
+
+    def command(*words: object) -> subprocess.CompletedProcess:
+        arguments = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", tmp_path / "x.h5", *words]
+        return subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=60)
+
+    assert (done := command()).returncode == 0, done.stderr
+    with msm.open(tmp_path / "x.h5") as result:
+        positions = result.frames.position[:]
+    velocity = np.diff((positions - positions[0])[:, 0, 2]) / STEP
+    assert np.allclose(velocity, SPEED * (1 - RATE * STEP) ** np.arange(1, 11), rtol=1e-9)
+    broken = command("--overwrite", "--set", "force.0.function=broken")
+    assert broken.returncode == 2 and "the force 'broken' that is installed cannot be imported" in broken.stderr
+    assert broken.stderr.count("\n") == 1
+
+
+ON_RANKS = """
+import sys
+import numpy as np
+import msmpetsc as msm
+from mpi4py import MPI
+msm.register_force("drag", lambda x, v, t: -8.0 * v * x[:, :1])
+*_, last = msm.frames(sys.argv[1])
+rows = MPI.COMM_WORLD.gather(last.position)
+if rows:
+    np.save(sys.argv[2], np.concatenate(rows))
+"""
+
+
+def test_ranks_agree(tmp_path: Path):
+    scene = flying(tmp_path, "drag", 5)
+    for ranks in (1, 3):
+        done = run(ranks, "-c", ON_RANKS, scene, tmp_path / f"{ranks}.npy", timeout=60)
+        assert done.returncode == 0, done.stderr
+    assert np.allclose(np.load(tmp_path / "1.npy"), np.load(tmp_path / "3.npy"), atol=1e-9)

@@ -1,0 +1,211 @@
+"""Frames without a file: those of msmpetsc.run, from files, tables and scenes, again and again on one lattice."""
+
+import gc
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import DENSITY, G, block_scene
+from conftest import run
+from mpi4py import MPI
+
+import msmpetsc as msm
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.model import build
+
+FALL = {"gravity": {"acceleration": [0, 0, -G]}, "time": {"step": 0.01, "duration": 0.03}}
+HELD = {"pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}]}
+INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A block that is held at one end and bends under its weight."""
+    return block_scene(tmp_path, **FALL | HELD)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_frames_are_those_of_the_file(scene: Path, tmp_path: Path, integrator: str):
+    changes = {"material.young_modulus": 2e5, "time.integrator": integrator}
+    frames = list(msm.frames(scene, set=changes))  # kept, though the next step goes on from them
+    with msm.open(msm.run(scene, tmp_path / "x.h5", set=changes, quiet=True)) as result:
+        assert np.array_equal([frame.position for frame in frames], result.frames.position[:])
+        assert [frame.time for frame in frames] == list(result.frames.time)
+        assert [frame.elastic for frame in frames] == list(result.frames.elastic)
+    assert np.ptp(frames[-1].position - frames[0].position) > 1e-4  # it does bend
+
+
+def test_a_frame_is_the_callers_own(scene: Path):
+    undisturbed = [frame.position for frame in msm.frames(scene)]
+    for frame, position in zip(msm.frames(scene), undisturbed, strict=True):
+        assert np.array_equal(frame.position, position)
+        frame.position[:] = np.nan
+
+
+def test_tables_and_scenes_are_as_good_as_a_file(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    expected = [frame.position for frame in msm.frames(scene, 2)]
+    tables = tomllib.loads(scene.read_text())
+    tables["mesh"]["source"] = tmp_path / "scene.ply"  # a path, an array and a number of numpy's stand in Python
+    tables["gravity"]["acceleration"] = np.array([0, 0, -G])
+    tables["material"]["density"] = np.float64(DENSITY)
+    monkeypatch.chdir("/")  # outside which the mesh lies nowhere, but where the tables say
+    for source in (tables, msm.Scene.of(tables), msm.Scene.load(scene)):
+        assert np.array_equal([frame.position for frame in msm.frames(source, 2)], expected)
+        path = msm.run(source, tmp_path / "x.h5", frames=2, overwrite=True, quiet=True)
+        with msm.open(path) as result:
+            assert np.array_equal(result.frames.position[:], expected)
+            assert msm.Scene.of(result.scene).material.density == DENSITY  # what the file says can be run again
+    with pytest.raises(InputError, match="say output"):
+        msm.run(tables, quiet=True)
+
+
+def test_a_run_of_tables_goes_on(scene: Path, tmp_path: Path):
+    tables = tomllib.loads(scene.read_text())
+    of_tables = msm.Scene.of(tables, tmp_path)
+    whole = msm.run(of_tables, tmp_path / "whole.h5", quiet=True)
+    part = msm.run(of_tables, tmp_path / "part.h5", frames=1, quiet=True)
+    msm.run(resume=part, force=True, set={"time.duration": 0.03}, quiet=True)
+    with msm.open(whole) as one, msm.open(part) as other:
+        assert np.array_equal(one.frames.position[:], other.frames.position[:])
+
+
+def test_changes_are_checked_as_a_file_is(scene: Path):
+    simulation = msm.Simulation(scene)
+    softer = simulation.scene.changed({"material.young_modulus": 1e3, "pin.0.region.box": [[-1, -1, -1], [0.2, 2, 2]]})
+    assert softer.material.young_modulus == 1e3 and softer.pin[0].region.box[1][0] == 0.2
+    assert simulation.scene.material.young_modulus != 1e3
+    for wrong, words in {
+        "material.yuong_modulus": "did you mean 'young_modulus'",
+        "pin.7.region": "is no item of a list of 1",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            simulation.frames(set={wrong: 1.0})  # at the call, before the first frame is asked for
+    with pytest.raises(InputError, match="frames must be at least 1"):
+        simulation.frames(0)
+    with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
+        next(simulation.frames(preset="newtno"))
+    with pytest.raises(InputError, match="scene: mesh: required"):
+        msm.Scene.of({"cages": {"count": 3}})
+
+
+def counted(patch: pytest.MonkeyPatch, *names: str) -> list[str]:
+    """Return a list that gets the name of each of these functions of the build whenever it is called."""
+    calls: list[str] = []
+
+    def counting(name: str):
+        function = getattr(build, name)
+        patch.setattr(build, name, lambda *arguments: calls.append(name) or function(*arguments))
+
+    for name in names:
+        counting(name)
+    return calls
+
+
+def test_the_lattice_is_kept_while_mesh_and_cages_are(scene: Path, monkeypatch: pytest.MonkeyPatch):
+    calls = counted(monkeypatch, "read_body", "fill_cages", "topology_of", "embed")
+    changes = [
+        {"output.surface": True},
+        {"output.surface": True, "material.young_modulus": 3e5, "material.density": 500.0},
+        {"output.surface": True, "part": [{"region": {"box": [[0, 0, 0], [0.2, 1, 1]]}, "density": 2000.0}]},
+        {"output.surface": True, "force": [{"region": {"box": [[0.4, 0, 0], [1, 1, 1]]}, "total": [0, 0, 9.0]}]},
+        {"output.surface": True, "time.step": 0.005, "start.velocity": [0, 0, 1.0]},
+    ]
+    simulation = msm.Simulation(scene)
+    for change in changes:
+        kept = [frame for frame in simulation.frames(set=change)]
+        assert calls == ["read_body", "fill_cages", "topology_of", "embed"]
+        fresh = [frame for frame in msm.frames(scene, set=change)]
+        del calls[4:]
+        assert np.array_equal([f.position for f in kept], [f.position for f in fresh])
+        assert np.array_equal([f.surface for f in kept], [f.surface for f in fresh])
+    list(simulation.frames(set={"cages.cell_size": 1 / 4}))
+    assert calls[4:] == ["read_body", "fill_cages", "topology_of"]  # another lattice; no surface was asked for
+    assert simulation.model is not None and simulation.model.lattice.cell_size == 1 / 4
+
+
+def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
+    from petsc4py import PETSc
+
+    before = PETSc.Options().getAll()
+    simulation = msm.Simulation(scene, petsc_options={"ksp_rtol": 1e-3})
+    for frame in simulation.frames():
+        assert PETSc.Options().getAll()["ksp_rtol"] == "0.001"
+        if frame.index == 1:
+            break
+    gc.collect()
+    assert PETSc.Options().getAll() == before
+    assert np.geterr()["invalid"] == "warn"
+    assert len(list(simulation.frames())) == 4
+
+
+def test_two_simulations_may_go_side_by_side(scene: Path):
+    one, other = msm.frames(scene), msm.frames(scene, preset="anderson")
+    both = [(a.position, b.position) for a, b in zip(one, other, strict=True)]
+    alone = [frame.position for frame in msm.frames(scene)]
+    assert np.array_equal([a for a, _ in both], alone)
+    assert all(np.allclose(a, b, atol=1e-7) for a, b in both)
+    frames = msm.frames(scene)
+    next(frames)
+    with pytest.raises(InputError, match="another simulation is under way"):
+        next(msm.frames(scene, petsc_options="-ksp_rtol 1e-2"))
+    frames.close()
+    with pytest.raises(InputError, match="-ksp_tpye"):
+        next(msm.frames(scene, petsc_options="-ksp_tpye cg"))
+
+
+def test_a_step_that_fails_raises_after_the_frames_before_it(tmp_path: Path):
+    pull = [{"region": {"box": [[-1, -1, -1], [0.1, 2, 2]]}, "total": [1e4, 0, 0], "start": 0.015}]
+    scene = block_scene(tmp_path, time=FALL["time"], force=pull)
+    frames = msm.frames(scene, error=1e-12, petsc_options="-snes_max_it 1")
+    assert [next(frames).index for _ in range(2)] == [0, 1]
+    with pytest.raises(StepFailed, match="frame 2 "):
+        next(frames)
+
+
+def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
+    seen = []
+    path = msm.run(scene, tmp_path / "x.h5", set={"output.every": 2}, on_frame=seen.append, quiet=True)
+    with msm.open(path) as result:
+        assert [frame.index for frame in seen] == [0, 2, 3]
+        assert np.array_equal([frame.position for frame in seen], result.frames.position[:])
+
+
+def test_the_notebook_shows_text_and_no_markup_of_the_scenes(scene: Path, tmp_path: Path):
+    shown = msm.Scene.load(scene, {"title": "<script>"})._repr_html_()
+    assert "<b>&lt;script&gt;</b>" in shown and "density = 1000" in shown and "<script>" not in shown
+    with msm.open(msm.run(scene, tmp_path / "x.h5", set={"title": "<b>a"}, quiet=True)) as result:
+        html = result._repr_html_()
+        assert "&lt;b&gt;a" in html and "4 frames" in html and f"{len(result.lattice.nodes)} nodes" in html
+        assert "0.03 s" in html
+    assert "closed" in result._repr_html_()
+
+
+ON_RANKS = """
+import sys
+import numpy as np
+import msmpetsc as msm
+from mpi4py import MPI
+simulation = msm.Simulation(sys.argv[1])
+for modulus in (1e5, 2e5):
+    *_, last = simulation.frames(set={"material.young_modulus": modulus})
+    rows = MPI.COMM_WORLD.gather(last.position)
+    if rows:
+        assert all(len(part) for part in rows)
+        np.save(sys.argv[2] + f"/{modulus:g}.npy", np.concatenate(rows))
+try:
+    next(msm.frames(sys.argv[1], set={"mesh.source": "none.obj"}))
+except msm.errors.InputError as error:
+    print("refused")
+"""
+
+
+def test_on_ranks_each_has_its_rows(scene: Path, tmp_path: Path):
+    done = run(3, "-c", ON_RANKS, scene, tmp_path, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("refused") == 3
+    for modulus in (1e5, 2e5):
+        *_, last = msm.frames(scene, set={"material.young_modulus": modulus})
+        assert MPI.COMM_WORLD.size == 1 and np.allclose(
+            np.load(tmp_path / f"{modulus:g}.npy"), last.position, atol=1e-9
+        )

@@ -16,7 +16,7 @@ from msmpetsc.cli.options.checks import add_baseline, add_check
 from msmpetsc.cli.options.examples import EXAMPLES, EXAMPLES_HEAD, ExamplesKept
 from msmpetsc.cli.options.planning import add_inspect, add_plan, add_study
 from msmpetsc.cli.options.program import add_completion, add_doctor
-from msmpetsc.cli.options.results import add_compare, add_render
+from msmpetsc.cli.options.results import add_compare, add_export, add_render
 from msmpetsc.cli.options.run import add_run
 from msmpetsc.cli.options.scenes import add_fetch, add_keys, add_new, add_schema
 from msmpetsc.cli.options.values import Commands, add_verbosity
@@ -164,6 +164,7 @@ COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module
     "plan": add_plan,
     "compare": add_compare,
     "render": add_render,
+    "export": add_export,
     "baseline": add_baseline,
     "check": add_check,
     "fetch": add_fetch,

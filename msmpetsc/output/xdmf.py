@@ -50,6 +50,7 @@ def _frame_slab(run: Result, points: str, index: int) -> ET.Element:
     """Return frame `index` of points (T, n, 3): start, stride and count along each axis, and where to take it from."""
     _, rows, axes = run[points].shape
     item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=f"{rows} {axes}", Type="HyperSlab")
+    item.append(ET.Comment(f"frame {index}"))  # VTK takes the first thing in it for its name, and caches points by that
     part = ET.SubElement(item, "DataItem", Dimensions="3 3", Format="XML")
     part.text = f"{index} 0 0  1 1 1  1 {rows} {axes}"
     item.append(_data_item(run, points))

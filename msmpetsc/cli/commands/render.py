@@ -16,8 +16,8 @@ def run(args: argparse.Namespace) -> int:
     refuse_below_one(count=args.count)
     refuse_other_format("-o", args.output, PICTURE_NAMES)
     picture = args.output or args.result.with_suffix(".png")
-    frames = _numbers("--frames", args.frames, int, "0,10,20")
-    eye = _numbers("--eye", args.eye, float, "1,-2,0.6")
+    frames = numbers("--frames", args.frames, int, "0,10,20")
+    eye = numbers("--eye", args.eye, float, "1,-2,0.6")
     if eye is not None and not (len(eye) == 3 and any(eye) and np.isfinite(eye).all()):
         raise InputError(f"--eye takes three numbers, not all zero, not {args.eye!r}")
     refuse_deadly(args.result)
@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _numbers(option: str, text: str | None, kind: type, example: str) -> list | None:
+def numbers(option: str, text: str | None, kind: type, example: str) -> list | None:
     """Return the numbers of "0,10,20". Raises InputError."""
     if text is None:
         return None

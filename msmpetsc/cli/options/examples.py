@@ -23,6 +23,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "compare": ("msmpetsc compare out/a.h5 out/b.h5 --rtol 1e-3", "msmpetsc compare out/a.h5 out/b.h5 --json"),
     "render": ("msmpetsc render out/my.h5 --count 12", "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5"),
+    "export": (
+        "msmpetsc export out/my.h5 -o out/my.vtkhdf --mesh lattice",
+        "msmpetsc export out/my.h5 -o out/last.obj --frames -1",
+    ),
     "baseline": ("msmpetsc baseline my.toml --cells 400 --frames 10",),
     "check": ("msmpetsc check my.toml", "msmpetsc check my.toml other.toml --ranks 2 --junit out/check.xml"),
     "fetch": ("msmpetsc fetch --list", "msmpetsc fetch bunny armadillo"),

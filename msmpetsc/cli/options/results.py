@@ -1,4 +1,4 @@
-"""The arguments of what is done with results: ``compare`` and ``render``."""
+"""The arguments of what is done with results: ``compare``, ``render`` and ``export``."""
 
 from msmpetsc.cli.options.values import Commands, add_json, file_argument
 
@@ -35,3 +35,18 @@ def add_render(commands: Commands) -> None:
         "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"
     )
     parser.add_argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)")
+
+
+def add_export(commands: Commands) -> None:
+    """Add ``msmpetsc export``."""
+    parser = commands.add_parser(
+        "export",
+        help="write frames of a result in another format",
+        description="Write frames of a result for another program; the name's ending says in which format: .vtkhdf and "
+        ".glb hold frames in time, .obj, .ply, .stl and .vtu one frame.",
+    )
+    parser.add_argument("result", metavar="OUT.h5", type=file_argument)
+    parser.add_argument("-o", "--output", metavar="FILE", type=file_argument, required=True, help="what to write")
+    parser.add_argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold")
+    parser.add_argument("--frames", metavar="0,10,20", help="these frames; default: all, or the last (-1) of one")
+    parser.add_argument("--every", metavar="N", type=int, default=1, help="every N-th of them (1)")

@@ -1,0 +1,104 @@
+"""The formats that a result is exported to, in one table, and the export itself."""
+
+import os
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msmpetsc.errors import InputError
+from msmpetsc.output.export.moments import Mesh, Moments
+from msmpetsc.output.reader import Result
+
+EXPORT = "msmpetsc.output.export."
+
+
+class Format(NamedTuple):
+    """A format of files.
+
+    writer : module, below this folder, and function that writes moments under a path
+    moves  : whether a file holds frames in time, or one frame
+    meshes : of which it can hold one; the first if none is asked for
+    about  : what reads it
+    """
+
+    writer: tuple[str, str]
+    moves: bool
+    meshes: tuple[Mesh, ...]
+    about: str
+
+    def load(self) -> Callable[[Moments, Path], None]:
+        """Import the writer: each needs packages of its own."""
+        module, function = self.writer
+        return getattr(import_module(EXPORT + module), function)
+
+
+ONE_FRAME = ("one_frame", "write_one_frame")
+FORMATS = {
+    ".vtkhdf": Format(("vtkhdf", "write_vtkhdf"), True, ("surface", "lattice"), "ParaView, VTK, pyvista"),
+    ".glb": Format(("gltf", "write_glb"), True, ("surface",), "Blender, browsers"),
+    ".obj": Format(ONE_FRAME, False, ("surface",), "nearly everything"),
+    ".ply": Format(ONE_FRAME, False, ("surface",), "MeshLab, Blender, trimesh"),
+    ".stl": Format(ONE_FRAME, False, ("surface",), "printers"),
+    ".vtu": Format(ONE_FRAME, False, ("lattice", "surface"), "ParaView, VTK, pyvista, meshio"),
+}
+
+
+def export(
+    result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Sequence[int] | None = None, every: int = 1
+) -> Path:
+    """Write frames of a result in the format that the path's ending names, and return the path.
+
+    mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
+    frames : their numbers, -1 the last; all if None, or the last where the format holds one
+    every  : of the frames chosen take every so many
+
+    Raises InputError.
+    """
+    path = Path(path)
+    chosen = FORMATS.get(path.suffix.lower())
+    if chosen is None:
+        raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
+    write = chosen.load()
+    with Result(result) as run:
+        moments = Moments(run, _mesh(run, path, chosen, mesh), _frames(run, path, chosen, frames, every))
+        part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(moments, part)
+            part.replace(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        finally:
+            part.unlink(missing_ok=True)
+    return path
+
+
+def _mesh(run: Result, path: Path, chosen: Format, mesh: Mesh | None) -> Mesh:
+    """Return which mesh is meant. Raises InputError for one that the format does not hold."""
+    if mesh is None:
+        has_surface = "surface/points" in run
+        return next((m for m in chosen.meshes if m == "lattice" or has_surface), chosen.meshes[0])
+    if mesh not in chosen.meshes:
+        raise InputError(f"{path}: a *{path.suffix} holds no {mesh}, but the {' or the '.join(chosen.meshes)}")
+    return mesh
+
+
+def _frames(run: Result, path: Path, chosen: Format, frames: Sequence[int] | None, every: int) -> list[int]:
+    """Return the numbers of the frames meant. Raises InputError for frames that the result does not have."""
+    count = len(run.frames.time)
+    if not count:
+        raise InputError(f"{run.path} has no finished frame")
+    if frames is None:
+        frames = range(count) if chosen.moves else (-1,)
+    wrong = [frame for frame in frames if not -count <= frame < count]
+    if wrong or not len(frames):
+        raise InputError(f"{run.path} has frames 0 to {count - 1}, and no {wrong[0] if wrong else 'other'}")
+    numbers = [int(frame) % count for frame in frames][::every]
+    if not chosen.moves and len(numbers) > 1:
+        raise InputError(f"{path}: a *{path.suffix} holds one frame, not {len(numbers)}")
+    if np.any(np.diff(numbers) <= 0):
+        raise InputError("frames to be exported must follow each other in time, each once")
+    return numbers

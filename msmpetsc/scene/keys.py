@@ -18,7 +18,7 @@ NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
 
 
 @dataclass(frozen=True)
-class Key:
+class SceneKey:
     """A key of a scene file, in words.
 
     name : as ``--set`` takes it, N for the number of a [[table]]: "pin.N.region.box"
@@ -36,7 +36,7 @@ def json_schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **_without_null(SceneFile.model_json_schema())}
 
 
-def keys(prefix: str = "") -> list[Key]:
+def keys(prefix: str = "") -> list[SceneKey]:
     """Return all keys, or those of a table or the one of this name. Raises InputError where there is none."""
     schema = json_schema()
     every = list(_keys(schema, schema, ""))
@@ -49,7 +49,7 @@ def keys(prefix: str = "") -> list[Key]:
     return chosen
 
 
-def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterator[Key]:
+def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterator[SceneKey]:
     one_of = [name for choice in table.get("oneOf", ()) for name in choice["required"]]
     for name, found in table["properties"].items():
         inner = found.get("items", found).get("$ref", "").rpartition("/")[2]
@@ -61,7 +61,7 @@ def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterato
             default = f"one of {', '.join(one_of)}"
         else:
             default = "required" if name in table.get("required", ()) else _default(found, text)
-        yield Key(prefix + name, _unit(text), default, _bounds(found), _about(text))
+        yield SceneKey(prefix + name, _unit(text), default, _bounds(found), _about(text))
 
 
 def _default(found: dict[str, Any], text: str) -> str:

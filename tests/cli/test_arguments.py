@@ -28,6 +28,10 @@ COMMANDS = [
     ["study", "study.toml", "-o", "{}"],
     ["plan", "{}", "--error", "0.1"],
     ["fetch", "{}"],
+    ["new", "{}", "--mesh", "good.h5"],
+    ["new", "new.toml", "--mesh", "{}"],
+    ["baseline", "{}"],
+    ["check", "{}"],
 ]
 PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]
 PATHS += ["scene.toml/x.h5", "a\x1b[31m.h5", "loop.h5", "\u2028.h5"]

@@ -6,12 +6,12 @@ import pytest
 from conftest import ROOT
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.keys import Key, json_schema, keys
+from msmpetsc.scene.keys import SceneKey, json_schema, keys
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.shipped import shipped_text, shipped_titles
 
 
-def key(name: str) -> Key:
+def key(name: str) -> SceneKey:
     (found,) = (each for each in keys() if each.name == name)
     return found
 
@@ -52,8 +52,8 @@ def accepts(schema: dict, node: dict, value: object) -> bool:
     """Whether a value is as the schema says, as far as an editor looks."""
     if "$ref" in node:
         node = schema["$defs"][node["$ref"].rpartition("/")[2]]
-    if "anyOf" in node and not any(accepts(schema, choice, value) for choice in node["anyOf"]):
-        return False
+    if "anyOf" in node:
+        return any(accepts(schema, choice, value) for choice in node["anyOf"])
     if "oneOf" in node and sum(set(choice["required"]) <= set(value) for choice in node["oneOf"]) != 1:
         return False
     if "enum" in node and value not in node["enum"]:

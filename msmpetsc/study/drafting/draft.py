@@ -28,7 +28,7 @@ GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
 @dataclass(frozen=True)
-class Body:
+class Shape:
     """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
 
     sides: np.ndarray
@@ -46,7 +46,7 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     """Return the text of a scene for a mesh, ``source`` as the scene will name it."""
     unit = mesh.unit or USUAL_SIZE / mesh.sides.max()
     sides = unit * (mesh.sides[[0, 2, 1]] if mesh.y_up else mesh.sides)
-    body = Body(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
+    body = Shape(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
     head = [
         f"#:schema {SCHEMA_FILE}",
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
@@ -57,7 +57,7 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     return "\n".join([*head, "", *mesh_lines, "", *cages, "", *moved]) + "\n"
 
 
-def _mesh(source: str, mesh: MeshMeasures, body: Body) -> list[str]:
+def _mesh(source: str, mesh: MeshMeasures, body: Shape) -> list[str]:
     """Return the table of the mesh, and what is wrong with it."""
     report, longest = mesh.report, float(body.sides.max())
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
@@ -89,14 +89,14 @@ def _mesh(source: str, mesh: MeshMeasures, body: Body) -> list[str]:
     return lines
 
 
-def _cages(body: Body) -> list[str]:
+def _cages(body: Shape) -> list[str]:
     aim = body.volume * (ACROSS / body.thickness) ** 3
     count = int(plain(min(max(aim, CELLS[0]), CELLS[1]), 1))
     across = body.thickness * (count / body.volume) ** (1 / 3)
     return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
 
 
-def _falling(body: Body) -> list[str]:
+def _falling(body: Shape) -> list[str]:
     """Return the tables of a body that falls on the ground."""
     height = float(body.sides[2])
     young = SINKING * DENSITY * G * height
@@ -114,7 +114,7 @@ def _falling(body: Body) -> list[str]:
     return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
 
 
-def _clamped(body: Body, axis: int) -> list[str]:
+def _clamped(body: Shape, axis: int) -> list[str]:
     """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
     length, thick = float(body.sides[axis]), float(body.sides[2])
     young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight

@@ -26,5 +26,5 @@ def run(args: argparse.Namespace) -> int:
 def complete_files(parser: argparse.ArgumentParser, by: dict[str, Any]) -> None:
     """Complete each argument that is a path by the files that there are."""
     for action in parser._actions:
-        if action.type in (path_argument, file_argument) or action.dest == "mesh":
+        if action.type in (path_argument, file_argument):
             action.complete = by  # type: ignore[attr-defined]  # where shtab looks for it

@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 
 from msmpetsc.cli.arguments import SCENE_NAMES, refuse_other_format, refuse_ranks
-from msmpetsc.errors import InputError, printable
-from msmpetsc.geometry.registry import MODELS, load
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
@@ -39,28 +39,26 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def drafted(mesh: str, scene: Path) -> str:
+def drafted(mesh: Path, scene: Path) -> str:
     """Return the text of a scene for a mesh, a file or a registry name. Raises InputError."""
-    if mesh in MODELS:
-        source, suffix, surface = mesh, "", load(mesh, scene.parent)
-    else:
-        source, suffix = beside(mesh, scene), Path(mesh.removesuffix(".gz")).suffix
-        surface = load(source, scene.parent)
+    is_named = str(mesh) in MODELS
+    source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), Path(mesh.name.removesuffix(".gz")).suffix)
+    surface = load(source, scene.parent)
     check_encloses(surface, examine(surface))
     return draft(source, scene.stem, measured(surface, suffix))
 
 
-def beside(mesh: str, scene: Path) -> str:
+def beside(mesh: Path, scene: Path) -> str:
     """Return the path of a mesh from the folder of its scene, in or below which it must be. Raises InputError."""
-    folder, path = scene.parent, Path(mesh)
-    if not path.exists():
-        load(mesh, Path())  # says what it is not
-    if not lies_below(folder, str(path.resolve())):
+    folder = scene.parent
+    if not mesh.exists():
+        locate(str(mesh), Path())  # says what it is not
+    if not lies_below(folder, str(mesh.resolve())):
         raise InputError(
-            f"{printable(mesh)} is not in {folder.resolve()}, nor below it, where a scene has its meshes: "
+            f"{mesh} is not in {folder.resolve()}, nor below it, where a scene has its meshes: "
             "write the scene beside its mesh"
         )
-    return str(path.resolve().relative_to(folder.resolve()))
+    return str(mesh.resolve().relative_to(folder.resolve()))
 
 
 def write(path: Path, text: str) -> None:

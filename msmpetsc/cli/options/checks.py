@@ -1,6 +1,6 @@
 """The arguments of what guards a scene's numbers: ``baseline`` and ``check``."""
 
-from msmpetsc.cli.options.values import Commands, add_json, add_set, file_argument, path_argument
+from msmpetsc.cli.options.values import Commands, add_json, add_set, file_argument
 
 
 def add_baseline(commands: Commands) -> None:
@@ -11,7 +11,7 @@ def add_baseline(commands: Commands) -> None:
         description="Run the first steps of a scene, each solved to 1e-9, and store counts, energies, momentum and "
         "places, with what later ones may be off.",
     )
-    parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
+    parser.add_argument("scene", type=file_argument, metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("-o", "--output", type=file_argument, metavar="FILE.json", help="default: SCENE.baseline.json")
     parser.add_argument("--cells", type=int, metavar="N", help="cages.count; the scene's cells if not given")
     parser.add_argument("--frames", type=int, default=20, metavar="N", help="steps, the scene's at the most (20)")
@@ -28,7 +28,7 @@ def add_check(commands: Commands) -> None:
         description="Run scenes as their numbers were stored by baseline, and compare. "
         "Exit status 0: all are as stored; 1: something differs.",
     )
-    parser.add_argument("scenes", type=path_argument, nargs="+", metavar="SCENE", help="scene files (TOML)")
+    parser.add_argument("scenes", type=file_argument, nargs="+", metavar="SCENE", help="scene files (TOML)")
     parser.add_argument("--baseline", type=file_argument, metavar="FILE.json", help="default: SCENE.baseline.json")
     parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks of the runs (1)")
     parser.add_argument("--junit", type=file_argument, metavar="OUT.xml", help="write what was checked as JUnit XML")

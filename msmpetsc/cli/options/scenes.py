@@ -12,7 +12,12 @@ def add_new(commands: Commands) -> None:
         "msmpetsc; beside it the schema by which editors complete its keys.",
     )
     parser.add_argument("scene", nargs="?", type=file_argument, metavar="SCENE.toml", help="what is written")
-    parser.add_argument("--mesh", metavar="MESH", help="a mesh file in or below the scene's folder, or a model's name")
+    parser.add_argument(
+        "--mesh",
+        type=file_argument,
+        metavar="MESH",
+        help="a mesh file in or below the scene's folder, or a model",
+    )
     parser.add_argument("--from", dest="from_scene", metavar="NAME", help="copy this scene, see --list")
     parser.add_argument("--list", action="store_true", help="list the scenes that come with msmpetsc")
     parser.add_argument("--overwrite", action="store_true", help="replace SCENE.toml if it exists")

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from msmpetsc.model.inversion import least_volumes
 from msmpetsc.model.loads import Motion
+from msmpetsc.output.drawing.sheet import read_scene
 from msmpetsc.output.reader import Result
-from msmpetsc.output.render import read_scene
 
 SCENE, OUT = ROOT / "scenes" / "lung_press.toml", ROOT / "out" / "press_study"
 HEIGHT, START = 0.37, 0.38  # of the lung and of the plate's lower face at the start [m]

@@ -6,8 +6,8 @@ import numpy as np
 
 from msmpetsc.cli.arguments import PICTURE_NAMES, refuse_below_one, refuse_other_format, refuse_ranks
 from msmpetsc.errors import InputError
+from msmpetsc.output.drawing.sheet import contact_sheet
 from msmpetsc.output.reader import refuse_deadly
-from msmpetsc.output.render import contact_sheet
 
 
 def run(args: argparse.Namespace) -> int:

@@ -295,7 +295,7 @@ def write_companions(request: RunRequest, whole: bool) -> None:
     except OSError as error:
         raise InputError(f"{path.with_suffix('.xdmf')} cannot be written: {error.strerror}") from None
     if whole and request.picture:
-        from msmpetsc.output.render import contact_sheet  # loads VTK: a second that other runs need not wait
+        from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
 
         contact_sheet(path, path.with_suffix(".png"))
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from msmpetsc.model.loads import LoadTable, Motion, within
 from msmpetsc.model.region import inside
-from msmpetsc.output.camera import Camera, unit
+from msmpetsc.output.drawing.camera import Camera, unit
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.schema import SceneFile
 

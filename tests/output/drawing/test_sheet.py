@@ -17,8 +17,8 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import Frame
-from msmpetsc.output import overlays, render
-from msmpetsc.output.camera import YAW, camera_facing
+from msmpetsc.output.drawing import overlays, sheet
+from msmpetsc.output.drawing.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
 from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.body import Region
@@ -78,32 +78,32 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
 
 def test_moments_tell_the_story(result):
     with Result(result) as run:
-        five = render.choose_moments(run, 5)
+        five = sheet.choose_moments(run, 5)
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
-        assert list(render.choose_moments(run, 3)) == [0, 5, 10]
-        assert list(render.choose_moments(run, 1)) == [0]
-        assert list(render.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
-        assert list(render.choose_moments(run, 99)) == list(range(11))
+        assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
+        assert list(sheet.choose_moments(run, 1)) == [0]
+        assert list(sheet.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(sheet.choose_moments(run, 99)) == list(range(11))
 
 
 def test_surface_that_was_not_stored_is_computed(result, tmp_path):
     bare = write_ball(tmp_path / "bare.h5", surface=False)
     with Result(result) as stored, Result(bare) as run:
-        assert render.surface_points(run, 4) == pytest.approx(render.surface_points(stored, 4), abs=1e-7)
+        assert sheet.surface_points(run, 4) == pytest.approx(sheet.surface_points(stored, 4), abs=1e-7)
 
 
 @pytest.fixture
 def panels(tmp_path, monkeypatch):
     """panels(scene tables, options) of a sheet that is not drawn."""
 
-    def sheet(tables: str, **options) -> list[render.Panel]:
+    def panels_of(tables: str, **options) -> list[sheet.Panel]:
         drawn = []
-        monkeypatch.setattr(render, "draw", lambda panels, *_: drawn.extend(panels))
+        monkeypatch.setattr(sheet, "draw", lambda panels, *_: drawn.extend(panels))
         path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + tables)
-        render.contact_sheet(path, tmp_path / "x.png", **options)
+        sheet.contact_sheet(path, tmp_path / "x.png", **options)
         return drawn
 
-    return sheet
+    return panels_of
 
 
 def test_moments_of_the_scene(panels):
@@ -142,8 +142,8 @@ def test_the_eye_chooses_the_side(tmp_path):
     path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
     dark = []
     for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
-        picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
-        ball = picture[: -render.CAPTION].astype(int)
+        picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
+        ball = picture[: -sheet.CAPTION].astype(int)
         dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
     assert dark[0] > 0.5 and dark[1] < 0.1
 
@@ -204,7 +204,7 @@ def test_an_arrow_for_each_force_while_it_acts(panels):
 
 def test_an_arrow_is_seen_in_front_of_the_body(tmp_path):
     path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + FORCE)
-    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[2, 8]))).astype(int)
+    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[2, 8]))).astype(int)
     red = [(panel[..., 0] - panel[..., 2] > 90).sum() for panel in np.split(picture, 2, axis=1)]
     assert red[0] > 500 and red[1] == 0
 
@@ -255,7 +255,7 @@ def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
     level = "picture.eye = [0, -1, 0]"
     path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + level + PLATE)
-    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -render.CAPTION]
+    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0, 1, 8])))[: -sheet.CAPTION]
     panels = np.split(picture, 3, axis=1)
     across = np.flatnonzero(is_body(panels[2]).any(axis=0))
     left, ball = across[0] - 2, slice(across[0], across[-1] + 1)
@@ -282,7 +282,7 @@ def body_rows(picture: np.ndarray) -> tuple[int, int]:
 
 
 def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
-    render.contact_sheet(result, tmp_path / "new" / "x.png")
+    sheet.contact_sheet(result, tmp_path / "new" / "x.png")
     assert capfd.readouterr().err == ""
     picture = np.array(Image.open(tmp_path / "new" / "x.png"))
     panels = np.split(picture, 5, axis=1)
@@ -299,7 +299,7 @@ def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
 
 def test_no_ground_where_the_scene_has_none(tmp_path):
     path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE)
-    picture = np.array(Image.open(render.contact_sheet(path, tmp_path / "x.png", frames=[3])))
+    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[3])))
     assert not (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any()
 
 
@@ -333,12 +333,12 @@ def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
         with h5py.File(path, "r+") as file:
             del (file.attrs if key == "scene" else file)[key]
         with pytest.raises(InputError, match=told):
-            render.contact_sheet(path, tmp_path / "x.png")
+            sheet.contact_sheet(path, tmp_path / "x.png")
 
 
 def test_without_opengl_one_line_names_the_package(result, tmp_path):
     """EGL is made to find no driver; VTK would crash."""
-    draw = "import sys; from msmpetsc.output.render import contact_sheet; contact_sheet(*sys.argv[1:])"
+    draw = "import sys; from msmpetsc.output.drawing.sheet import contact_sheet; contact_sheet(*sys.argv[1:])"
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
     order = [sys.executable, "-c", draw, str(result), str(tmp_path / "x.png")]
@@ -352,16 +352,16 @@ def test_without_opengl_one_line_names_the_package(result, tmp_path):
 def drawing(result, tmp_path, monkeypatch):
     """What a sheet of frames 0 and 8 is drawn from: panels, triangles, camera."""
     with monkeypatch.context() as patch:
-        patch.setattr(render, "draw", lambda *given: calls.append(given))
+        patch.setattr(sheet, "draw", lambda *given: calls.append(given))
         calls = []
-        render.contact_sheet(result, tmp_path / "x.png", frames=[0, 8])
+        sheet.contact_sheet(result, tmp_path / "x.png", frames=[0, 8])
     return calls[0][:3]
 
 
 def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
     """Wider than the 8192 pixels at which Mesa's pictures end."""
     panels, triangles, camera = drawing
-    render.draw(13 * panels, triangles, camera, tmp_path / "x.png")
+    sheet.draw(13 * panels, triangles, camera, tmp_path / "x.png")
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert drawn.shape[1] > 8192
     sheets = np.split(drawn, 26, axis=1)
@@ -375,20 +375,20 @@ def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result,
     with pytest.raises(
         InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"
     ):
-        render.draw(100 * panels, triangles, camera, tmp_path / "y.png")
-    monkeypatch.setattr(render, "WIDEST", 2000)
-    monkeypatch.setattr(render, "surface_points", lambda *_: pytest.fail("a surface was read"))
+        sheet.draw(100 * panels, triangles, camera, tmp_path / "y.png")
+    monkeypatch.setattr(sheet, "WIDEST", 2000)
+    monkeypatch.setattr(sheet, "surface_points", lambda *_: pytest.fail("a surface was read"))
     for options in ({"count": 10**9}, {"frames": list(range(11))}):
         with pytest.raises(
             InputError,
             match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000",
         ):
-            render.contact_sheet(result, tmp_path / "y.png", **options)
+            sheet.contact_sheet(result, tmp_path / "y.png", **options)
     assert not (tmp_path / "y.png").exists()
 
 
 def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
-    monkeypatch.setattr(render.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
+    monkeypatch.setattr(sheet.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(InputError, match=r"y\.png cannot be drawn: the graphics library gives a black picture"):
-        render.draw(*drawing, tmp_path / "y.png")
+        sheet.draw(*drawing, tmp_path / "y.png")
     assert not (tmp_path / "y.png").exists()

@@ -17,8 +17,8 @@ from PIL import Image
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.camera import Camera, camera_facing
-from msmpetsc.output.overlays import MARGIN, Ground, Overlays, Rest, fixed_nodes, overlays_at
+from msmpetsc.output.drawing.camera import Camera, camera_facing
+from msmpetsc.output.drawing.overlays import MARGIN, Ground, Overlays, Rest, fixed_nodes, overlays_at
 from msmpetsc.output.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
 

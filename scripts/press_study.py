@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from msmpetsc.model.inversion import least_volumes
 from msmpetsc.model.loads import Motion
-from msmpetsc.output.drawing.sheet import read_scene
+from msmpetsc.output.drawing.subject import read_scene
 from msmpetsc.output.reader import Result
 
 SCENE, OUT = ROOT / "scenes" / "lung_press.toml", ROOT / "out" / "press_study"

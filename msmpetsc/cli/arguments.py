@@ -179,10 +179,11 @@ COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module
 
 RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
+MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
 SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
 NO_FOLDERS = (
-    *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES,
-    ".csv", ".gif", ".html", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"
+    *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES,
+    ".csv", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"
 )  # fmt: skip
 
 

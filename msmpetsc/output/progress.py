@@ -2,8 +2,9 @@
 
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 from tqdm import tqdm
 from tqdm.contrib.logging import tqdm_logging_redirect
@@ -11,6 +12,7 @@ from tqdm.contrib.logging import tqdm_logging_redirect
 from msmpetsc.comm import log
 from msmpetsc.model.fields import Frame
 
+Item = TypeVar("Item")
 LINE_EVERY = 10.0  # [s] at the least between two lines of a log
 
 
@@ -72,3 +74,8 @@ def duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def counted(items: Sequence[Item], unit: str) -> Iterator[Item]:
+    """Yield the items, with a bar on a terminal that goes away with the last of them."""
+    yield from tqdm(items, unit=f" {unit}", disable=None, leave=False, dynamic_ncols=True)

@@ -29,7 +29,7 @@ WRONG = [
     (["run", "scene.toml", "--resume", "x.vtk"], RESULT),
     (["run", "scene.toml", "--measure", "x.csv"], JSON),
     (["run", "scene.toml", "--measure", "scene.toml"], JSON),
-    *[(["render", "bar.h5", "-o", name], PICTURE) for name in ("x.vtk", "x.gif", "x.jpg", "x", "bar.h5")],
+    *[(["render", "bar.h5", "-o", name], PICTURE) for name in ("x.vtk", "x.mkv", "x.jpg", "x", "bar.h5")],
     *[(["study", "study.toml", "-o", name], "what is written there is a folder")
       for name in ("x.csv", "x.vtk", "x.gif", "x.HTML")],
     (["compare", "bar.h5", "bar.h5", "-o", "x.vtk"], "compare: unknown argument -o"),

@@ -1,28 +1,184 @@
-"""``msmpetsc render``: some moments of a result in one picture."""
+"""``msmpetsc render``: pictures, films and pages of a result, or of a scene or a mesh before anything is run."""
 
 import argparse
+import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from mpi4py import MPI
 
-from msmpetsc.cli.arguments import PICTURE_NAMES, refuse_below_one, refuse_other_format, refuse_ranks
-from msmpetsc.errors import InputError
-from msmpetsc.output.drawing.sheet import contact_sheet
-from msmpetsc.output.reader import refuse_deadly
+from msmpetsc.cli.arguments import (
+    MOVIE_NAMES,
+    PAGE_NAMES,
+    PICTURE_NAMES,
+    RESULT_NAMES,
+    refuse_below_one,
+    refuse_other_format,
+    refuse_ranks,
+)
+from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.build import build_model
+from msmpetsc.output.drawing.colouring import opened_reference
+from msmpetsc.output.drawing.fabric import SHOWN
+from msmpetsc.output.drawing.film import TURN, Pace, paced, write_film
+from msmpetsc.output.drawing.moments import Frames, frames_of
+from msmpetsc.output.drawing.page import write_page
+from msmpetsc.output.drawing.sheet import Moment, contact_sheet, draw_moments
+from msmpetsc.output.drawing.style import Style
+from msmpetsc.output.drawing.subject import Subject, subject_of_model, subject_of_result, subject_of_surface
+from msmpetsc.output.reader import Result, plain_damage, refuse_deadly
+from msmpetsc.scene.reading import load_scene
+
+SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
+STILL = (760, 900)  # [px]: a panel of a scene or a mesh
+ONLY = {  # options by the endings of what they are for
+    "count": PICTURE_NAMES,
+    "size": (*PICTURE_NAMES, *MOVIE_NAMES),
+    "show": (*PICTURE_NAMES, *MOVIE_NAMES),
+    "fps": MOVIE_NAMES,
+    "speed": MOVIE_NAMES,
+    "turntable": MOVIE_NAMES,
+}
+FASTEST = {"fps": 240, "speed": 1e6}
+TURN_FPS = 30  # pictures a second of a body that is turned around
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the picture and print its path; return the exit status."""
+    """Draw what is asked for and print its path; return the exit status."""
     refuse_ranks("render", "it draws on one process")
     refuse_below_one(count=args.count)
-    refuse_other_format("-o", args.output, PICTURE_NAMES)
-    picture = args.output or args.result.with_suffix(".png")
-    frames = numbers("--frames", args.frames, int, "0,10,20")
+    refuse_other_format("-o", args.output, (*PICTURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES))
+    path = args.output or args.subject.with_suffix(".png")
+    ending = path.suffix.lower()
+    for option, endings in ONLY.items():
+        if getattr(args, option) and ending not in endings:
+            raise InputError(f"--{option} is for {', '.join(f'*{end}' for end in endings)}, not for {path}")
+    style, frames = style_of(args), _frames(args.frames)
+    if args.subject.suffix.lower() in RESULT_NAMES:
+        refuse_deadly(args.subject)
+        _draw_result(args, path, frames, style)
+    else:
+        _draw_unrun(args, path, style)
+    print(path)
+    return 0
+
+
+def style_of(args: argparse.Namespace) -> Style:
+    """Return how things are to look. Raises InputError."""
     eye = numbers("--eye", args.eye, float, "1,-2,0.6")
     if eye is not None and not (len(eye) == 3 and any(eye) and np.isfinite(eye).all()):
         raise InputError(f"--eye takes three numbers, not all zero, not {args.eye!r}")
-    refuse_deadly(args.result)
-    print(contact_sheet(args.result, picture, frames, args.count, eye))
-    return 0
+    shown = tuple(args.show.split(",")) if args.show else ()
+    for name in shown:
+        if name not in SHOWN:
+            raise InputError(f"--show takes {' and '.join(SHOWN)}, not {name!r}{did_you_mean(name, SHOWN)}")
+    for option in ("fps", "speed"):
+        number = getattr(args, option)
+        if number is not None and not (0 < number <= FASTEST[option]):
+            raise InputError(f"--{option} must be above 0, and {FASTEST[option]:g} at most, not {number:g}")
+    return Style(eye, args.colour, _size(args.size), args.axes, args.scale_bar, shown)
+
+
+def _draw_result(args: argparse.Namespace, path: Path, frames: Frames | None, style: Style) -> None:
+    """Draw a result: moments of it, a film, or a page."""
+    if path.suffix.lower() in PICTURE_NAMES:
+        contact_sheet(args.subject, path, frames, args.count, None, style, args.reference)
+        return
+    with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
+        subject = subject_of_result(run)
+        everything: Frames = [slice(-1, None) if args.turntable else slice(None)]
+        numbers = frames_of(subject.name, frames or everything, len(subject.times))
+        _draw_motion(args, subject, path, numbers, style, reference)
+
+
+def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
+    """Draw a scene or a mesh as it lies before anything is run."""
+    for option in ("frames", "count", "speed", "reference"):
+        if getattr(args, option) is not None:
+            raise InputError(f"--{option} is for results, and {args.subject} is none")
+    if path.suffix.lower() in MOVIE_NAMES and not args.turntable:
+        raise InputError(f"{args.subject} has no motion to film: --turntable turns it around")
+    subject, about = subject_of_file(args.subject, args.set)
+    if path.suffix.lower() not in PICTURE_NAMES:
+        _draw_motion(args, subject, path, [0], style, None)
+        return
+    moments = [Moment(0, (subject.title, about[0]), style.shown)]
+    if len(subject.rest.cells) and not style.shown:
+        moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
+    draw_moments(subject, path, moments, replace(style, size=style.size or STILL, axes=True, scale_bar=True))
+
+
+def _draw_motion(
+    args: argparse.Namespace, subject: Subject, path: Path, frames: list[int], style: Style, reference: Result | None
+) -> None:
+    """Draw a film or a page of these frames."""
+    if path.suffix.lower() in PAGE_NAMES:
+        write_page(subject, path, frames, style, reference)
+        return
+    if args.turntable and len(frames) == 1:
+        if args.speed is not None:
+            raise InputError("--speed needs --frames, two or more: time stands still on this turntable")
+        fps = args.fps or TURN_FPS
+        pace = Pace(np.zeros(round(TURN * fps), int), fps, 0.0)
+    else:
+        pace = paced(subject.times[frames], args.fps, args.speed)
+    write_film(subject, path, frames, style, pace, float(args.turntable), reference)
+
+
+def subject_of_file(path: Path, changes: list[str]) -> tuple[Subject, tuple[str, str]]:
+    """Return what a scene or a mesh shows, with its size and its cells in words. Raises InputError."""
+    if path.suffix.lower() != ".toml":
+        if changes:
+            raise InputError(f"--set changes a scene, and {path} is a mesh")
+        surface = read_surface(path)
+        return subject_of_surface(path, surface), (f"{_sides(surface.points)}, {_counted(surface)}", "")
+    scene = load_scene(path, changes)
+    model = build_model(MPI.COMM_SELF, scene)
+    subject = subject_of_model(path, scene, model)
+    lattice = model.lattice
+    cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
+    return subject, (f"{_sides(subject.rest.points)} m", cells)
+
+
+def _sides(points: np.ndarray) -> str:
+    """Return "0.3 x 0.2325 x 0.2974" of the box around points (v, 3)."""
+    return " x ".join(f"{length:.4g}" for length in np.ptp(points, axis=0))
+
+
+def _counted(surface: Surface) -> str:
+    return f"{len(surface.points)} points, {len(surface.triangles)} triangles"
+
+
+def _frames(text: str | None) -> Frames | None:
+    """Return the numbers and slices of "0,10:250:5". Raises InputError."""
+    if text is None:
+        return None
+    try:
+        return [_slice(part) if ":" in part else int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--frames takes numbers like 0,10,20 or slices like 0:250:5, not {text!r}") from None
+
+
+def _slice(text: str) -> slice:
+    """Return the slice of "0:250:5", from start to end without its end, as Python counts."""
+    numbers = [int(word) if word else None for word in text.split(":")]
+    if len(numbers) > 3 or numbers[2:] == [0]:
+        raise ValueError(text)
+    return slice(*numbers)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Return width and height of "960x720"; of films both must be even."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text, re.ASCII)
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(SIZES[0] <= side <= SIZES[1] and side % 2 == 0 for side in size):
+        raise InputError(f"--size takes two even numbers from {SIZES[0]} to {SIZES[1]}, like 960x720, not {text!r}")
+    return size
 
 
 def numbers(option: str, text: str | None, kind: type, example: str) -> list | None:

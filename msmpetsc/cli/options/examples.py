@@ -22,7 +22,13 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "msmpetsc plan my.toml --error 0.01 --frames 10",
     ),
     "compare": ("msmpetsc compare out/a.h5 out/b.h5 --rtol 1e-3", "msmpetsc compare out/a.h5 out/b.h5 --json"),
-    "render": ("msmpetsc render out/my.h5 --count 12", "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5"),
+    "render": (
+        "msmpetsc render out/my.h5 --frames 0,10,20 --eye=-1,2,0.5",
+        "msmpetsc render out/my.h5 -o out/my.mp4 --speed 0.1",
+        "msmpetsc render out/my.h5 -o out/my.html --colour strain",
+        "msmpetsc render out/my.h5 -o out/turn.gif --turntable --size 480x360",
+        "msmpetsc render my.toml --show cells",
+    ),
     "export": (
         "msmpetsc export out/my.h5 -o out/my.vtkhdf --mesh lattice",
         "msmpetsc export out/my.h5 -o out/last.obj --frames -1",

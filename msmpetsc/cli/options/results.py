@@ -1,6 +1,8 @@
 """The arguments of what is done with results: ``compare``, ``render`` and ``export``."""
 
-from msmpetsc.cli.options.values import Commands, add_json, file_argument
+import argparse
+
+from msmpetsc.cli.options.values import Commands, add_json, add_set, file_argument
 
 
 def add_compare(commands: Commands) -> None:
@@ -25,16 +27,53 @@ def add_compare(commands: Commands) -> None:
 
 def add_render(commands: Commands) -> None:
     """Add ``msmpetsc render``."""
-    parser = commands.add_parser("render", help="draw some moments of a result side by side")
-    parser.add_argument("result", metavar="OUT.h5", type=file_argument)
-    parser.add_argument(
-        "-o", "--output", metavar="PNG", type=file_argument, help="default: beside the result, ending in .png"
+    parser = commands.add_parser(
+        "render",
+        help="draw a result as a picture, a film or a page; or a scene or a mesh before anything is run",
+        description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
+        "a browser in which the body turns and its frames play (*.html). A scene or a mesh is drawn as it lies.",
     )
-    parser.add_argument("--frames", metavar="0,10,20", help="these frames, in this order")
+    parser.add_argument("subject", metavar="OUT.h5|SCENE.toml|MESH", type=file_argument, help="what is drawn")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", type=file_argument,
+        help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
+    )  # fmt: skip
+    parser.add_argument("--frames", metavar="0,10,20", help="these frames; slices like 0:250:5 as Python counts")
     parser.add_argument(
         "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"
     )
     parser.add_argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)")
+    add_look(parser)
+    add_film(parser)
+    add_set(parser)
+
+
+def add_look(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``render`` that say how things look."""
+    parser.add_argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)")
+    parser.add_argument(
+        "--colour", metavar="FIELD", help="colour by displacement, speed, strain, part, or error, with a legend"
+    )
+    parser.add_argument(
+        "--reference",
+        metavar="OUT.h5",
+        type=file_argument,
+        help="of --colour error: the result that it is counted from",
+    )
+    parser.add_argument("--axes", action="store_true", help="draw a box around the body, with lengths")
+    parser.add_argument("--scale-bar", action="store_true", help="put a length into the legend")
+    parser.add_argument(
+        "--show", metavar="cells,springs", help="cut the body open: boundary cells red, interior ones blue"
+    )
+
+
+def add_film(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``render`` for films."""
+    parser.add_argument("--fps", type=float, metavar="N", help="pictures a second; alone: every frame is one picture")
+    parser.add_argument("--speed", type=float, metavar="S", help="simulated seconds a second (1, which is real time)")
+    parser.add_argument(
+        "--turntable", action="store_true", help="go around the body once; of the last frame unless --frames is given"
+    )
 
 
 def add_export(commands: Commands) -> None:

@@ -68,3 +68,10 @@ def unit(vector: ArrayLike) -> np.ndarray:
     scaled = np.asarray(vector, float)
     scaled = scaled / np.abs(scaled).max()  # the squares of very large or small components leave the range
     return scaled / np.linalg.norm(scaled)
+
+
+def turned(camera: Camera, angle: float) -> Camera:
+    """Return the camera after the eye went an angle [rad] around the upright axis, to its right."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    right, away = camera.right, camera.away
+    return Camera(cosine * right + sine * away, cosine * away - sine * right, camera.up, camera.elevation)

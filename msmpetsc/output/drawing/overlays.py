@@ -66,10 +66,41 @@ class Rest:
         if region.painted is None:
             return inside(region, self.nodes, self.bounds)
         where = np.zeros(len(self.nodes), bool)
+        where[self.cells[self._painted_cells(region.painted)]] = True
+        return where
+
+    @property
+    def middles(self) -> np.ndarray:
+        """Centres (c, 3) of the cells [m]."""
+        return self.nodes[self.cells].mean(axis=1)
+
+    def find_cells(self, region: Region) -> np.ndarray:
+        """Tell which cells (c,) a region means, by their centres; none if it is painted in a file."""
+        if region.painted is None:
+            return inside(region, self.middles, self.bounds)
+        where = np.zeros(len(self.cells), bool)
+        where[self._painted_cells(region.painted)] = True
+        return where
+
+    def _painted_cells(self, painted: str | tuple[int, ...]) -> np.ndarray:
+        """Return the numbers of the cells around painted points."""
+        if isinstance(painted, str):
+            return np.empty(0, int)
+        # cubes: the nearest is around it
+        return KDTree(self.middles).query(self.points[list(painted)], p=np.inf)[1]
+
+
+@dataclass(frozen=True)
+class SurfaceAtRest(Rest):
+    """A body known by its surface alone: its nodes are the surface points, and it has no cells."""
+
+    def find(self, region: Region) -> np.ndarray:
+        """Tell which surface points (v,) a region means; none if it is painted in a file."""
+        if region.painted is None:
+            return inside(region, self.points, self.bounds)
+        where = np.zeros(len(self.points), bool)
         if not isinstance(region.painted, str):
-            middles = KDTree(self.nodes[self.cells].mean(axis=1))
-            cells = middles.query(self.points[list(region.painted)], p=np.inf)[1]  # cubes: the nearest is around it
-            where[self.cells[cells]] = True
+            where[list(region.painted)] = True
         return where
 
 

@@ -17,7 +17,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.model.fields import Frame
-from msmpetsc.output.drawing import overlays, sheet
+from msmpetsc.output.drawing import legend, moments, overlays, sheet, stage, subject
 from msmpetsc.output.drawing.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
 from msmpetsc.output.writer import Begin, ResultFile
@@ -78,18 +78,18 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
 
 def test_moments_tell_the_story(result):
     with Result(result) as run:
-        five = sheet.choose_moments(run, 5)
+        five = moments.choose_moments(run, 5)
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
-        assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
-        assert list(sheet.choose_moments(run, 1)) == [0]
-        assert list(sheet.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
-        assert list(sheet.choose_moments(run, 99)) == list(range(11))
+        assert list(moments.choose_moments(run, 3)) == [0, 5, 10]
+        assert list(moments.choose_moments(run, 1)) == [0]
+        assert list(moments.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(moments.choose_moments(run, 99)) == list(range(11))
 
 
 def test_surface_that_was_not_stored_is_computed(result, tmp_path):
     bare = write_ball(tmp_path / "bare.h5", surface=False)
     with Result(result) as stored, Result(bare) as run:
-        assert sheet.surface_points(run, 4) == pytest.approx(sheet.surface_points(stored, 4), abs=1e-7)
+        assert subject.surface_points(run, 4) == pytest.approx(subject.surface_points(stored, 4), abs=1e-7)
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ def test_the_eye_chooses_the_side(tmp_path):
     dark = []
     for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
         picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
-        ball = picture[: -sheet.CAPTION].astype(int)
+        ball = picture[: -sheet.CAPTION - legend.LINE].astype(int)
         dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
     assert dark[0] > 0.5 and dark[1] < 0.1
 
@@ -377,7 +377,7 @@ def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result,
     ):
         sheet.draw(100 * panels, triangles, camera, tmp_path / "y.png")
     monkeypatch.setattr(sheet, "WIDEST", 2000)
-    monkeypatch.setattr(sheet, "surface_points", lambda *_: pytest.fail("a surface was read"))
+    monkeypatch.setattr(subject, "surface_points", lambda *_: pytest.fail("a surface was read"))
     for options in ({"count": 10**9}, {"frames": list(range(11))}):
         with pytest.raises(
             InputError,
@@ -388,7 +388,7 @@ def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result,
 
 
 def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
-    monkeypatch.setattr(sheet.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(InputError, match=r"y\.png cannot be drawn: the graphics library gives a black picture"):
+    monkeypatch.setattr(stage.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(InputError, match=r"the graphics library gives a black picture"):
         sheet.draw(*drawing, tmp_path / "y.png")
     assert not (tmp_path / "y.png").exists()

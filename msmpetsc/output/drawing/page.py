@@ -1,0 +1,197 @@
+"""A page for any browser, all in one file: the body turns with the mouse, its frames play under a slider.
+
+page.html is its frame, page.css its look, page.js what draws and steers it; this file says what is drawn. Positions are
+whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
+straight on from the two frames before, deflated and in base64.
+"""
+
+import base64
+import html
+import json
+import os
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError
+from msmpetsc.output.drawing import colours
+from msmpetsc.output.drawing.colouring import Colouring
+from msmpetsc.output.drawing.legend import entries_of
+from msmpetsc.output.drawing.overlays import Overlays
+from msmpetsc.output.drawing.shots import Shot, Survey, shots_of, survey
+from msmpetsc.output.drawing.style import Style
+from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.progress import counted
+from msmpetsc.output.reader import Result
+
+MOST = 20e6  # [byte]: a page of more frames takes fewer of them
+LEVELS = 65535  # of a coordinate
+PARTS = files("msmpetsc.output.drawing")
+
+
+def write_page(
+    subject: Subject, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
+) -> None:
+    """Write the page of these frames; of fewer, evenly chosen, where it would be larger than `MOST`.
+
+    Raises InputError where they cannot be drawn or the page not be written.
+    """
+    seen = survey(subject, frames, style, reference)
+    chosen = list(frames)
+    while True:
+        streams = packed_frames(subject, chosen, seen)
+        size = sum(map(len, streams.values())) * 4 / 3
+        if size <= MOST or len(chosen) < 3:
+            break
+        step = max(2, int(np.ceil(size / MOST)))
+        chosen = [*chosen[:-1:step], chosen[-1]]
+    if len(chosen) < len(frames):
+        log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
+    shots = shots_of(subject, chosen, seen)
+    streams["fixed"], numbers = fixed_states(subject, chosen)
+    facts = page_facts(subject, shots, seen, style) | {"fixed": numbers}
+    write_whole(path, page_text(subject.title, facts, streams))
+
+
+def packed_frames(subject: Subject, frames: Sequence[int], seen: Survey) -> dict[str, bytes]:
+    """Return positions, colours and triangles as deflated bytes, for page.js to read."""
+    points = len(subject.rest.points)
+    kind = np.dtype("<u2" if points <= LEVELS else "<u4")
+    streams = {
+        "positions": deflated(residuals(quantised(subject, frames, seen.box))),
+        "triangles": zlib.compress(subject.triangles.astype(kind).tobytes(), 6),
+    }
+    if seen.colouring is not None:
+        streams["colours"] = deflated(changes(levels(seen.colouring, frames)))
+    return streams
+
+
+def quantised(subject: Subject, frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the surface points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
+    scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
+    for index in counted(list(frames), "frames packed"):
+        yield np.clip(np.round((subject.surface(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
+
+
+def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+    """Yield each frame less its prediction 2 p - q from the frames p, q before: all low bytes, then all high ones.
+
+    A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
+    """
+    p = q = None
+    for frame in frames:
+        predicted = np.zeros_like(frame) if p is None else p if q is None else 2 * p - q
+        left = (frame - predicted + 2**15) % 2**16 - 2**15
+        coded = np.where(left < 0, -2 * left - 1, 2 * left).astype(np.uint16)
+        yield (coded & 255).astype(np.uint8).tobytes() + (coded >> 8).astype(np.uint8).tobytes()
+        p, q = frame, p
+
+
+def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[np.ndarray]:
+    """Yield the colours (v,) of each frame as whole numbers of 8 bits: shares of the scale, or classes."""
+    for index in frames:
+        shown = colouring.values(index) if colouring.classes else 255 * colouring.shares(index)
+        yield np.clip(np.round(np.nan_to_num(shown)), 0, 255).astype(np.uint8)
+
+
+def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+    """Yield what each frame of numbers (v,) of 8 bits changes of the one before it."""
+    before = None
+    for frame in frames:
+        yield (frame if before is None else frame - before).tobytes()
+        before = frame
+
+
+def fixed_states(subject: Subject, frames: Iterable[int]) -> tuple[bytes, list[int]]:
+    """Return how far points are pinned or led, each different state once, deflated, and each frame's number of one."""
+    states: dict[bytes, int] = {}
+    masks = (np.round(255 * subject.fixed(index)).astype(np.uint8).tobytes() for index in frames)
+    numbers = [states.setdefault(mask, len(states)) for mask in masks]
+    return zlib.compress(b"".join(states)), numbers
+
+
+def deflated(parts: Iterable[bytes]) -> bytes:
+    """Return the parts, one after the other, deflated."""
+    packer = zlib.compressobj(6)
+    return b"".join([*map(packer.compress, parts), packer.flush()])
+
+
+def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Style) -> dict[str, Any]:
+    """Return what page.js must know beside the streams, in types of JSON."""
+    camera, colouring = seen.camera, seen.colouring
+    overlays = [shot.overlays for shot in shots]
+    bar = entries_of(subject.scene, seen.fixed, overlays, colouring, ())
+    return {
+        "title": subject.title,
+        "points": len(subject.rest.points),
+        "box": seen.box.tolist(),
+        "times": [float(subject.times[shot.index]) for shot in shots],
+        "frames": [shot.index for shot in shots],
+        "camera": {
+            "right": camera.right.tolist(),
+            "away": camera.away.tolist(),
+            "up": camera.up.tolist(),
+            "elevation": float(camera.elevation),
+        },
+        "scale": scale_colours(colouring),
+        "legend": [vars(entry) for entry in bar],
+        "overlays": distinct(overlays),
+        "axes": style.axes,
+    }
+
+
+def scale_colours(colouring: Colouring | None) -> list[list[int]]:
+    """Return the 256 colours of the numbers of 8 bits that stand for the colours of points."""
+    numbers = np.arange(256)
+    if colouring is None:
+        table = np.tile(colours.rgb(colours.BODY), (256, 1))
+    else:
+        table = colours.of_classes(numbers) if colouring.classes else colours.on_scale(numbers / 255)
+    return np.round(table).astype(int).tolist()
+
+
+def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
+    """Return what stands beside the body, each different state once, and the number of its state for each frame."""
+    states: dict[str, int] = {}
+    numbers = []
+    for shown in overlays:
+        state = {
+            "grounds": [{"corners": g.corners.tolist(), "normal": g.normal.tolist()} for g in shown.grounds],
+            "glass": [corners.tolist() for corners in shown.glass],
+            "arrows": [arrow.tolist() for arrow in shown.arrows],
+        }
+        numbers.append(states.setdefault(json.dumps(state), len(states)))
+    return {"states": [json.loads(state) for state in states], "numbers": numbers}
+
+
+def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
+    """Return the text of the page, with nothing left to load."""
+    data = facts | {"streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}}
+    parts = {
+        "title": html.escape(title),
+        "css": (PARTS / "page.css").read_text(encoding="utf-8"),
+        "script": (PARTS / "page.js").read_text(encoding="utf-8"),
+        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # which could end the script
+    }
+    text = (PARTS / "page.html").read_text(encoding="utf-8")
+    for name, part in parts.items():
+        text = text.replace(f"{{{{ {name} }}}}", part)
+    return text
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file under a name of its own, and rename it: who reads it sees the old one or the new one."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,208 @@
+"""Bodies and what stands beside them, drawn by VTK: one window off screen, one camera without perspective."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+from msmpetsc.errors import InputError
+from msmpetsc.output.drawing.camera import Camera
+from msmpetsc.output.drawing.colours import (
+    ARROW,
+    BODY,
+    BOX,
+    FIXED,
+    GLASS,
+    GLASS_EDGE,
+    GROUND,
+    GROUND_EDGE,
+    INK,
+    SHADOW,
+    rgb,
+)
+from msmpetsc.output.drawing.fabric import Fabric
+from msmpetsc.output.drawing.overlays import Ground, Overlays
+
+GLASS_OPACITY = 0.22
+# of a box: four along z, y and x each, between corners 4i + 2j + k
+EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)])
+LABEL_GAP = 14  # [px] between an edge and what is written at it
+THROUGH = 0.3  # opacity of a body whose lattice is shown
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One moment: surface points (v, 3) [m], how far each is fixed (v,) in [0, 1], and what stands beside them.
+
+    colours : (v, 3) of the points where they are not fixed, 0 to 255; those of a plain body if None
+    fabric  : cells and springs
+    axes    : corners (2, 3) of the box that axes are drawn around [m]
+    """
+
+    points: np.ndarray
+    fixed: np.ndarray
+    overlays: Overlays
+    caption: tuple[str, str]
+    colours: np.ndarray | None = None
+    fabric: tuple[Fabric, ...] = ()
+    axes: np.ndarray | None = None
+
+
+class Stage:
+    """A window off screen in which panels are drawn, one after the other.
+
+    Used as a context, which closes it.
+    """
+
+    def __init__(self, width: int, height: int, triangles: np.ndarray):
+        """Open a window of so many pixels for a surface of triangles (f, 3)."""
+        self._size, self._triangles = np.array([width, height]), triangles
+        self._front = np.zeros(3)
+        with quiet_opengl():
+            self._plotter = pv.Plotter(off_screen=True, window_size=[width, height], lighting="none")
+            self._plotter.background_color = pv.Color("white")
+            for position, intensity in (((-0.5, 1.1, 1.3), 0.85), ((1, 0.15, 0.65), 0.35)):
+                self._plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
+            self._plotter.enable_anti_aliasing("ssaa")
+
+    def __enter__(self) -> "Stage":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with quiet_opengl():
+            self._plotter.close()
+
+    def face(self, camera: Camera, middle: np.ndarray, height: float, depth: float) -> None:
+        """Face `middle` (3,) without perspective; the window shows `height` [m], and nothing beyond `depth` [m]."""
+        view, far = self._plotter.camera, 4 * depth
+        view.focal_point, view.position, view.up = middle, middle + far * camera.to_eye, camera.upward
+        view.enable_parallel_projection()
+        view.parallel_scale = height / 2
+        view.clipping_range = (far / 100, 2 * far)
+        self._front = 2 * depth * camera.to_eye  # out of what could hide anything
+        self._to_pixels = lambda points: (camera.flat(points - middle) * self._size[1] / height) + self._size / 2
+
+    def picture(self, panel: Panel) -> np.ndarray:
+        """Return the picture (height, width, 3) of a panel. Raises InputError if the graphics library gives none."""
+        with quiet_opengl():
+            self._plotter.suppress_rendering = True  # or all that is added would be drawn once more, half done
+            self._plotter.clear_actors()
+            _draw_panel(self._plotter, panel, self._triangles, self._front)
+            if panel.axes is not None:
+                _draw_axes(self._plotter, panel.axes, self._to_pixels)
+            _write_caption(self._plotter, panel.caption, self._size[0] / 2)
+            self._plotter.suppress_rendering = False
+            self._plotter.render()
+            picture = self._plotter.screenshot(return_img=True)
+        if picture is None or not picture.any():
+            raise InputError("nothing can be drawn: the graphics library gives a black picture")
+        return picture
+
+
+def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front: np.ndarray) -> None:
+    """Draw the body and what stands beside it; front: (3,) towards the eye, out of what could hide anything."""
+    for ground in panel.overlays.grounds:
+        _draw_ground(plotter, ground, panel.points, triangles)
+    _draw_body(plotter, panel, triangles)
+    for fabric in panel.fabric:
+        _draw_fabric(plotter, fabric)
+    for corners in panel.overlays.glass:
+        _draw_glass(plotter, corners)
+    shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
+    shape |= dict(tip_resolution=40, shaft_resolution=40)
+    for tail, tip in panel.overlays.arrows:  # without perspective, nearer to the eye is the same point of the picture
+        length = float(np.linalg.norm(tip - tail))
+        arrow = pv.Arrow(start=tail + front, direction=tip - tail, scale=length, **shape)
+        plotter.add_mesh(arrow, color=ARROW, smooth_shading=True, split_sharp_edges=True, ambient=0.7, diffuse=0.4)
+
+
+def _draw_body(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray) -> None:
+    body = pv.PolyData.from_regular_faces(panel.points, triangles)
+    plain = rgb(BODY) if panel.colours is None else panel.colours
+    colours = (1 - panel.fixed[:, None]) * plain + panel.fixed[:, None] * rgb(FIXED)
+    shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
+    if panel.fabric:
+        shading |= dict(opacity=THROUGH)
+    plotter.add_mesh(body, scalars=colours.astype(np.uint8), rgb=True, **shading)
+
+
+def _draw_fabric(plotter: pv.Plotter, fabric: Fabric) -> None:
+    if fabric.joined.shape[1] == 2:
+        lines = pv.PolyData(fabric.points, lines=np.insert(fabric.joined, 0, 2, axis=1).ravel())
+        plotter.add_mesh(lines, color=fabric.colour, line_width=1, lighting=False)
+    else:
+        faces = pv.PolyData.from_regular_faces(fabric.points, fabric.joined)
+        plotter.add_mesh(faces, color=fabric.colour, ambient=0.5, diffuse=0.55)
+
+
+def _draw_axes(plotter: pv.Plotter, box: np.ndarray, to_pixels: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Draw the edges of a box (2, 3), and along three of them from where to where it reaches.
+
+    Lines and three texts: VTK's own axes take a second to draw.
+    """
+    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    lines = np.insert(EDGES, 0, 2, axis=1).ravel()
+    plotter.add_mesh(pv.PolyData(corners, lines=lines), color=BOX, line_width=1, lighting=False)
+    middles = to_pixels(corners[EDGES].mean(axis=1)).reshape(3, 4, 2)  # of the edges along z, y and x
+    outward = middles - to_pixels(box.mean(axis=0)[None])
+    for axis, ways, ends in zip((2, 1, 0), outward, middles, strict=True):
+        farthest = int(np.argmax(np.linalg.norm(ways, axis=1)))
+        way = ways[farthest] / np.linalg.norm(ways[farthest])
+        low, high = (f"{number:.3g}" for number in rounded(box)[:, axis])
+        text = f"{'xyz'[axis]}: {low} to {high} m"
+        actor = plotter.add_text(text, tuple(ends[farthest] + LABEL_GAP * way), font_size=8, color=INK)
+        actor.prop.justification_horizontal = "center" if abs(way[0]) < 0.3 else "left" if way[0] > 0 else "right"
+        actor.prop.justification_vertical = "center"
+
+
+def rounded(box: np.ndarray) -> np.ndarray:
+    """Return the corners (2, 3) of a box without what is rounding: 0 in place of 1e-20."""
+    return np.where(abs(box) < 1e-6 * np.ptp(box, axis=0).max(), 0.0, box)
+
+
+def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray) -> None:
+    """Draw a plane and the body's shadow on it, which shows where the body is above the ground, and how high."""
+    patch = pv.PolyData.from_regular_faces(ground.corners, [[0, 1, 2, 3]])
+    plotter.add_mesh(patch, color=GROUND, lighting=False, show_edges=True, edge_color=GROUND_EDGE, line_width=2)
+    above = (points - ground.corners[0]) @ ground.normal
+    lift = 2e-3 * np.ptp(points, axis=0).max()  # or the two surfaces would flicker into each other
+    shadow = points - np.outer(above - lift, ground.normal)
+    plotter.add_mesh(pv.PolyData.from_regular_faces(shadow, triangles), color=SHADOW, lighting=False)
+
+
+def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:
+    """Draw a body of corners (8, 3) numbered 4i + 2j + k, seen through, with its edges."""
+    faces = [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
+    solid = pv.PolyData.from_regular_faces(corners, faces)
+    plotter.add_mesh(solid, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
+    edges = solid.extract_feature_edges(feature_angle=1)
+    plotter.add_mesh(edges, color=GLASS_EDGE, line_width=2, lighting=False)
+
+
+def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float) -> None:
+    """Write time and reason below a panel whose middle is `middle` [px]."""
+    for text, size, height in zip(caption, (15, 11), (42, 16), strict=True):
+        if text:
+            actor = plotter.add_text(text, position=(middle, height), font_size=size, color=INK)
+            actor.prop.justification_horizontal = "center"
+
+
+@contextmanager
+def quiet_opengl() -> Iterator[None]:
+    """Keep what the graphics libraries say on their own off the terminal; InputError if there is no OpenGL."""
+    terminal = os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        # With neither screen nor EGL, VTK falls back on OSMesa, which is hardly found and crashes it if absent.
+        if vtkRenderWindow().IsA("vtkOSOpenGLRenderWindow"):
+            raise InputError("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
+        yield
+    finally:
+        os.dup2(terminal, 2)
+        os.close(terminal)

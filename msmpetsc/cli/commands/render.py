@@ -134,7 +134,7 @@ def subject_of_file(path: Path, changes: list[str]) -> tuple[Subject, tuple[str,
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")
         surface = read_surface(path)
-        return subject_of_surface(path, surface), (f"{_sides(surface.points)}, {_counted(surface)}", "")
+        return subject_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
     scene = load_scene(path, changes)
     model = build_model(MPI.COMM_SELF, scene)
     subject = subject_of_model(path, scene, model)

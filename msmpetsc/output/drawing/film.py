@@ -24,6 +24,7 @@ from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
 SIZE = (960, 720)  # [px]
+SMALLEST = 0.5  # of the usual size: captions and legend of small films
 FASTEST = 30.0  # pictures a second, where nothing is said
 TURN = 6.0  # [s] that the eye takes to go around a body that stands still
 SHORT = 1.0  # [s]: who makes a film shorter than this is told how to make it longer
@@ -93,17 +94,21 @@ def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, s
     width, height = style.size or SIZE
     low, high, depth = room_of(shots, seen, LABELS if style.axes else MARGIN)
     entries = entries_of(subject.scene, seen.fixed, [shot.overlays for shot in shots], seen.colouring, style.shown)
-    stage_height = height - len(legend_picture([*entries, *[Entry("length", "")] * style.scale_bar], width))
-    scale = min(width / (high - low)[0], (stage_height - CAPTION) / (high - low)[1])  # [px/m]
+    letters = min(1.0, max(height / SIZE[1], SMALLEST))
+    bar = [Entry("length", "")] if style.scale_bar else []
+    stage_height = height - len(legend_picture([*entries, *bar], width, letters))
+    caption = letters * CAPTION
+    scale = min(width / (high - low)[0], (stage_height - caption) / (high - low)[1])  # [px/m]
     if scale <= 0:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
-    legend = legend_picture([*entries, scale_bar(scale, width / 5)] if style.scale_bar else entries, width)
-    across, upward = (low + high) / 2 - [0, CAPTION / 2 / scale]
+    bar = [scale_bar(scale / letters, width / letters / 5)] if style.scale_bar else []
+    legend = legend_picture([*entries, *bar], width, letters)
+    across, upward = (low + high) / 2 - [0, caption / 2 / scale]
     middle = seen.box.mean(axis=0)
     cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
     before: Shot | None = None
     picture = np.empty(0)
-    with Stage(width, stage_height, subject.triangles) as stage:
+    with Stage(width, stage_height, subject.triangles, letters) as stage:
         for shot in counted(shots, "pictures"):
             if before is None or shot.index != before.index or shot.camera is not before.camera:
                 camera = shot.camera

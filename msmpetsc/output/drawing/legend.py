@@ -71,8 +71,12 @@ def scale_bar(scale: float, most: float) -> Entry:
     return Entry("length", f"{length:.3g} m", width=length * scale)
 
 
-def legend_picture(entries: Sequence[Entry], width: int) -> np.ndarray:
-    """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none."""
+def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> np.ndarray:
+    """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none.
+
+    letters : their size, 1 in a sheet
+    """
+    room_of_line = round(width / letters)
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), FINE * LETTERS)
     lines: list[list[Entry]] = []
     room = 0.0
@@ -80,18 +84,18 @@ def legend_picture(entries: Sequence[Entry], width: int) -> np.ndarray:
         needed = _length(entry, font) + GAP
         if not lines or needed > room:
             lines.append([])
-            room = width - GAP
+            room = room_of_line - GAP
         lines[-1].append(entry)
         room -= needed
-    picture = Image.new("RGB", (FINE * width, FINE * LINE * len(lines)), "white")
+    picture = Image.new("RGB", (FINE * room_of_line, FINE * LINE * len(lines)), "white")
     for number, line in enumerate(lines):
-        left = (width - sum(_length(entry, font) + GAP for entry in line) + GAP) / 2
+        left = (room_of_line - sum(_length(entry, font) + GAP for entry in line) + GAP) / 2
         for entry in line:
             _draw(ImageDraw.Draw(picture), entry, FINE * left, FINE * LINE * (number + 0.5), font)
             left += _length(entry, font) + GAP
     if not lines:
         return np.empty((0, width, 3), np.uint8)
-    return np.array(picture.resize((width, LINE * len(lines)), Image.Resampling.LANCZOS))
+    return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
 
 
 def _length(entry: Entry, font: ImageFont.FreeTypeFont) -> float:

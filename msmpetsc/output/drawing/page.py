@@ -1,6 +1,6 @@
 """A page for any browser, all in one file: the body turns with the mouse, its frames play under a slider.
 
-page.html is its frame, page.css its look, page.js what draws and steers it; this file says what is drawn. Positions are
+page.html is its frame, page.css its look, page*.js draws and steers it; this file says what is drawn. Positions are
 whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
 straight on from the two frames before, deflated and in base64.
 """
@@ -32,6 +32,7 @@ from msmpetsc.output.reader import Result
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
 PARTS = files("msmpetsc.output.drawing")
+SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js", "page_run.js", "page_begin.js")
 
 
 def write_page(
@@ -59,7 +60,7 @@ def write_page(
 
 
 def packed_frames(subject: Subject, frames: Sequence[int], seen: Survey) -> dict[str, bytes]:
-    """Return positions, colours and triangles as deflated bytes, for page.js to read."""
+    """Return positions, colours and triangles as deflated bytes, for the script to read."""
     points = len(subject.rest.points)
     kind = np.dtype("<u2" if points <= LEVELS else "<u4")
     streams = {
@@ -122,7 +123,7 @@ def deflated(parts: Iterable[bytes]) -> bytes:
 
 
 def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Style) -> dict[str, Any]:
-    """Return what page.js must know beside the streams, in types of JSON."""
+    """Return what the script must know beside the streams, in types of JSON."""
     camera, colouring = seen.camera, seen.colouring
     overlays = [shot.overlays for shot in shots]
     bar = entries_of(subject.scene, seen.fixed, overlays, colouring, ())
@@ -175,7 +176,7 @@ def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> s
     parts = {
         "title": html.escape(title),
         "css": (PARTS / "page.css").read_text(encoding="utf-8"),
-        "script": (PARTS / "page.js").read_text(encoding="utf-8"),
+        "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS),
         "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # which could end the script
     }
     text = (PARTS / "page.html").read_text(encoding="utf-8")

@@ -31,7 +31,7 @@ from msmpetsc.output.drawing.overlays import Ground, Overlays
 GLASS_OPACITY = 0.22
 # of a box: four along z, y and x each, between corners 4i + 2j + k
 EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)])
-LABEL_GAP = 14  # [px] between an edge and what is written at it
+LABEL_GAP, HALF_LETTER = 14, 4.2  # [px] between an edge and what is written at it; of a letter of that
 THROUGH = 0.3  # opacity of a body whose lattice is shown
 
 
@@ -59,10 +59,10 @@ class Stage:
     Used as a context, which closes it.
     """
 
-    def __init__(self, width: int, height: int, triangles: np.ndarray):
-        """Open a window of so many pixels for a surface of triangles (f, 3)."""
+    def __init__(self, width: int, height: int, triangles: np.ndarray, letters: float = 1.0):
+        """Open a window of so many pixels for a surface of triangles (f, 3); letters: their size, 1 in a sheet."""
         self._size, self._triangles = np.array([width, height]), triangles
-        self._front = np.zeros(3)
+        self._front, self._letters = np.zeros(3), letters
         with quiet_opengl():
             self._plotter = pv.Plotter(off_screen=True, window_size=[width, height], lighting="none")
             self._plotter.background_color = pv.Color("white")
@@ -95,7 +95,7 @@ class Stage:
             _draw_panel(self._plotter, panel, self._triangles, self._front)
             if panel.axes is not None:
                 _draw_axes(self._plotter, panel.axes, self._to_pixels)
-            _write_caption(self._plotter, panel.caption, self._size[0] / 2)
+            _write_caption(self._plotter, panel.caption, self._size[0] / 2, self._letters)
             self._plotter.suppress_rendering = False
             self._plotter.render()
             picture = self._plotter.screenshot(return_img=True)
@@ -155,9 +155,10 @@ def _draw_axes(plotter: pv.Plotter, box: np.ndarray, to_pixels: Callable[[np.nda
         way = ways[farthest] / np.linalg.norm(ways[farthest])
         low, high = (f"{number:.3g}" for number in rounded(box)[:, axis])
         text = f"{'xyz'[axis]}: {low} to {high} m"
-        actor = plotter.add_text(text, tuple(ends[farthest] + LABEL_GAP * way), font_size=8, color=INK)
-        actor.prop.justification_horizontal = "center" if abs(way[0]) < 0.3 else "left" if way[0] > 0 else "right"
-        actor.prop.justification_vertical = "center"
+        half = HALF_LETTER * len(text)
+        across, upward = ends[farthest] + (LABEL_GAP + half * np.array([1, 0])) * way
+        at = np.clip([across, upward], [half, 0], np.array(plotter.window_size) - [half, 2 * LABEL_GAP])
+        plotter.add_text(text, position=tuple(at), font_size=8, color=INK).prop.justification_horizontal = "center"
 
 
 def rounded(box: np.ndarray) -> np.ndarray:
@@ -184,11 +185,12 @@ def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:
     plotter.add_mesh(edges, color=GLASS_EDGE, line_width=2, lighting=False)
 
 
-def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float) -> None:
-    """Write time and reason below a panel whose middle is `middle` [px]."""
+def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float, letters: float) -> None:
+    """Write time and reason below a panel whose middle is `middle` [px]; letters: their size, 1 in a sheet."""
     for text, size, height in zip(caption, (15, 11), (42, 16), strict=True):
         if text:
-            actor = plotter.add_text(text, position=(middle, height), font_size=size, color=INK)
+            position = middle, letters * height
+            actor = plotter.add_text(text, position=position, font_size=round(letters * size), color=INK)
             actor.prop.justification_horizontal = "center"
 
 

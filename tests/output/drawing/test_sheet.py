@@ -8,72 +8,25 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from ball_result import BARE, HEIGHTS, write_ball
 from conftest import ROOT
-from mpi4py import MPI
 from PIL import Image
-from scipy.sparse import csr_array
 
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
-from msmpetsc.model.fields import Frame
 from msmpetsc.output.drawing import legend, moments, overlays, sheet, stage, subject
 from msmpetsc.output.drawing.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
-from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.body import Region
 
-trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.timeout(60)
-BARE = """
-mesh.source = "ball"
-cages.count = 1
-material = { stiffness = 1.0, density = 1.0 }
-time = { step = 0.1, duration = 1.0 }
-"""
-SCENE = f"""
-{BARE}
-[[obstacle]]
-shape = "plane"
-point = [0, 0, 0]
-normal = [0, 0, 2]
-[gravity]
-acceleration = [0, 0, -9.81]
-"""
-# A ball of radius 0.1 m falls, touches the ground, is squashed, leaps and comes to rest: height of its middle [m].
-HEIGHTS = [0.5, 0.45, 0.3, 0.1, 0.07, 0.05, 0.08, 0.2, 0.35, 0.2, 0.1]
-KINETIC = [0, 1, 4, 8, 4, 0, 5, 3, 0, 2, 0]
-ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]
 
 
 @pytest.fixture
 def result(tmp_path) -> Path:
     """The ball with its surface stored."""
     return write_ball(tmp_path / "ball.h5", surface=True)
-
-
-def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
-    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    rows = len(ball.vertices)
-    factor = 1 if surface else 2
-    embedding = csr_array(np.eye(rows) / factor)
-    with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, Begin.OVERWRITE) as file:
-        file.write("surface/triangles", np.array(ball.faces))
-        file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
-        file.write("lattice/cells", np.zeros((1, 8), int))
-        file.write("lattice/nodes", factor * (ball.vertices + np.array([0, 0, HEIGHTS[0]])))
-        for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
-            file.write(f"embedding/{name}", part)
-        file.start_frames(len(HEIGHTS), rows, rows if surface else None)
-        for index, height in enumerate(HEIGHTS):
-            points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]
-            energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)
-            numbers = dict(contact=0.0, step_error=0.0, iterations=1, ksp_its=1, momentum=np.zeros(3), wall_time=0.0)
-            drawn = points if surface else None
-            place = dict(time=index / 10, position=factor * points, surface=drawn)
-            file.append(Frame(index=index, **place, **energies, **numbers))
-    return path
 
 
 def test_moments_tell_the_story(result):

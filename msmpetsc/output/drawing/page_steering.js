@@ -1,0 +1,170 @@
+// Around the picture: legend, player, time, mouse, fingers, keys, and the address, which is a link to a view.
+
+// What stands around the picture
+
+function showState() {
+  const rate = +speedChoice.value;
+  const pace = frames > 1 && rate !== 1 ? (rate < 1 ? `   ${+(1 / rate).toPrecision(3)} times slower` : `   ${rate} times faster`) : "";
+  byId("time").textContent = `t = ${data.times[view.frame].toFixed(3)} s${pace}`;
+  slider.value = view.frame;
+  play.textContent = view.playing ? "❚❚" : "▶";
+  play.setAttribute("aria-label", view.playing ? "Pause" : "Play");
+  const most = 160 / perMetre(), power = 10 ** Math.floor(Math.log10(most));
+  const length = power * [5, 2, 1].find((step) => step * power <= most), bar = byId("length");
+  const [scale, name] = length >= 1 ? [1, "m"] : length >= 0.01 ? [0.01, "cm"] : length >= 1e-3 ? [1e-3, "mm"] : [1e-6, "µm"];
+  bar.firstChild.style.width = `${length * perMetre()}px`;
+  bar.lastChild.textContent = `${+(length / scale).toPrecision(3)} ${name}`;
+}
+
+function legendEntry({ kind, text, colour: paint, low, high }) {
+  const entry = document.createElement("span"), mark = document.createElement(kind === "arrow" ? "b" : "i");
+  mark.className = kind;
+  if (kind === "arrow") { mark.textContent = "➞"; mark.style.color = paint; }
+  else if (kind === "bar") mark.style.background = `linear-gradient(to right, ${data.scale.filter((_, k) => k % 15 === 0).map((rgb) => `rgb(${rgb})`)})`;
+  else mark.style.background = paint;
+  const words = [high, text].filter((part) => part).join("\u2002");
+  entry.append(low, mark, words);
+  return entry;
+}
+
+function makeLegend() {
+  byId("legend").append(...data.legend.map(legendEntry));
+  const bar = document.createElement("span"), mark = document.createElement("i");
+  bar.id = "length";
+  mark.className = "length";
+  bar.append(mark, document.createElement("span"));
+  byId("legend").append(bar);
+}
+
+function makePlayer() {
+  slider.max = frames - 1;
+  for (const id of ["player", "playing"]) byId(id).hidden = frames < 2;
+  const spacing = (data.times[frames - 1] - data.times[0]) / 4; // a play of about four seconds
+  const rates = [4, 2, 1, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001];
+  const nearest = spacing >= 0.5 ? 1 : rates.reduce((a, b) => Math.abs(Math.log(b / spacing)) < Math.abs(Math.log(a / spacing)) ? b : a);
+  for (const rate of rates) {
+    const option = new Option(rate === 1 ? "real time" : rate > 1 ? `${rate} × faster` : `${Math.round(1 / rate)} × slower`, rate);
+    option.selected = rate === nearest;
+    speedChoice.append(option);
+  }
+}
+
+// Time
+
+let begun = null; // when the play began [ms], and at which time of the result [s]
+function tick(now) {
+  if (!view.playing) return;
+  begun ??= { now, time: view.frame === frames - 1 ? data.times[0] : data.times[view.frame] };
+  const time = begun.time + +speedChoice.value * (now - begun.now) / 1000;
+  let frame = view.frame === frames - 1 && time < data.times[frames - 1] ? 0 : view.frame;
+  while (frame < frames - 1 && data.times[frame + 1] <= time) frame++;
+  if (frame !== view.frame) { view.frame = frame; draw(); }
+  if (time > data.times[frames - 1] + 0.3 * +speedChoice.value) { begun = { now, time: data.times[0] }; view.frame = 0; draw(); }
+  requestAnimationFrame(tick);
+}
+
+function setPlaying(playing) {
+  view.playing = playing && frames > 1;
+  begun = null;
+  if (view.playing) requestAnimationFrame(tick);
+  noteAddress();
+  redraw();
+}
+
+function goTo(frame) {
+  view.frame = Math.min(frames - 1, Math.max(0, Math.round(frame) || 0));
+  begun = null;
+  noteAddress();
+  redraw();
+}
+
+// The address: #frame=40&turn=30,10&zoom=2&move=0.1,0 is a view, and a link to it
+
+function readAddress() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  const pair = (name) => (given.get(name) || "").split(",").map((part) => +part || 0);
+  [view.yaw, view.pitch = 0] = pair("turn");
+  [view.right, view.up = 0] = pair("move");
+  view.zoom = Math.min(50, Math.max(0.2, +given.get("zoom") || 1));
+  const frame = given.has("frame") ? +given.get("frame") : 0;
+  view.frame = Math.min(frames - 1, Math.max(0, Math.round(frame) || 0));
+  view.playing = given.get("play") === "1" && frames > 1;
+  begun = null;
+}
+
+function noteAddress() {
+  const round = (x) => +x.toPrecision(4);
+  const parts = [`frame=${view.frame}`, `turn=${round(view.yaw)},${round(view.pitch)}`];
+  if (view.zoom !== 1) parts.push(`zoom=${round(view.zoom)}`);
+  if (view.right || view.up) parts.push(`move=${round(view.right)},${round(view.up)}`);
+  if (view.playing) parts.push("play=1");
+  try { history.replaceState(null, "", `#${parts.join("&")}`); } catch { /* a browser may forbid it to files */ }
+}
+
+// Mouse, fingers, keys
+
+const fingers = new Map();
+const apart = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y) || 1; };
+
+function turn(dx, dy) {
+  view.yaw = (view.yaw - 0.4 * dx) % 360;
+  const steepest = 90 - 180 * data.camera.elevation / Math.PI;
+  view.pitch = Math.min(steepest, Math.max(steepest - 180, view.pitch + 0.4 * dy));
+}
+
+function shift(dx, dy) {
+  view.right += dx / perMetre();
+  view.up -= dy / perMetre();
+}
+
+function nearer(factor) {
+  view.zoom = Math.min(50, Math.max(0.2, view.zoom * factor));
+}
+
+function changed() { noteAddress(); redraw(); }
+
+canvas.addEventListener("pointerdown", (event) => {
+  canvas.setPointerCapture(event.pointerId);
+  fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+});
+canvas.addEventListener("pointermove", (event) => {
+  const finger = fingers.get(event.pointerId);
+  if (!finger) return;
+  const before = fingers.size === 2 ? apart() : 0, dx = event.clientX - finger.x, dy = event.clientY - finger.y;
+  Object.assign(finger, { x: event.clientX, y: event.clientY });
+  if (fingers.size === 2) { nearer(apart() / before); shift(dx / 2, dy / 2); }
+  else if (event.shiftKey || event.buttons === 2) shift(dx, dy);
+  else turn(dx, dy);
+  changed();
+});
+for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+canvas.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  nearer(Math.exp(-0.001 * event.deltaY * (event.deltaMode ? 30 : 1)));
+  changed();
+}, { passive: false });
+slider.addEventListener("input", () => { view.playing = false; goTo(+slider.value); });
+play.addEventListener("click", () => setPlaying(!view.playing));
+speedChoice.addEventListener("change", () => { begun = null; redraw(); });
+const KEYS = {
+  " ": () => setPlaying(!view.playing),
+  ArrowRight: () => { view.playing = false; goTo(view.frame + 1); },
+  ArrowLeft: () => { view.playing = false; goTo(view.frame - 1); },
+  Home: () => goTo(0),
+  End: () => goTo(frames - 1),
+  "+": () => { nearer(1.2); changed(); },
+  "-": () => { nearer(1 / 1.2); changed(); },
+  ArrowUp: () => { turn(0, 12); changed(); },
+  ArrowDown: () => { turn(0, -12); changed(); },
+  r: () => { Object.assign(view, { yaw: 0, pitch: 0, zoom: 1, right: 0, up: 0 }); changed(); },
+};
+addEventListener("keydown", (event) => {
+  const act = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!act || event.ctrlKey || event.metaKey || event.altKey || event.target === speedChoice) return;
+  event.preventDefault();
+  act();
+});
+addEventListener("resize", redraw);
+addEventListener("hashchange", () => { readAddress(); if (view.playing) setPlaying(true); redraw(); });
+dark.addEventListener("change", redraw);

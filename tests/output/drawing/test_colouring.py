@@ -1,0 +1,81 @@
+"""Fields on a surface: each on a motion of which it is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_result import BARE, HEIGHTS, write_ball
+
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.output.drawing.colouring import COLOURINGS, Colouring, colouring_of, opened_reference, scaled
+from msmpetsc.output.drawing.colours import SCALE, on_scale, rgb
+from msmpetsc.output.drawing.overlays import Rest
+from msmpetsc.output.drawing.subject import subject_of_result, subject_of_surface
+from msmpetsc.output.reader import Result
+from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.toml import toml_of
+
+
+@pytest.fixture
+def subject(tmp_path):
+    with Result(write_ball(tmp_path / "ball.h5", surface=True)) as run:
+        yield subject_of_result(run)
+
+
+def test_displacement_of_a_fall_is_its_height(subject):
+    values = colouring_of(subject, "displacement").values
+    for index in (0, 2, 3, 8):
+        assert values(index) == pytest.approx(np.full(len(subject.rest.points), HEIGHTS[0] - HEIGHTS[index]), abs=1e-6)
+
+
+def test_speed_is_the_way_over_the_time_around_a_frame(subject):
+    values = colouring_of(subject, "speed").values
+    assert values(0) == pytest.approx(np.full(len(subject.rest.points), 0.05 / 0.1), rel=1e-4)  # towards frame 1
+    assert values(2) == pytest.approx(np.full(len(subject.rest.points), 0.35 / 0.2), rel=1e-4)  # 0.45 to 0.1 m
+    assert values(8) == pytest.approx(0.0, abs=1e-5)  # 0.2 m before and after
+
+
+def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
+    """Three nodes in a row: the first spring 10% longer, the second 20% shorter."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
+    subject = replace(
+        subject_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
+        nodes=lambda _: moved,
+        array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
+    )
+    values = COLOURINGS["strain"](subject, None).values(0)
+    assert values == pytest.approx([0.1, np.sqrt((0.1**2 + 0.2**2) / 2), 0.2])
+
+
+def test_error_is_the_distance_from_the_reference(subject, tmp_path):
+    path = write_ball(tmp_path / "other.h5", surface=True)
+    with Result(tmp_path / "ball.h5") as run, opened_reference(path, run) as reference:
+        assert colouring_of(subject, "error", reference).values(4) == pytest.approx(0.0, abs=1e-12)
+        raised = replace(subject, surface=lambda index: subject.surface(index) + np.array([0.003, 0, 0.004]))
+        error = scaled(colouring_of(raised, "error", reference), [0, 4])
+        assert error.values(4) == pytest.approx(0.005, rel=1e-3)
+        assert error.ends == ("distance from the reference [mm]", "5")
+
+
+def test_parts_are_those_of_the_nearest_cell(subject):
+    """Two cells; the later of two parts that both mean the second one counts."""
+    x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
+    cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
+    rest = Rest(np.stack([x, y, z], axis=1).astype(float), cells, np.array([[0.2, 0.5, 0.5], [1.9, 0.1, 0.1]]))
+    east = "region = { half_space = { point = [1, 0, 0], normal = [1, 0, 0] } }\n"
+    tables = f"[[part]]\n{east}density = 2.0\n[[part]]\n{east}density = 3.0\n"
+    parted = replace(subject, rest=rest, scene=SceneFile.model_validate(toml_of(BARE + tables)))
+    part = colouring_of(parted, "part")
+    assert part.values(0).tolist() == [0, 2] and part.classes == ("material", "part.0", "part.1")
+
+
+@pytest.mark.parametrize(
+    ("high", "end"), [(0.0125, ("way [mm]", "12.5")), (3.0, ("way [m]", "3")), (0.0, ("way [m]", "0"))]
+)
+def test_ends_of_the_scale_have_a_fitting_unit(high, end):
+    assert Colouring("way", "m", lambda _: np.zeros(1), high).ends == end
+
+
+def test_the_scale_ends_where_its_colours_do():
+    assert on_scale(np.array([-1.0, 0, 1, 7])) == pytest.approx(np.array([rgb(SCALE[k]) for k in (0, 0, -1, -1)]))

@@ -1,0 +1,86 @@
+"""Scenes and meshes drawn before anything is run."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import block_scene
+from PIL import Image
+
+from msmpetsc.cli import render as command
+from msmpetsc.cli.arguments import parsed
+from msmpetsc.errors import InputError
+
+SCENE = {
+    "output": {"surface": True},
+    "time": {"step": 0.01, "duration": 0.1},
+    "pin": [{"region": {"painted": "spots.txt"}}],
+    "force": [{"region": {"box": [[0.3, 0, 0], [0.5, 0.5, 0.25]]}, "total": [1.0, 0, 0]}],
+}
+
+
+def drawn(*words: object) -> np.ndarray:
+    """The picture that a command draws; its path is the last word."""
+    assert command.run(parsed(["render", *map(str, words[:-1]), "-o", str(words[-1])])) == 0
+    return np.array(Image.open(words[-1]).convert("RGB")).astype(int)
+
+
+def near(picture: np.ndarray, colour: tuple[int, int, int], within: int = 12) -> int:
+    return int((abs(picture - colour).max(axis=2) <= within).sum())
+
+
+def sized(folder: Path, sides: tuple[float, float, float]) -> Path:
+    """A block with the points of its west side painted, pinned by a file, and pulled at its east."""
+    path = block_scene(folder, np.array(sides), **SCENE)
+    (folder / "spots.txt").write_text("0 1 2 3\n")  # box: corners are numbered along x, so these are its west
+    return path
+
+
+def test_a_scene_shows_pins_forces_and_cells(tmp_path):
+    picture = drawn(sized(tmp_path, (0.5, 0.5, 0.5)), tmp_path / "x.png")
+    left, right = np.array_split(picture, 2, axis=1)
+    assert (left[..., 0] < 58).sum() > 500  # pinned by the file: dark
+    assert (left[..., 0] - left[..., 2] > 90).sum() > 300  # the arrow
+    for less, more in ((2, 0), (0, 2)):  # red cells of the boundary, blue ones inside, in the panel cut open
+        counts = [(half[:-40, :, more] - half[:-40, :, less] > 75).sum() for half in (left, right)]
+        assert counts[1] > 300 and counts[1] > 2 * counts[0]
+
+
+def test_a_mesh_alone_shows_its_box_and_a_length(tmp_path, ball):
+    picture = drawn(ball, tmp_path / "x.png")
+    assert picture[..., 2].shape[0] > 400 and near(picture, (0x8A, 0x92, 0x9B), 40) > 500
+    bar = picture[-34:]
+    (columns,) = np.nonzero((bar < 120).all(axis=2)[15:19].all(axis=0))
+    assert np.ptp(columns[columns < columns[0] + 400]) > 50
+
+
+def test_a_page_of_a_scene_has_one_frame(tmp_path):
+    page = tmp_path / "x.html"
+    assert command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), "-o", str(page)])) == 0
+    assert '"times":[0.0]' in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["-o", "x.mp4"], "has no motion to film: --turntable"),
+        (["--frames", "1"], "--frames is for results"),
+        (["--colour", "part"], "has no part"),
+    ],
+)
+def test_what_a_scene_has_not_got(tmp_path, words, line):
+    with pytest.raises(InputError, match=line):
+        command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), *words]))
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--show", "cells"], "is a mesh without cells"),
+        (["--colour", "speed"], "is a mesh alone"),
+        (["--set", "cages.count=3"], "--set changes a scene"),
+    ],
+)
+def test_what_a_mesh_has_not_got(ball, words, line):
+    with pytest.raises(InputError, match=line):
+        command.run(parsed(["render", str(ball), *words]))

@@ -23,11 +23,9 @@ from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.build import build_model
 from msmpetsc.output.drawing.colouring import opened_reference
 from msmpetsc.output.drawing.fabric import SHOWN
-from msmpetsc.output.drawing.film import TURN, Pace, paced, write_film
 from msmpetsc.output.drawing.moments import Frames, frames_of
 from msmpetsc.output.drawing.page import write_page
-from msmpetsc.output.drawing.sheet import Moment, contact_sheet, draw_moments
-from msmpetsc.output.drawing.style import Style
+from msmpetsc.output.drawing.shots import Style
 from msmpetsc.output.drawing.subject import Subject, subject_of_model, subject_of_result, subject_of_surface
 from msmpetsc.output.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
@@ -85,6 +83,8 @@ def style_of(args: argparse.Namespace) -> Style:
 def _draw_result(args: argparse.Namespace, path: Path, frames: Frames | None, style: Style) -> None:
     """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
+        from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK, which a page does not need
+
         contact_sheet(args.subject, path, frames, args.count, None, style, args.reference)
         return
     with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
@@ -105,6 +105,8 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     if path.suffix.lower() not in PICTURE_NAMES:
         _draw_motion(args, subject, path, [0], style, None)
         return
+    from msmpetsc.output.drawing.sheet import Moment, draw_moments
+
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
     if len(subject.rest.cells) and not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
@@ -118,6 +120,8 @@ def _draw_motion(
     if path.suffix.lower() in PAGE_NAMES:
         write_page(subject, path, frames, style, reference)
         return
+    from msmpetsc.output.drawing.film import TURN, Pace, paced, write_film
+
     if args.turntable and len(frames) == 1:
         if args.speed is not None:
             raise InputError("--speed needs --frames, two or more: time stands still on this turntable")

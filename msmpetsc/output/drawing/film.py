@@ -16,9 +16,8 @@ from msmpetsc.output.drawing.fabric import Fabric, cut_open
 from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
 from msmpetsc.output.drawing.overlays import MARGIN
 from msmpetsc.output.drawing.sheet import CAPTION, LABELS
-from msmpetsc.output.drawing.shots import Shot, Survey, room_of, shots_of, survey
+from msmpetsc.output.drawing.shots import Shot, Style, Survey, room_of, shots_of, survey
 from msmpetsc.output.drawing.stage import Panel, Stage
-from msmpetsc.output.drawing.style import Style
 from msmpetsc.output.drawing.subject import Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result

@@ -3,16 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import matplotlib
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
 from msmpetsc.output.drawing.fabric import KINDS
 from msmpetsc.output.drawing.overlays import Overlays
 from msmpetsc.scene.schema import SceneFile
+
+if TYPE_CHECKING:  # a page has the entries without them
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
 
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
@@ -76,6 +79,9 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
     letters : their size, 1 in a sheet
     """
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
     room_of_line = round(width / letters)
     font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), FINE * LETTERS)
     lines: list[list[Entry]] = []
@@ -98,12 +104,12 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
     return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
 
 
-def _length(entry: Entry, font: ImageFont.FreeTypeFont) -> float:
+def _length(entry: Entry, font: "FreeTypeFont") -> float:
     """Return how long an entry is [px]."""
     return entry.width + sum(font.getlength(text) / FINE + 8 for text in (entry.text, entry.low, entry.high) if text)
 
 
-def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
+def _draw(draw: "ImageDraw", entry: Entry, left: float, middle: float, font: "FreeTypeFont") -> None:
     """Draw an entry from `left` on, around `middle`, in fine pixels."""
     gap, half = 8 * FINE, 8 * FINE
     if entry.low:

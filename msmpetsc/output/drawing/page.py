@@ -23,8 +23,7 @@ from msmpetsc.output.drawing import colours
 from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.legend import entries_of
 from msmpetsc.output.drawing.overlays import Overlays
-from msmpetsc.output.drawing.shots import Shot, Survey, shots_of, survey
-from msmpetsc.output.drawing.style import Style
+from msmpetsc.output.drawing.shots import Shot, Style, Survey, shots_of, survey
 from msmpetsc.output.drawing.subject import Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result

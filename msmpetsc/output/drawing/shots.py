@@ -1,4 +1,4 @@
-"""The shots of a film or a page: what is seen at each frame, and how much room all of it takes."""
+"""The shots of a film or a page: how they are to look, what is seen at each, and how much room all of it takes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -9,12 +9,31 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.camera import Camera, camera_facing, turned
 from msmpetsc.output.drawing.colouring import Colouring, colouring_of
 from msmpetsc.output.drawing.overlays import MARGIN, Overlays
-from msmpetsc.output.drawing.style import Style
 from msmpetsc.output.drawing.subject import FARTHEST, Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
 DIRECTIONS = 40  # in which the points farthest out of a frame stand for all of it
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a picture, a film or a page is to look: what ``msmpetsc render`` is asked for, beside frames and files.
+
+    eye       : direction (3,) from the body to the eye; the scene's picture.eye if None
+    colour    : name of a field
+    size      : width and height [px] of a film, a still, or a panel
+    axes      : whether a box with lengths is drawn around the body
+    scale_bar : whether the legend has a length
+    shown     : "cells", "springs"
+    """
+
+    eye: Sequence[float] | None = None
+    colour: str | None = None
+    size: tuple[int, int] | None = None
+    axes: bool = False
+    scale_bar: bool = False
+    shown: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,14 @@ import logging
 import re
 import shutil
 import subprocess
+import sys
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS, write_ball
+from conftest import ENVIRONMENT
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -80,6 +82,17 @@ def test_the_page_holds_every_frame_to_its_levels(tmp_path):
 def test_the_page_loads_nothing(tmp_path):
     text = written_page(tmp_path).read_text(encoding="utf-8")
     assert not re.search(r"""(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{""", text)
+
+
+@pytest.mark.parametrize("name", ["pyvista", "vtkmodules", "matplotlib", "PIL", "jinja2"])
+def test_a_page_needs_nothing_that_draws(tmp_path, name):
+    path = write_ball(tmp_path / "x.h5", surface=True)
+    program = "import sys; sys.modules[sys.argv.pop()] = None; from msmpetsc.cli.main import main; sys.exit(main())"
+    words = [sys.executable, "-c", program, "render", str(path), "-o", str(tmp_path / "x.html")]
+    done = subprocess.run(
+        [*words, "--colour", "speed", name], env=ENVIRONMENT, capture_output=True, text=True, timeout=40
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_title_cannot_end_the_script(tmp_path):

@@ -11,6 +11,7 @@ from PIL import Image, ImageSequence
 from msmpetsc.cli import render as command
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.errors import InputError, as_expected
+from msmpetsc.output.drawing.camera import camera_facing, turned
 from msmpetsc.output.drawing.film import paced
 
 pytestmark = pytest.mark.timeout(60)
@@ -92,6 +93,14 @@ def test_the_ball_falls_and_leaps_in_the_film(result, tmp_path, ending, capsys):
 def test_a_slice_of_the_frames_is_filmed(result, tmp_path):
     render(result, "-o", tmp_path / "x.gif", "--size", "320x320", "--frames", "0,3:10:3", "--fps", 5)
     assert len(pictures_of(tmp_path / "x.gif")) == 4  # 0, 3, 6, 9
+
+
+def test_a_turning_camera_stays_upright():
+    """After a quarter to its right the eye stands where the right was, as high as before."""
+    camera = camera_facing(np.eye(3), None, (0, -3, 4))
+    quarter = turned(camera, np.pi / 2)
+    assert quarter.to_eye == pytest.approx([0.6, 0, 0.8]) and quarter.right == pytest.approx([0, 1, 0])
+    assert np.cross(quarter.right, quarter.upward) == pytest.approx(quarter.to_eye)
 
 
 EAST_HELD = """

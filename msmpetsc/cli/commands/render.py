@@ -13,6 +13,7 @@ from msmpetsc.cli.arguments import (
     PAGE_NAMES,
     PICTURE_NAMES,
     RESULT_NAMES,
+    SCENE_NAMES,
     refuse_below_one,
     refuse_other_format,
     refuse_ranks,
@@ -134,7 +135,7 @@ def _draw_motion(
 
 def subject_of_file(path: Path, changes: list[str]) -> tuple[Subject, tuple[str, str]]:
     """Return what a scene or a mesh shows, with its size and its cells in words. Raises InputError."""
-    if path.suffix.lower() != ".toml":
+    if path.suffix.lower() not in SCENE_NAMES:
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")
         surface = read_surface(path)

@@ -8,8 +8,8 @@ import pytest
 from ball_result import BARE, HEIGHTS, write_ball
 from PIL import Image, ImageSequence
 
-from msmpetsc.cli import render as command
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.output.drawing.camera import camera_facing, turned
 from msmpetsc.output.drawing.film import paced

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from msmpetsc.cli import render as command
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
 from msmpetsc.output.drawing import page
 from msmpetsc.output.drawing.subject import surface_points
 from msmpetsc.output.reader import Result

@@ -7,8 +7,8 @@ import pytest
 from block_scene import block_scene
 from PIL import Image
 
-from msmpetsc.cli import render as command
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 
 SCENE = {

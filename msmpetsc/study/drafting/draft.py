@@ -18,7 +18,7 @@ USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
 SLENDER = 2.5  # times its other sides: so long a body is a beam
 DROP = 0.2  # of the height, that a body falls
 ACROSS, CELLS = 3, (1000, 8000)  # cells across the mean thickness, within these counts
-SINKING = 50  # rho g H in Young's modulus, of a body that falls
+SINKING = 100  # rho g H in Young's modulus, of a body that falls
 SAG, CLAMPED = 0.15, 0.05  # of a beam's length: what its end sinks by, what is clamped
 STEPS_A_PERIOD, PERIODS = 40, 3
 DEBRIS = 0.01  # of the area: all parts but the largest together
@@ -111,7 +111,8 @@ def _falling(body: Shape) -> list[str]:
         line("friction = 0.5", "Coulomb's coefficient"),
     ]
     material = _material(young, f"its own weight presses it together by about {100 / SINKING:g}%")
-    return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
+    law = line('law = "stiffening"', "springs resist large strain, and cells turning inside out in the impact")
+    return [*material, law, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
 
 
 def _clamped(body: Shape, axis: int) -> list[str]:

@@ -66,16 +66,16 @@ def seconds(function: Callable[[], object]) -> float:
 
 def row(name: str, body: Body, count: int) -> list[str]:
     """The table's cells for one body filled with about ``count`` cells."""
-    cell_size = choose_cell_size(body, count)
-    cages = fill(body, cell_size)
+    cell_size = choose_cell_size([body], count)
+    cages = fill([body], cell_size)
     nodes = SortedKeys(comm, encode_morton(cages.ijk[:, None, :] + CORNERS).ravel())
     points = np.empty((0, 3))
     triangles = 0
     if body.surface is not None:
         chosen = np.random.default_rng(0).choice(len(body.surface.points), min(POINTS, len(body.surface.points)), False)
         points, triangles = body.surface.points[chosen], len(body.surface.triangles)
-    times = [seconds(lambda: fill(body, cell_size)), seconds(lambda: fill(body, choose_cell_size(body, count)))]
-    times += [seconds(partial(embed, points, cages, nodes, kind)) for kind in KINDS]
+    times = [seconds(lambda: fill([body], cell_size)), seconds(lambda: fill([body], choose_cell_size([body], count)))]
+    times += [seconds(partial(embed, [points], cages, nodes, kind)) for kind in KINDS]
     return [name, f"{triangles:,}", f"{cages.table.total:,}", *(f"{time:.3f}" for time in times)]
 
 

@@ -33,7 +33,7 @@ def lattice_of(mesh: trimesh.Trimesh, h: float, boundary: str, offset: Iterable[
     """The lattice of a mesh in a grid that begins ``offset`` (3,) cells before it."""
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
-    cages = fill(Body(COMM, surface, examine(surface), bounds), h, boundary=boundary)
+    cages = fill([Body(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
     return build_lattice(cages, DENSITY, young_modulus=E)
 
 

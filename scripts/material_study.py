@@ -42,7 +42,7 @@ def box(cells: tuple[int, int, int], cell_size: float) -> Lattice:
     mesh = trimesh.creation.box(np.ones(3))
     surface = Surface((mesh.vertices + 0.5) * cells * cell_size, np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return build_lattice(fill(Body(COMM, surface, examine(surface), bounds), cell_size), DENSITY, young_modulus=E)
+    return build_lattice(fill([Body(COMM, surface, examine(surface), bounds)], cell_size), DENSITY, young_modulus=E)
 
 
 def beam(across: int) -> Lattice:

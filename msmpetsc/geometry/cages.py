@@ -1,11 +1,12 @@
-"""A surface filled with uniform grid cells, the cages (paper section 4.1).
+"""Surfaces filled with uniform grid cells, the cages (paper section 4.1).
 
-Rank 0 holds the surface; each rank finds the cells of one slab of the grid, then the cells are
+Rank 0 holds the surfaces; each rank finds the cells of one slab of each grid, then the cells are
 spread over the ranks in Morton order. The three kinds of cell are external (not kept), boundary
 and interior; the last two are the valid ones.
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from mpi4py import MPI
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
-from msmpetsc.geometry.grid import CHUNK, Grid, decode_morton, encode_morton, packed, unpacked
+from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.share import LEAK, OUTSIDE, Columns, sampled_shares
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
@@ -43,17 +44,19 @@ class Body:
 
 @dataclass(frozen=True)
 class Cages:
-    """Valid cells of a body, each rank's share in Morton order.
+    """Valid cells of bodies, each rank's share in Morton order.
 
     table : keys of the cells (geometry.grid)
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
     share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.share) [-]; None where all are whole
+    fills : of each body, whether its boundary cells count by their fill
     """
 
-    grid: Grid
+    grids: BodyGrids
     table: SortedKeys
     kind: np.ndarray
     share: np.ndarray | None = None
+    fills: tuple[bool, ...] = (False,)
 
     @property
     def ijk(self) -> np.ndarray:
@@ -84,28 +87,40 @@ class SlabCells:
 
 
 def fill(
-    body: Body, cell_size: float, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[Body], cell_size: float, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> Cages:
-    """Return the valid cells of side ``cell_size`` [m] (collective).
+    """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
     method   : "exact", or "sample" for the paper's sample points
     boundary : "fill": a boundary cell counts for the share of it that is inside; "whole", as in the paper
     raises   : InputError if there would be more than ``max_cells``
     """
-    grid = Grid.covering(body.bounds, cell_size)
-    cells = slab_cells(body, grid, method, max_cells, boundary)
-    refuse_beyond_memory(body.comm, cells.count(body.comm))
+    comm, grids = bodies[0].comm, BodyGrids.covering([body.bounds for body in bodies], cell_size)
+    found = slabs_of_all(bodies, grids, method, max_cells, boundary)
+    refuse_beyond_memory(comm, sum(cells.count(comm) for cells in found))
+    parts = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, found, strict=True)]
+    keys = encode_morton(np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(parts)]))
+    table = SortedKeys(comm, keys)
+    route = Route(comm, table.owner(keys))
+    order = np.argsort(route.send(keys))
+    kind, share = np.concatenate([kind for _, kind, _ in parts]), None
+    fills = tuple(of_body is not None for _, _, of_body in parts)
+    if any(fills):
+        whole = (np.ones((len(kind), 2, 2, 2)) for _, kind, _ in parts)
+        shares = [ones if of_body is None else of_body for ones, (_, _, of_body) in zip(whole, parts, strict=True)]
+        share = route.send(np.concatenate(shares))[order]
+    return Cages(grids, table, route.send(kind)[order], share, fills)
+
+
+def _cells_of(
+    body: Body, grid: Grid, cells: SlabCells, boundary: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return grid index (n, 3), kind (n,) and shares (n, 2, 2, 2) of this rank's cells of a body (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
     share = _share(body, grid, cells) if boundary == "fill" else None
-    keys = encode_morton(ijk)
-    table = SortedKeys(body.comm, keys)
-    route = Route(body.comm, table.owner(keys))
-    order = np.argsort(route.send(keys))
-    if share is not None:
-        share = route.send(np.concatenate([share, np.ones((len(interior), 2, 2, 2))]))[order]
-    return Cages(grid, table, route.send(kind)[order], share)
+    return ijk, kind, None if share is None else np.concatenate([share, np.ones((len(interior), 2, 2, 2))])
 
 
 def _share(body: Body, grid: Grid, cells: SlabCells) -> np.ndarray | None:
@@ -121,12 +136,27 @@ def _share(body: Body, grid: Grid, cells: SlabCells) -> np.ndarray | None:
     return np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
 
 
-def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: str) -> SlabCells:
-    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
+def slabs_of_all(
+    bodies: Sequence[Body], grids: BodyGrids, method: str, max_cells: int, boundary: str
+) -> list[SlabCells]:
+    """Return the valid cells of this rank's slab of each body (collective); arguments as of ``fill``."""
+    found: list[SlabCells] = []
+    before = 0
+    for body, grid in zip(bodies, grids.grids, strict=True):
+        found.append(slab_cells(body, grid, method, max_cells, boundary, before))
+        before += found[-1].count(body.comm)
+    return found
+
+
+def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: str, before: int = 0) -> SlabCells:
+    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``.
+
+    before : number of cells of other bodies, which count, too
+    """
     axes = _axes(body)
     slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
-    _refuse_above(max_cells, _least_cells(body, grid), grid)
-    refuse_beyond_memory(body.comm, _least_cells(body, grid))
+    _refuse_above(max_cells, before + _least_cells(body, grid), grid)
+    refuse_beyond_memory(body.comm, before + _least_cells(body, grid))
     corners = _slab_triangles(body, grid, axes)
     touched = _mark(corners, grid.shape[axes], slab, method)
     if body.report.closed:
@@ -137,7 +167,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: st
     if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
         gaps = gaps[columns.corner_shares(gaps[:, [0, 1, 3]])[:, 0, 0, 0] > OUTSIDE]
     cells = SlabCells(touched, gaps, columns)
-    _refuse_above(max_cells, cells.count(body.comm), grid)
+    _refuse_above(max_cells, before + cells.count(body.comm), grid)
     return cells
 
 
@@ -228,9 +258,9 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, bound
 
 
 def choose_cell_size(
-    body: Body, count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[Body], count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> float:
-    """Return the cell size [m] that gives ``count`` cells within 1%, or the nearest with a warning (collective).
+    """Return the cell size [m] that gives bodies ``count`` cells within 1%, or the nearest with a warning (collective).
 
     The number of cells falls about as a power of the size, so this is a secant search in logarithms,
     kept inside the bracket found so far: the number is a step function and not quite monotone.
@@ -239,12 +269,14 @@ def choose_cell_size(
     """
     if count > max_cells:
         raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
-    refuse_beyond_memory(body.comm, count)
+    comm, bounds = bodies[0].comm, [body.bounds for body in bodies]
+    refuse_beyond_memory(comm, count)
     excess = {}  # log(size) -> log(cells / count)
-    guess = np.log(_first_guess(body, count))
+    guess = np.log(_first_guess(bodies, count))
     for _ in range(SEARCH_LIMIT):
-        cells = slab_cells(body, Grid.covering(body.bounds, np.exp(guess)), method, 20 * max_cells, boundary)
-        excess[guess] = np.log(cells.count(body.comm) / count)
+        grids = BodyGrids.covering(bounds, np.exp(guess))
+        found = slabs_of_all(bodies, grids, method, 20 * max_cells, boundary)
+        excess[guess] = np.log(sum(cells.count(comm) for cells in found) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:
             return float(np.exp(nearest))
@@ -254,9 +286,10 @@ def choose_cell_size(
     return float(np.exp(nearest))
 
 
-def _first_guess(body: Body, count: int) -> float:
+def _first_guess(bodies: Sequence[Body], count: int) -> float:
     """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
-    roots = np.roots([count, 0, -0.75 * body.report.area, -abs(body.report.volume)])
+    area, volume = sum(body.report.area for body in bodies), sum(abs(body.report.volume) for body in bodies)
+    roots = np.roots([count, 0, -0.75 * area, -volume])
     return float(roots.real.max())
 
 

@@ -3,6 +3,7 @@
 ``stencil_weights`` is the one interface to the kinds of embedding, in geometry.mvc and geometry.smoothing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,15 +44,17 @@ class Embedding:
         return len(self.indptr) - 1
 
 
-def embed(points: np.ndarray, cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
-    """Return W for surface points (collective).
+def embed(
+    points: Sequence[np.ndarray], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0
+) -> Embedding:
+    """Return W for the surface points of all bodies, one after the other (collective).
 
-    points    : (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells
+    points    : of each body (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells of the body
     nodes     : the lattice's node numbers by grid key
     kind, smoothing : see ``stencil_weights``
     """
     comm = cages.table.comm
-    total = comm.allreduce(len(points))
+    total = comm.allreduce(sum(map(len, points)))
     row, ijk, u = _to_cells(points, cages)
     cell_keys, cell = np.unique(encode_morton(ijk), return_inverse=True)
     around = decode_morton(cell_keys)[:, None, :]
@@ -62,12 +65,14 @@ def embed(points: np.ndarray, cages: Cages, nodes: SortedKeys, kind: str, smooth
     return _gather_rows(comm, rows, columns, weights, total, nodes.total)
 
 
-def _to_cells(points: np.ndarray, cages: Cages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _to_cells(points: Sequence[np.ndarray], cages: Cages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Send each point to its cell's rank: its number there, its cell (p, 3), its coordinates in the cell (p, 3)."""
-    at = cages.grid.to_cells(points)
-    ijk = np.floor(at).astype(np.int64)
+    at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
+    cells = [np.floor(of_body).astype(np.int64) for of_body in at]
+    u = np.concatenate([x - ijk for x, ijk in zip(at, cells, strict=True)])
+    ijk = np.concatenate([of_body + cages.grids.first(body) for body, of_body in enumerate(cells)])
     route = Route(cages.table.comm, cages.table.owner(encode_morton(ijk)))
-    return route.send(np.arange(len(points))), route.send(ijk), route.send(at - ijk)
+    return route.send(np.arange(len(u))), route.send(ijk), route.send(u)
 
 
 def _parts(count: int) -> list[slice]:

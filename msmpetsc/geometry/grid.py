@@ -3,7 +3,9 @@
 In Morton order, cells and nodes near in space are near in number, so a contiguous range of keys is compact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -51,6 +53,68 @@ class Grid:
     def nearest_nodes(self, points: np.ndarray) -> np.ndarray:
         """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
         return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class BodyGrids:
+    """The grids of bodies, all of one cell size, numbered as one grid: each body's is moved along the first axis.
+
+    So no two bodies have a cell or a node in common, wherever they are. A body has ``room`` cells, a power of two and
+    more than twice what any body takes along any axis: along the Morton curve one body follows the other, each in the
+    order that it has alone, and a coarser grid's cell is one body's until it is as large as a body.
+    """
+
+    grids: tuple[Grid, ...]
+
+    @classmethod
+    def covering(cls, bounds: Sequence[np.ndarray], cell_size: float) -> "BodyGrids":
+        """Return the grids of bodies in these bounding boxes (2, 3) [m].
+
+        Raises InputError for a cell size too small to number the cells.
+        """
+        grids = cls(tuple(Grid.covering(box, cell_size) for box in bounds))
+        if grids.room * len(bounds) > LIMIT:
+            raise InputError(
+                f"cages.cell_size: {cell_size:g} m is too small to number the cells of {len(bounds)} bodies: "
+                f"at most {LIMIT // len(bounds) // 4} along a side are sure to do"
+            )
+        return grids
+
+    @property
+    def cell_size(self) -> float:
+        """Side of a cell [m]."""
+        return self.grids[0].cell_size
+
+    @cached_property
+    def room(self) -> int:
+        """Cells along the first axis that are each body's own; 0 for a single body, which needs no bounds."""
+        longest = max(int(grid.shape.max()) for grid in self.grids)
+        return 2 << longest.bit_length() if len(self.grids) > 1 else 0
+
+    @cached_property
+    def _origins(self) -> np.ndarray:
+        return np.array([grid.origin for grid in self.grids])
+
+    def first(self, body: int | np.ndarray) -> np.ndarray:
+        """Return the grid index (..., 3) of a body's first cell."""
+        return np.asarray(body)[..., None] * np.array([self.room, 0, 0])
+
+    def body_of(self, ijk: np.ndarray) -> np.ndarray:
+        """Return the number (...,) of the body that grid indices (..., 3) are of."""
+        return (ijk[..., 0] // self.room).astype(np.int64) if self.room else np.zeros(ijk.shape[:-1], np.int64)
+
+    def node_positions(self, ijk: np.ndarray) -> np.ndarray:
+        """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
+        if not self.room:
+            return self.grids[0].node_positions(ijk)
+        body = self.body_of(ijk)
+        return self._origins[body] + (ijk - self.first(body)) * self.cell_size
+
+    def nearest_nodes(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
+        if not self.room:
+            return self.grids[0].nearest_nodes(points)
+        return np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64) + self.first(body)
 
 
 @numba.njit(cache=True)

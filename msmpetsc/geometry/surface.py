@@ -23,6 +23,11 @@ class Surface:
     triangles: np.ndarray
 
 
+def bounds_of(surface: Surface) -> np.ndarray:
+    """Return the bounding box (2, 3) [m] of all points."""
+    return np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
+
+
 @dataclass(frozen=True)
 class SurfaceReport:
     """Measures of a surface, and counts of its faults.

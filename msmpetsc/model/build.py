@@ -1,20 +1,20 @@
-"""From a scene to what is simulated: surface, cages, lattice, embedding, loads, obstacles."""
+"""From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import log, on_root
+from msmpetsc.comm import log, on_root, starts
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
-from msmpetsc.geometry.surface import Surface, check_encloses, examine
+from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, examine
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
@@ -36,14 +36,15 @@ USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
 @dataclass(frozen=True)
 class Model:
-    """A scene made ready to step. Arrays hold this rank's share; the surface is on rank 0 only.
+    """A scene made ready to step. Arrays hold this rank's share; the surfaces are on rank 0 only.
 
     embedding : None where the scene stores no surface
     loads     : gravity first, where there is any
     own_forces : forces that are functions of the state that starts a step
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
+    surface   : of all bodies, one after the other
     damping   : of velocities, by the mass [1/s]
-    body, reaches : what the first lines of a run say of the surface, and of pins, anchors and forces
+    bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
     """
 
     surface: Surface | None
@@ -54,74 +55,80 @@ class Model:
     reflections: list[Reflection]
     penalties: list[Penalty]
     start: InitialState
-    body: Body | None = None
+    bodies: tuple[Body, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
 
+    @property
+    def body_of_point(self) -> np.ndarray:
+        """Number (v,) of the body of each surface point, on rank 0."""
+        points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
+        return np.repeat(np.arange(len(points)), points)
+
 
 class Shape:
-    """What mesh and cages alone decide, which runs of other materials, loads and times may share.
+    """What meshes and cages alone decide, which runs of other materials, loads and times may share.
 
-    body, cages, topology : surface, valid cells, and the nodes and springs that these make
+    bodies, cages, topology : surfaces, valid cells, and the nodes and springs that these make
     """
 
     def __init__(self, comm: MPI.Comm, scene: Scene):
-        """Read the mesh and fill it (collective). Raises InputError on all ranks."""
-        self.source = scene.folder, scene.mesh, scene.cages
-        self.body = read_body(comm, scene)
-        self.cages = fill_cages(self.body, scene)
+        """Read the meshes and fill them (collective). Raises InputError on all ranks."""
+        self.source = scene.folder, scene.meshes, scene.cages
+        self.bodies = read_bodies(comm, scene)
+        self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
         self._outside: np.ndarray | None = None
 
     def fits(self, scene: Scene) -> bool:
-        """Return whether a scene has this mesh and these cages."""
-        return self.source == (scene.folder, scene.mesh, scene.cages)
+        """Return whether a scene has these meshes and these cages."""
+        return self.source == (scene.folder, scene.meshes, scene.cages)
 
     @cached_property
     def embedding(self) -> Embedding:
-        """How the surface follows the nodes (collective)."""
-        points = np.empty((0, 3)) if self.body.surface is None else self.body.surface.points
+        """How the surfaces follow the nodes (collective)."""
+        points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
     def outside(self, lattice: Lattice) -> np.ndarray | None:
-        """Return how far nodes (l,) stick out of the surface [m]; None where cells count whole (collective).
+        """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective).
 
         lattice : of this shape, of any material
         """
         if self._outside is None and self.cages.share is not None:
-            self._outside = distance_outside(self.body, self.cages, lattice)
+            self._outside = distance_outside(self.bodies, self.cages, lattice)
         return self._outside
 
 
 def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Model:
     """Build everything of a scene but its solver (collective). Raises InputError on all ranks.
 
-    shape : of the scene's mesh and cages, where it is known already
+    shape : of the scene's meshes and cages, where it is known already
     """
     shape = shape or Shape(comm, scene)
-    body, cages = shape.body, shape.cages
-    finder = Finder(body, cages, scene.folder)
+    bodies, cages = shape.bodies, shape.cages
+    finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
     masks = regions(scene, lattice, finder)
-    lattice = lattice.pin(_any_of(masks, "pin", lattice.pinned))
+    lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     anchors = _anchors(scene, lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     return Model(
-        surface=body.surface,
+        surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=lattice,
         embedding=shape.embedding if scene.output.surface else None,
         loads=_loads(comm, scene, lattice, masks),
         own_forces=_own_forces(scene, lattice, masks),
         anchors=anchors,
         reflections=_reflections(scene, outside),
-        penalties=_penalties(comm, scene, lattice, body, outside),
-        start=initial_state(comm, scene.start, lattice, fixed, body.bounds),
-        body=body,
+        penalties=_penalties(comm, scene, lattice, finder.bounds, outside),
+        start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
+        bodies=bodies,
         reaches=reaches,
         damping=scene.material.damping,
     )
@@ -155,21 +162,45 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
     )
 
 
-def read_body(comm: MPI.Comm, scene: Scene) -> Body:
-    """Return the prepared surface on rank 0, and on all ranks what they need to know of it (collective)."""
+def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[Body, ...]:
+    """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
 
-    def read() -> tuple[Surface, tuple]:
-        surface = prepare(load(scene.mesh.source, scene.folder), scene.mesh.prepare, scene.mesh.size, scene.mesh.base)
-        _check_in_range(surface)
-        report = examine(surface)
-        for warning in (*check_encloses(surface, report), *_doubtful_unit(surface, scene.mesh.size)):
-            log.warning("%s: %s", scene.mesh.source, warning)
-        surface = compact(surface.points, surface.triangles)  # a point of no triangle may lie in no cell
-        return surface, (report, np.array([surface.points.min(axis=0), surface.points.max(axis=0)]))
+    def read() -> tuple[list[Surface], list[tuple[SurfaceReport, np.ndarray]]]:
+        surfaces, reports = zip(*_prepared(scene), strict=True)
+        return list(surfaces), list(zip(reports, map(bounds_of, surfaces), strict=True))
 
-    surface, facts = on_root(comm, read) or (None, None)
-    report, bounds = comm.bcast(facts)
-    return Body(comm, surface, report, bounds)
+    surfaces, facts = on_root(comm, read) or (None, None)
+    of_bodies: Sequence[Surface | None] = surfaces or [None] * len(scene.meshes)
+    return tuple(Body(comm, surface, *known) for surface, known in zip(of_bodies, comm.bcast(facts), strict=True))
+
+
+def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
+    """Yield the surface of each body with its report, checked; bodies of one shape are prepared once."""
+    shapes: dict[str, Surface] = {}
+    for path, mesh in scene.meshes.items():
+        whose = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
+        shape = repr(mesh.model_copy(update={"base": None}))
+        try:
+            if shape not in shapes:
+                shapes[shape] = prepare(load(mesh.source, scene.folder), mesh.prepare, mesh.size)
+            surface = prepare(shapes[shape], (), base=mesh.base)
+            _check_in_range(surface)
+            report = examine(surface)
+            warnings = *check_encloses(surface, report), *_doubtful_unit(surface, mesh.size)
+        except InputError as error:
+            raise InputError(f"{whose}{error}") from error
+        for warning in warnings:
+            log.warning("%s%s: %s", whose, mesh.source, warning)
+        yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface | None:
+    """Return surfaces as one, one after the other; None for none."""
+    if len(surfaces) < 2:
+        return next(iter(surfaces), None)
+    first = starts(np.array([len(surface.points) for surface in surfaces]))
+    triangles = [surface.triangles + number for surface, number in zip(surfaces, first, strict=True)]
+    return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
 
 
 def _check_in_range(surface: Surface) -> None:
@@ -192,14 +223,14 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
     return [f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"]
 
 
-def fill_cages(body: Body, scene: Scene) -> Cages:
+def fill_cages(bodies: Sequence[Body], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
     cages = scene.cages
     cell_size = cages.cell_size
     if cages.count is not None:
-        cell_size = choose_cell_size(body, cages.count, cages.method, cages.max_cells, cages.boundary)
+        cell_size = choose_cell_size(bodies, cages.count, cages.method, cages.max_cells, cages.boundary)
     assert cell_size is not None  # the schema has one of the two
-    return fill(body, cell_size, cages.method, cages.max_cells, cages.boundary)
+    return fill(bodies, cell_size, cages.method, cages.max_cells, cages.boundary)
 
 
 def _lattice(scene: Scene, shape: Shape, finder: Finder) -> Lattice:
@@ -210,22 +241,17 @@ def _lattice(scene: Scene, shape: Shape, finder: Finder) -> Lattice:
         young_modulus=material.young_modulus,
         stiffness=material.stiffness,
         stiffening=material.law_stiffening,
-        of_cells=cell_materials(material, scene.part, finder),
+        of_cells=cell_materials(scene, finder),
         topology=shape.topology,
     )
-
-
-def _any_of(masks: Regions, kind: str, where: np.ndarray) -> np.ndarray:
-    """Return the nodes (l,) bool of all regions of this kind, and those of ``where``."""
-    return reduce(np.logical_or, (nodes for key, nodes in masks.items() if key.startswith(kind)), where)
 
 
 def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
     """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
     anchors, taken = [], lattice.pinned
-    for number, anchor in enumerate(scene.anchor):
-        where = masks[f"anchor.{number}"] & ~taken
-        anchors.append(Anchor(where, Motion.through(anchor.path), anchor.stop))
+    for anchor in scene.tables("anchor"):
+        where = masks[anchor.key] & ~taken
+        anchors.append(Anchor(where, Motion.through(anchor.table.path), anchor.table.stop))
         taken = taken | where
     return anchors
 
@@ -240,10 +266,10 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
     loads = []
     if scene.gravity is not None:
         loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
-    for number, force in enumerate(scene.force):
-        if force.total is None:
+    for table in scene.tables("force"):
+        if table.table.total is None:
             continue
-        where = masks[f"force.{number}"][: lattice.owned]
+        where, force = masks[table.key][: lattice.owned], table.table
         if isinstance(force.total, ForceTable):
             share = spread_by_mass(comm, (1.0,), where, lattice.mass)
             loads.append(Load(share, force.start, force.stop, LoadTable.of(force.total)))
@@ -255,12 +281,12 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
 def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
     """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
     forces = []
-    for number, force in enumerate(scene.force):
+    for table in scene.tables("force"):
+        force = table.table
         if force.function is not None:
-            key = f"force.{number}"
-            rows = np.flatnonzero(masks[key][: lattice.owned])
+            rows = np.flatnonzero(masks[table.key][: lattice.owned])
             function = FORCES.find(force.function)
-            forces.append(OwnForce(key, function, rows, lattice.mass[rows], force.start, force.stop))
+            forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
     return tuple(forces)
 
 
@@ -272,11 +298,13 @@ def _reflections(scene: Scene, outside: np.ndarray | None) -> list[Reflection]:
     ]
 
 
-def _penalties(comm: MPI.Comm, scene: Scene, lattice: Lattice, body: Body, outside: np.ndarray | None) -> list[Penalty]:
+def _penalties(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray, outside: np.ndarray | None
+) -> list[Penalty]:
     pressing = [(f"obstacle.{number}", o) for number, o in enumerate(scene.obstacle) if o.response == "penalty"]
     if not pressing:
         return []
-    usual, stick = PENALTY * lattice.stiffest(comm), STICK * (body.bounds[1] - body.bounds[0]).max()
+    usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
     return [
         Penalty(Obstacle.of(o, key, outside), o.stiffness or usual, o.friction or 0.0, stick) for key, o in pressing
     ]

@@ -98,10 +98,12 @@ LATTICE = {
     "stiffness": Field("f8", ("s",), "N/m", "stiffness of a spring"),
     "mass": Field("f8", ("n",), "kg", "mass of a node"),
     "pinned": Field("i8", ("p",), "1", "pinned nodes, not those of anchors"),
+    "body": Field("i4", ("n",), "1", "number of a node's body, where there are several"),
 }
 SURFACE = {
     "points": Field("f8", ("v", 3), "m", "surface points at rest"),
     "triangles": Field("i8", ("f", 3), "1", "corner points of a triangle"),
+    "body": Field("i4", ("v",), "1", "number of a point's body, where there are several"),
 }
 EMBEDDING = {  # W (v, n) in CSR form: surface points = W @ node positions
     "indptr": Field("i8", ("r",), "1", "where a point's weights begin"),

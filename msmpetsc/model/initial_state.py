@@ -1,4 +1,6 @@
-"""How a body is at time 0: where its nodes are, and how fast."""
+"""How bodies are at time 0: where their nodes are, and how fast."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from mpi4py import MPI
@@ -15,26 +17,40 @@ def at_rest(lattice: Lattice) -> InitialState:
 
 
 def initial_state(
-    comm: MPI.Comm, start: Start | None, lattice: Lattice, held: np.ndarray, bounds: np.ndarray
+    comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: np.ndarray, bounds: np.ndarray
 ) -> InitialState:
-    """Return where nodes are, and how fast, at a scene's start (collective).
+    """Return where nodes are, and how fast, as each body's start has it (collective).
 
+    starts : of each body; None: at rest
     held   : (l,) bool, nodes that stay at rest where they are
-    bounds : (2, 3) the body's bounding box at rest [m]
+    bounds : (b, 2, 3) each body's bounding box at rest [m]
     """
-    if start is None:
+    if not any(starts):
         return at_rest(lattice)
-    middle = bounds.mean(axis=0)
-    q = middle + np.array(start.scale) * (lattice.nodes - middle)
-    if start.twist is not None:
-        q = twisted(q, start.twist, lattice.nodes, bounds)
-    if start.scatter > 0:
-        anywhere = bounds[0] + uniform(lattice.global_numbers) * (bounds[1] - bounds[0])
-        q = (1 - start.scatter) * q + start.scatter * anywhere
-    q[held] = lattice.nodes[held]
-    velocity = np.array(start.velocity) + np.cross(start.spin, q - centre_of_mass(comm, q, lattice.mass))
+    (q, velocity), body = at_rest(lattice), lattice.body
+    q = q.copy()
+    for number, start in enumerate(starts):
+        if start is not None:
+            own = np.flatnonzero(body == number)
+            owned = int((own < lattice.owned).sum())
+            q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
+            q[own[held[own]]] = lattice.nodes[own[held[own]]]
+            middle = centre_of_mass(comm, q[own], lattice.mass[own[:owned]])
+            velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - middle)
     velocity[held] = 0
     return q, velocity
+
+
+def moved(start: Start, nodes: np.ndarray, numbers: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
+    middle = bounds.mean(axis=0)
+    q = middle + np.array(start.scale) * (nodes - middle)
+    if start.twist is not None:
+        q = twisted(q, start.twist, nodes, bounds)
+    if start.scatter > 0:
+        anywhere = bounds[0] + uniform(numbers) * (bounds[1] - bounds[0])
+        q = (1 - start.scatter) * q + start.scatter * anywhere
+    return q
 
 
 def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import SortedKeys
+from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.model.boundary_cells import CORNERS, shares_of_mass, shares_of_pairs
@@ -44,6 +44,7 @@ class Lattice:
                   first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
     cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
     cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
+    first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
     """
 
     table: SortedKeys
@@ -63,6 +64,7 @@ class Lattice:
     cells_owned: int = 0
     cell_stiffness: np.ndarray = field(default_factory=lambda: np.empty(0))
     cell_share: np.ndarray = field(default_factory=lambda: np.empty(0))
+    first_of_body: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
 
     @property
     def owned(self) -> int:
@@ -73,6 +75,15 @@ class Lattice:
     def global_numbers(self) -> np.ndarray:
         """Global number (l,) of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
+
+    def body_of(self, numbers: int | np.ndarray) -> np.ndarray:
+        """Return the number of the body that each of some nodes, by their global numbers, belongs to."""
+        return np.searchsorted(self.first_of_body, numbers, side="right") - 1
+
+    @property
+    def body(self) -> np.ndarray:
+        """Number (l,) of the body that each local node belongs to."""
+        return self.body_of(self.global_numbers)
 
     def stiffest(self, comm: MPI.Comm) -> float:
         """Return the greatest stiffness of any spring [N/m] (collective)."""
@@ -101,7 +112,7 @@ def build_lattice(
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.region)
     topology      : that of the cages, where it is known already
     """
-    h = cages.grid.cell_size
+    h = cages.grids.cell_size
     net = topology or topology_of(cages)
     given = young_modulus if stiffness is None else stiffness
     mass, of_spring, of_cell = _sums(net, h, density, given, of_cells)
@@ -111,7 +122,7 @@ def build_lattice(
     return Lattice(
         table=net.table,
         cell_size=h,
-        nodes=cages.grid.node_positions(net.ijk),
+        nodes=cages.grids.node_positions(net.ijk),
         ghosts=net.ghosts,
         mass=mass,
         cells=net.corners,
@@ -126,7 +137,15 @@ def build_lattice(
         local_cells=net.cells[kept],
         cells_owned=cells_owned,
         cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
+        first_of_body=_first_of_body(cages, net.ijk[: len(mass)]),
     )
+
+
+def _first_of_body(cages: Cages, ijk: np.ndarray) -> np.ndarray:
+    """Return the global number (b,) of the first node of each body; ijk (owned, 3) of the owned nodes (collective)."""
+    bodies = len(cages.grids.grids)
+    nodes = cages.table.comm.allreduce(np.bincount(cages.grids.body_of(ijk), minlength=bodies))
+    return starts(nodes)
 
 
 class Topology(NamedTuple):

@@ -19,7 +19,7 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray, measure
     if len(rows):
         candidate = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
     _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
-    return f"node {number}, {rest_point(point)}"
+    return f"node {number}, {rest_point(lattice, number, point)}"
 
 
 def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int, str]:
@@ -29,8 +29,11 @@ def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int
     total = comm.allreduce(count)
     if not total:
         return 0, ""
-    point = to_host(lattice.nodes[cells[worst]].mean(axis=0)) if worst >= 0 else None
-    return total, rest_point(min(comm.allgather((least, point)), key=lambda candidate: candidate[0])[1])
+    number, point = 0, np.zeros(3)
+    if worst >= 0:
+        number, point = lattice.global_numbers[int(cells[worst][0])], to_host(lattice.nodes[cells[worst]].mean(axis=0))
+    _, number, point = min(comm.allgather((least, number, point)), key=lambda candidate: candidate[0])
+    return total, rest_point(lattice, number, point)
 
 
 def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> str:
@@ -42,6 +45,11 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> str:
     return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
 
 
-def rest_point(point: np.ndarray) -> str:
-    """Return a point (3,) [m] of the body at rest in words."""
-    return f"at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
+def rest_point(lattice: Lattice, number: int, point: np.ndarray) -> str:
+    """Return a point (3,) [m] at rest in words, with the body of the node of this global number."""
+    return f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
+
+
+def of_body(lattice: Lattice, number: int) -> str:
+    """Return "of body.1 ", the body of the node of this global number; "" where there is but one."""
+    return f"of body.{lattice.body_of(number)} " if len(lattice.first_of_body) > 1 else ""

@@ -4,6 +4,7 @@ The ranks cut cells and nodes, both in Morton order, as comm.SortedKeys does: at
 depends on what each rank brings to it, slabs of cells and then the corners of its cells, so that is repeated too.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,30 +82,31 @@ def _cut_springs(side: float) -> float:
     return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
 
 
-def partition_of(body: Body, wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
+def partition_of(bodies: Sequence[Body], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
     """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
 
     That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
     """
-    h, report = wanted.cell_size, body.report
+    h = wanted.cell_size
+    area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
     guess: float
     if wanted.count is not None:
         guess = wanted.count
     else:
         assert h is not None  # the schema has one of the two
-        guess = _cells(abs(report.volume), 3 / 4 * report.area, h)  # as choose_cell_size does
+        guess = _cells(enclosed, 3 / 4 * area, h)  # as choose_cell_size does
     if h and guess <= most:
         size = h
     else:
-        size = choose_cell_size(body, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
-    cages = fill(body, size, wanted.method, MOST, wanted.boundary)
-    partition = count_partition(body, cages, build_lattice(cages, 1.0, 1.0), ranks)
+        size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
+    cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
+    partition = count_partition(bodies, cages, build_lattice(cages, 1.0, 1.0), ranks)
     counted = int(partition.cells.sum())
     if guess > most:
         cells = wanted.count
         if cells is None:
             assert h is not None
-            volume = abs(report.volume) if report.closed else counted * size**3
+            volume = enclosed if all(body.report.closed for body in bodies) else counted * size**3
             cells = round(_cells(volume, (counted * size**3 - volume) / size, h))
         partition = partition.scaled(cells)
     return partition, counted
@@ -115,9 +117,9 @@ def _cells(volume: float, area: float, h: float) -> float:
     return volume / h**3 + area / h**2
 
 
-def count_partition(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> Partition:
+def count_partition(bodies: Sequence[Body], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
     """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
-    cell_rank = _ranks_of_cells(body, cages, ranks)
+    cell_rank = _ranks_of_cells(bodies, cages, ranks)
     rank = _ranks_of_nodes(lattice, cell_rank, ranks)
     of_end = rank[lattice.springs]
     across = of_end[:, 0] != of_end[:, 1]
@@ -135,10 +137,13 @@ def count_partition(body: Body, cages: Cages, lattice: Lattice, ranks: int) -> P
     return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
 
 
-def _ranks_of_cells(body: Body, cages: Cages, ranks: int) -> np.ndarray:
-    """Return the rank (c,) of each cell; each rank first finds those of its slab along the longest side."""
-    axis = int(np.argmax(np.ptp(body.bounds, axis=0)))
-    slab = Slab.owner(cages.ijk[:, axis], ranks, int(cages.grid.shape[axis]))
+def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> np.ndarray:
+    """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
+    grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
+    of_cell = grids.body_of(ijk)
+    for number, (body, grid) in enumerate(zip(bodies, grids.grids, strict=True)):
+        axis, own = int(np.argmax(np.ptp(body.bounds, axis=0))), of_cell == number
+        slab[own] = Slab.owner((ijk[own] - grids.first(number))[:, axis], ranks, int(grid.shape[axis]))
     keys = cages.table.keys
     return _cut(keys, [keys[part] for part in _parts(slab, ranks)], ranks)
 

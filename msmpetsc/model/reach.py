@@ -4,11 +4,10 @@ What could not have any effect at all is refused; what is overruled in part is w
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -30,17 +29,19 @@ class Reach:
 
     nodes : how many the region holds
     held  : how many of them are not the table's own, for a pin or an anchor that comes before it holds them
+    kind  : "pin", "anchor" or "force"
     """
 
     key: str
     nodes: int
     held: int
+    kind: str
 
 
 def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndarray]:
     """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
-    tables = dict(chain.from_iterable(_keyed(scene, kind) for kind in ("pin", "anchor", "force")))
-    return {key: finder.find(key, table.region, lattice) for key, table in tables.items()}
+    tables = chain.from_iterable(scene.tables(kind) for kind in ("pin", "anchor", "force"))
+    return {table.key: finder.find(table, lattice) for table in tables}
 
 
 def reach_of(
@@ -57,25 +58,25 @@ def reach_of(
         return comm.allreduce(int(where[: lattice.owned].sum()))
 
     reaches, pinned = [], np.zeros_like(lattice.pinned)
-    for number in range(len(scene.pin)):
-        where = masks[f"pin.{number}"]
-        reaches.append(Reach(f"pin.{number}", count(where), count(where & pinned)))
+    for pin in scene.tables("pin"):
+        where = masks[pin.key]
+        reaches.append(Reach(pin.key, count(where), count(where & pinned), "pin"))
         pinned = pinned | where
-    for number, anchor in enumerate(anchors):
-        where = masks[f"anchor.{number}"]
-        reach = Reach(f"anchor.{number}", count(where), count(where & ~anchor.where))
+    for number, (table, anchor) in enumerate(zip(scene.tables("anchor"), anchors, strict=True)):
+        where = masks[table.key]
+        reach = Reach(table.key, count(where), count(where & ~anchor.where), "anchor")
         reaches.append(reach)
         same = (before.where for before in anchors[:number] if _leads_alike(before, anchor))
         alike = reduce(np.logical_or, same, np.zeros_like(pinned))
         _warn_of_overruled(reach, count(where & pinned), count(where & ~anchor.where & ~pinned & ~alike))
-    for number, force in enumerate(scene.force):
-        where = masks[f"force.{number}"]
-        reach = Reach(f"force.{number}", count(where), count(where & _held_while(force, lattice.pinned, anchors)))
-        reaches.append(reach)
-        if reach.held == reach.nodes and force.pulls:
+    for table in scene.tables("force"):
+        where, force = masks[table.key], table.table
+        held = where & _held_while(force, lattice.pinned, anchors)
+        reaches.append(Reach(table.key, count(where), count(held), "force"))
+        if reaches[-1].held == reaches[-1].nodes and force.pulls:
             raise InputError(
-                f"{reach.key} moves nothing: of the {_nodes(reach.nodes)} in its region none is free while it acts, "
-                "pins and anchors hold all"
+                f"{table.key} moves nothing: of the {_nodes(reaches[-1].nodes)} in its region none is free while it "
+                "acts, pins and anchors hold all"
             )
     _warn_of_idle_parts(comm, scene, lattice, anchors, finder)
     _note_what_never_acts(scene)
@@ -109,22 +110,23 @@ def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.n
 
 def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder) -> None:
     """Warn of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
-    if not scene.part:
+    parts = list(scene.tables("part"))
+    if not parts:
         return
     own = lattice.local_cells[: lattice.cells_owned]
-    ijk = finder.cages.grid.nearest_nodes(lattice.nodes[own[:, 0]])
+    ijk = finder.cages.grids.nearest_nodes(lattice.nodes[own[:, 0]], lattice.body[own[:, 0]])
     held = reduce(np.logical_or, (a.where for a in anchors if a.stop is None), lattice.pinned)
     free = ~held[own].all(axis=1)
     replaced = {name: np.zeros(len(own), bool) for name in ("density", "young_modulus", "stiffness")}
-    for number, part in reversed(list(enumerate(scene.part))):
-        where = finder.find_cells(f"part.{number}", part.region, ijk)
-        given = [name for name in replaced if getattr(part, name) is not None]
+    for part in reversed(parts):
+        where = finder.find_cells(part, ijk)
+        given = [name for name in replaced if getattr(part.table, name) is not None]
         counts = where, where & ~np.all([replaced[name] for name in given], axis=0), where & free
         cells, kept, moving = comm.allreduce(np.array([mask.sum() for mask in counts]))
         if kept == 0:
-            log.warning("part.%d has no effect: later parts give all that it gives, on all its %d cells", number, cells)
+            log.warning("%s has no effect: later parts give all that it gives, on all its %d cells", part.key, cells)
         elif moving == 0:
-            log.warning("part.%d has no effect: pins and anchors hold all nodes of its %d cells", number, cells)
+            log.warning("%s has no effect: pins and anchors hold all nodes of its %d cells", part.key, cells)
         for name in given:
             replaced[name] |= where
 
@@ -132,7 +134,9 @@ def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors:
 def _note_what_never_acts(scene: Scene) -> None:
     """Warn of forces and obstacles that are there at the end of no step."""
     time = scene.time
-    for key, table in chain(_keyed(scene, "force"), _keyed(scene, "obstacle")):
+    forces = ((force.key, force.table) for force in scene.tables("force"))
+    obstacles = ((f"obstacle.{number}", obstacle) for number, obstacle in enumerate(scene.obstacle))
+    for key, table in chain(forces, obstacles):
         if _acts_in_a_step(table, time):
             continue
         until = "on" if table.stop is None else f"to {table.stop:g} s"
@@ -141,11 +145,6 @@ def _note_what_never_acts(scene: Scene) -> None:
             log.info("%s, and the run ends at %g s", text, time.duration)
         else:
             log.warning("%s, between the ends of steps of %g s", text, time.step)
-
-
-def _keyed(scene: Scene, kind: str) -> Iterator[tuple[str, Any]]:
-    """Return the tables of a kind, each with its key: ("force.0", ...)."""
-    return ((f"{kind}.{number}", table) for number, table in enumerate(getattr(scene, kind)))
 
 
 def _acts_in_a_step(table: Force | ObstacleTable, time: Time) -> bool:

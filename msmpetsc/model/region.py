@@ -13,61 +13,79 @@ from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.model.lattice import CORNERS, Lattice
 from msmpetsc.model.material import CellMaterial
-from msmpetsc.scene.body import Material, PartTable, Region
+from msmpetsc.scene.bodies import OfBody
+from msmpetsc.scene.body import Material, Region
+from msmpetsc.scene.schema import Scene
 
 EDGE = 1e-9  # of the body's longest side: a node this near to a region counts as on its edge, whatever was rounded
 
 
 @dataclass(frozen=True)
 class Finder:
-    """Finds a region's nodes in a body's lattice, or its cells.
+    """Finds a region's nodes in the lattice of bodies, or its cells.
 
     folder : where files of painted points lie
     """
 
-    body: Body
+    bodies: tuple[Body, ...]
     cages: Cages
     folder: Path
 
-    def find(self, key: str, region: Region, lattice: Lattice) -> np.ndarray:
-        """Return the local nodes that a region means, (l,) bool (collective).
+    @property
+    def comm(self) -> MPI.Comm:
+        return self.bodies[0].comm
 
-        key : of the region's table in the scene, for messages. Raises InputError on all ranks if there are none.
+    @property
+    def bounds(self) -> np.ndarray:
+        """Bounding box at rest (b, 2, 3) [m] of each body."""
+        return np.array([body.bounds for body in self.bodies])
+
+    def find(self, table: OfBody, lattice: Lattice) -> np.ndarray:
+        """Return the local nodes that the region of a scene's table means, (l,) bool (collective).
+
+        Raises InputError on all ranks if there are none.
         """
+        region = table.table.region
         if region.painted is None:
-            where = inside(region, lattice.nodes, self.body.bounds)
+            where = inside_bodies(region, lattice.nodes, self.bounds, lattice.body, table.body)
         else:
-            where = self._corners_of(self._painted_cells(key, region.painted), lattice)
-        if self.body.comm.allreduce(int(where[: lattice.owned].sum())) == 0:
-            raise InputError(f"{key}.region holds no node of the lattice")
+            keys = np.unique(encode_morton(self._painted_cells(table)[:, None, :] + CORNERS))
+            nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
+            where = np.isin(encode_morton(nodes), keys)
+        if self.comm.allreduce(int(where[: lattice.owned].sum())) == 0:
+            raise InputError(f"{table.key}.region holds no node of the lattice")
         return where
 
-    def find_cells(self, key: str, region: Region, ijk: np.ndarray) -> np.ndarray:
+    def find_cells(self, table: OfBody, ijk: np.ndarray) -> np.ndarray:
         """Return which cells (c,) bool have their centres in a region, or hold a painted point (collective).
 
         ijk : (c, 3) grid index of the cells. Raises InputError on all ranks if the region means none.
         """
+        region, grids = table.table.region, self.cages.grids
         if region.painted is None:
-            where = inside(region, self.cages.grid.node_positions(ijk + 0.5), self.body.bounds)
+            centres = grids.node_positions(ijk + 0.5)
+            where = inside_bodies(region, centres, self.bounds, grids.body_of(ijk), table.body)
         else:
-            where = np.isin(encode_morton(ijk), encode_morton(self._painted_cells(key, region.painted)))
-        if not self.body.comm.allreduce(bool(where.any()), MPI.LOR):
-            raise InputError(f"{key}.region holds the centre of no cell")
+            where = np.isin(encode_morton(ijk), encode_morton(self._painted_cells(table)))
+        if not self.comm.allreduce(bool(where.any()), MPI.LOR):
+            raise InputError(f"{table.key}.region holds the centre of no cell")
         return where
 
-    def _painted_cells(self, key: str, painted: str | tuple[int, ...]) -> np.ndarray:
-        """Return the cells (k, 3) that painted points of the surface lie in (collective)."""
+    def _painted_cells(self, table: OfBody) -> np.ndarray:
+        """Return the cells (k, 3) that painted points of a body's surface lie in (collective)."""
+        key, number = table.key, table.body or 0  # without a body there is but one: the scene's own
+        surface, grid = self.bodies[number].surface, self.cages.grids.grids[number]
 
         def cells() -> np.ndarray:
-            assert self.body.surface is not None  # it is on rank 0, which alone is asked
-            points, numbers = self.body.surface.points, np.array(self._numbers(key, painted))
+            assert surface is not None  # it is on rank 0, which alone is asked
+            points, numbers = surface.points, np.array(self._numbers(key, table.table.region.painted))
             if numbers.max() >= len(points):
                 raise InputError(
                     f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}"
                 )
-            return np.unique(self.cages.grid.to_cells(points[numbers]).astype(np.int64), axis=0)
+            return np.unique(grid.to_cells(points[numbers]).astype(np.int64), axis=0)
 
-        return self.body.comm.bcast(on_root(self.body.comm, cells))
+        return self.comm.bcast(on_root(self.comm, cells)) + self.cages.grids.first(number)
 
     def _numbers(self, key: str, painted: str | tuple[int, ...]) -> list[int]:
         if not isinstance(painted, str):
@@ -84,10 +102,6 @@ class Finder:
         if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
             raise InputError(f"{key}.region.painted: {path} must list point numbers, from 0")
         return numbers
-
-    def _corners_of(self, cells: np.ndarray, lattice: Lattice) -> np.ndarray:
-        keys = np.unique(encode_morton(cells[:, None, :] + CORNERS))
-        return np.isin(encode_morton(self.cages.grid.nearest_nodes(lattice.nodes)), keys)
 
 
 def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
@@ -112,23 +126,45 @@ def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray
     return (points - to_body(region.half_space.point)) @ np.asarray(region.half_space.normal) >= -edge
 
 
-def cell_materials(
-    material: Material, parts: tuple[PartTable, ...], finder: Finder
-) -> Callable[[np.ndarray], CellMaterial] | None:
+def inside_bodies(
+    region: Region, points: np.ndarray, bounds: np.ndarray, body: np.ndarray, meant: int | None
+) -> np.ndarray:
+    """Return which points (n, 3) [m] of bodies lie in a region, (n,) bool.
+
+    bounds : (b, 2, 3) each body's bounding box at rest [m]
+    body   : (n,) the body of each point
+    meant  : the body whose region it is; None: all
+    """
+    if len(bounds) == 1:
+        return inside(region, points, bounds[0])
+    where = np.zeros(len(points), bool)
+    for number in range(len(bounds)) if meant is None else (meant,):
+        own = body == number
+        where[own] = inside(region, points[own], bounds[number])
+    return where
+
+
+def cell_materials(scene: Scene, finder: Finder) -> Callable[[np.ndarray], CellMaterial] | None:
     """Return the function from the grid index (c, 3) of cells to what they are made of (collective).
 
     It is None where all cells are of the same material.
     """
-    if not parts:
+    material, parts, bodies = scene.material, list(scene.tables("part")), [body.material for body in scene.body]
+    if not parts and not any(bodies):
         return None
     (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
+    density, stiffness = (
+        np.array([getattr(own, name, None) or getattr(material, name) for own in bodies or [None]])
+        for name in ("density", spring)
+    )
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
-        cells = CellMaterial(np.full(len(ijk), material.density), np.full(len(ijk), getattr(material, spring)))
-        for number, part in enumerate(parts):
-            where = finder.find_cells(f"part.{number}", part.region, ijk)
-            cells.density[where] = part.density or cells.density[where]
-            cells.spring[where] = getattr(part, spring) or cells.spring[where]
+        body = finder.cages.grids.body_of(ijk)
+        cells = CellMaterial(density[body], stiffness[body])
+        for part in parts:
+            where = finder.find_cells(part, ijk)
+            cells.density[where] = part.table.density or cells.density[where]
+            cells.spring[where] = getattr(part.table, spring) or cells.spring[where]
         return cells
 
     return of_cells

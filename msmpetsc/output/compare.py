@@ -163,7 +163,7 @@ def _row_lengths(rows: np.ndarray) -> np.ndarray:
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: np.ndarray) -> dict[str, float]:
     """Return what the errors of each field are relative to."""
     scales = {name: distance.size for name, distance in distances.items()}
-    side = np.ptp(a.lattice.nodes[:], axis=0).max() if len(a.lattice.nodes) else 0.0
+    side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
     least = _least_energy(a)
     energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
     for name in scales:
@@ -174,6 +174,12 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: np.nda
     if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
         scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
     return scales
+
+
+def longest_side(points: np.ndarray, body: np.ndarray) -> float:
+    """Return the longest side [m] of the bounding box of any body's points (n, 3); ``body`` (n,) are their numbers."""
+    of_bodies = (points[body == number] for number in np.unique(body))
+    return float(max((np.ptp(own, axis=0).max() for own in of_bodies), default=0.0))
 
 
 def _largest(a: Result, b: Result, pairs: np.ndarray, names: Sequence[str]) -> float:

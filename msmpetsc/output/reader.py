@@ -140,6 +140,12 @@ class Result:
             raise InputError(f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points")
         return W
 
+    def body_of(self, group: str) -> np.ndarray:
+        """Return the number of the body of each node ("lattice", (n,)) or surface point ("surface", (v,))."""
+        if f"{group}/body" in self:
+            return self[f"{group}/body"][:].astype(np.int64)
+        return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
+
     @property
     def checkpoint(self) -> StoredState | None:
         """The newest checkpoint by now, or None."""

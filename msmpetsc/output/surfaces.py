@@ -9,7 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import LEAST_STRAIN, SAME_POINT, Comparison, FieldError, common_times, point_text
+from msmpetsc.output.compare import (
+    LEAST_STRAIN,
+    SAME_POINT,
+    Comparison,
+    FieldError,
+    common_times,
+    longest_side,
+    point_text,
+)
 from msmpetsc.output.reader import Result
 
 NEEDED = ("frames/surface", "surface/points", "surface/triangles")
@@ -62,7 +70,9 @@ def surface_distance(run: Result, reference: Result) -> SurfaceDistance:
         worst[number] = np.argmax(apart)
         greatest[number] = apart[worst[number]]
         moved = max(moved, np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0))
-    moved = moved if moved > LEAST_STRAIN * np.ptp(rest, axis=0).max() else 0.0  # less is rounding
+    moved = (
+        moved if moved > LEAST_STRAIN * longest_side(rest, reference.body_of("surface")) else 0.0
+    )  # less is rounding
     return SurfaceDistance(pairs, times[pairs[:, 0]], rms, greatest, worst, float(moved))
 
 

@@ -42,6 +42,9 @@ def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements:
         topology.append(_data_item(run, elements))
         geometry = ET.SubElement(grid, "Geometry", GeometryType="XYZ")
         geometry.append(_frame_slab(run, points, index))
+        if f"{name}/body" in run:
+            body = ET.SubElement(grid, "Attribute", Name="body", AttributeType="Scalar", Center="Node")
+            body.append(_data_item(run, f"{name}/body"))
         grids.append(grid)
     return grids
 

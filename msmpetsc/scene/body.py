@@ -1,6 +1,7 @@
 """Tables of what the body is: surface, cells, material, parts, and regions of it."""
 
-from typing import Annotated, Any, Literal, get_args
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
@@ -151,10 +152,9 @@ class Region(Table):
         return relative
 
 
-class PartTable(Table):
-    """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
+class OwnMaterial(Table):
+    """What is not of the scene's material; a key that is absent is the material's."""
 
-    region: Region = Field(description="the cells whose centres lie in it")
     density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
     young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")
     stiffness: Positive | None = Field(
@@ -162,24 +162,32 @@ class PartTable(Table):
     )
 
     @model_validator(mode="after")
-    def _says_something(self) -> "PartTable":
+    def _says_something(self) -> Self:
         if self.density is None and self.young_modulus is None and self.stiffness is None:
             raise rule("needs density, young_modulus or stiffness")
         return self
 
 
-def as_the_material(cls, parts: tuple[PartTable, ...], info: ValidationInfo) -> tuple[PartTable, ...]:
-    """Stiffness and Young's modulus are two ways to name all springs: parts must take the material's."""
-    material = info.data.get("material")
-    for number, part in enumerate(parts):
+class PartTable(OwnMaterial):
+    """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
+
+    region: Region = Field(description="the cells whose centres lie in it")
+
+
+def refuse_unlike(material: Material | None, others: Mapping[str, OwnMaterial]) -> None:
+    """Raise a broken rule where others, by their keys, do not go with the material; None: it is not known.
+
+    Stiffness and Young's modulus are two ways to name all springs.
+    """
+    for key, other in others.items():
         for name in Material.one_of:
-            if material is not None and getattr(part, name) is not None and getattr(material, name) is None:
-                raise rule(f"may give {name} only where material does, as part.{number} does", "material")
+            if material is not None and getattr(other, name) is not None and getattr(material, name) is None:
+                raise rule(f"may give {name} only where material does, as {key} does", "material")
     for name in (*Material.one_of, "density"):
-        values = [value for table in (material, *parts) if (value := getattr(table, name, None)) is not None]
+        tables = (material, *others.values())
+        values = [value for table in tables if (value := getattr(table, name, None)) is not None]
         if values and max(values) > MOST_CONTRAST * min(values):
             raise rule(
-                f"has {name} of {min(values):g} to {max(values):g} in one body: more than {MOST_CONTRAST:g} to 1 "
+                f"has {name} of {min(values):g} to {max(values):g} in one run: more than {MOST_CONTRAST:g} to 1 "
                 "cannot be solved in double precision (1e6 to 1 is as good as rigid)"
             )
-    return parts

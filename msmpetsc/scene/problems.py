@@ -96,7 +96,7 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
         number = _line(e["loc"], prefixes)
         where = f" (--set {as_given(culprit)})" if culprit else f" (line {number})" if number else ""
-        lines.append(f"{path}: {_key(e['loc'])}: {_words(e)}{where}")
+        lines.append(": ".join(filter(None, [str(path), _key(e["loc"]), f"{_words(e)}{where}"])))
     more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 

@@ -54,7 +54,8 @@ def scene_of(
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else ())
-    return Scene(**dict(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+    given = {name: getattr(checked, name) for name in checked.model_fields_set}
+    return Scene(**given, text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
 
 
 def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] = ()) -> Scene:

@@ -2,14 +2,25 @@
 
 from collections.abc import Iterator, Mapping
 from html import escape
+from itertools import chain
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable, as_the_material
+from msmpetsc.scene.bodies import (
+    OF_REGIONS,
+    BodyTable,
+    OfBody,
+    as_the_material,
+    no_moving_body,
+    of_all_bodies,
+    tables_of,
+)
+from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, Start, Time
+from msmpetsc.scene.problems import KeyPath
 from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
@@ -63,12 +74,14 @@ class Picture(Table):
 class SceneFile(Table):
     """What may stand in a scene file; ``SceneFile.model_json_schema()`` is its schema."""
 
+    one_of = ("mesh", "body")
     title: str = Field("", description="for the reader")
-    mesh: Mesh = Field(description="the closed surface")
+    mesh: Mesh | None = Field(None, description="the closed surface of the one body")
     cages: CagesTable = Field(description="the cells that fill it")
     material: Material = Field(description="what it is made of")
-    part: ListOf[PartTable] = Field((), description="cells of another material")
     time: Time = Field(description="time step and duration")
+    body: ListOf[BodyTable] = Field((), min_length=1, description="each of several bodies, in place of mesh")
+    part: ListOf[PartTable] = Field((), description="cells of another material")
     start: Start | None = Field(None, description="how it is at time 0; at rest in its rest shape if absent")
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
     obstacle: ListOf[ObstacleTable] = Field((), description="what nodes bounce off")
@@ -81,9 +94,11 @@ class SceneFile(Table):
     budget: Budget | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
-    _of_one_kind = field_validator("part")(as_the_material)
+    _of_one_kind = field_validator("body", "part")(as_the_material)
     _is_damped_in_motion = field_validator("time")(no_damping)
+    _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)
     _starts_at_rest = field_validator("start")(no_motion)
+    _start_at_rest = field_validator("body")(no_moving_body)
     _only_presses = field_validator("obstacle")(no_impact)
     _is_given = field_validator("force")(no_functions)
 
@@ -97,13 +112,29 @@ class SceneFile(Table):
         every = self.output.every
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 
+    @property
+    def meshes(self) -> dict[KeyPath, Mesh]:
+        """The surface of each body, by the path of its key."""
+        if self.mesh is not None:
+            return {("mesh",): self.mesh}
+        return {("body", number, "mesh"): body.mesh for number, body in enumerate(self.body)}
+
+    @property
+    def starts(self) -> list[Start | None]:
+        """How each body is at time 0."""
+        return [body.start or self.start for body in self.body] or [self.start]
+
+    def tables(self, kind: str) -> Iterator[OfBody]:
+        """Yield the tables of a kind that take a region: those of all bodies, then those of each."""
+        return tables_of(self, kind)
+
     def named_files(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
         """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
-        yield ("mesh", "source"), self.mesh.source
-        for kind in ("part", "pin", "anchor", "force"):
-            for number, table in enumerate(getattr(self, kind)):
-                if isinstance(table.region.painted, str):
-                    yield (kind, number, "region", "painted"), table.region.painted
+        for path, mesh in self.meshes.items():
+            yield (*path, "source"), mesh.source
+        for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):
+            if isinstance(table.region.painted, str):
+                yield (*path, "region", "painted"), table.region.painted
 
 
 class Scene(SceneFile):

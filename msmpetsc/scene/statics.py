@@ -29,9 +29,15 @@ def no_damping(cls: Any, time: Any, info: ValidationInfo) -> Any:
 
 def no_motion(cls: Any, start: Any, info: ValidationInfo) -> Any:
     """Refuse a start in motion (a validator of ``start``)."""
-    if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):
-        raise rule(f'may have no velocity or spin where time.integrator = "{STATIC}": there is no inertia', "time")
+    refuse_motion(start, info)
     return start
+
+
+def refuse_motion(start: Any, info: ValidationInfo, whose: str = "") -> None:
+    """Raise a broken rule for a start in motion; ``whose`` it is, for the message."""
+    if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):
+        words = f'{whose}may have no velocity or spin where time.integrator = "{STATIC}": there is no inertia'
+        raise rule(words, "time")
 
 
 def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:

@@ -13,11 +13,16 @@ from msmpetsc.output.surfaces import surface_distance
 
 
 def shape_error(run: Result, frame: int) -> float | None:
-    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite."""
+    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite.
+
+    Of several bodies it is that of the one that is farthest from its shape.
+    """
     position = run.frames.position[frame]
     if not np.isfinite(position).all():
         return None
-    return distance_of_shapes(position, run["lattice/nodes"][:], run["lattice/mass"][:])
+    rest, mass, body = run["lattice/nodes"][:], run["lattice/mass"][:], run.body_of("lattice")
+    of_bodies = (body == number for number in np.unique(body))
+    return max(distance_of_shapes(position[own], rest[own], mass[own]) for own in of_bodies)
 
 
 def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:

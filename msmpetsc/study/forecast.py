@@ -177,7 +177,7 @@ def forecast(
     changes: Sequence[str],
     options: str,
     scene: Scene,
-    surface: Surface,
+    surfaces: Sequence[Surface],
     cells: float,
     frames: int,
     again: bool,
@@ -186,7 +186,7 @@ def forecast(
 
     Runs that were made on this machine before stand in the user's cache, unless they are to be made ``again``.
 
-    surface : prepared
+    surfaces : prepared, of each body
 
     Raises InputError where a run fails.
     """
@@ -196,9 +196,10 @@ def forecast(
     else:
         fine = min(int(cells), FINE)
         with tempfile.TemporaryDirectory(prefix="msmpetsc-inspect-") as folder:
-            mesh = Path(folder) / "surface.obj"
-            trimesh.Trimesh(surface.points, surface.triangles, process=False).export(mesh)
-            base = _case(file, scene, changes=changes, options=options, mesh=mesh, frames=frames)
+            meshes = [Path(folder) / f"surface{number}.obj" for number in range(len(surfaces))]
+            for surface, mesh in zip(surfaces, meshes, strict=True):
+                trimesh.Trimesh(surface.points, surface.triangles, process=False).export(mesh)
+            base = _case(file, scene, changes=changes, options=options, meshes=meshes, frames=frames)
             rows = _measured(Path(folder), [_on(base, scene, n) for n in (min(COARSE, max(1, fine // 8)), fine)])
         cached.parent.mkdir(parents=True, exist_ok=True)
         cached.write_text(json.dumps(rows))
@@ -227,11 +228,15 @@ def _measured(folder: Path, cases: Sequence[Case]) -> list[Row]:
     return rows
 
 
-def _case(file: Path, scene: Scene, *, changes: Sequence[str], options: str, mesh: Path, frames: int) -> Case:
-    """Return the run of the scene's first frames, its surface as it was prepared."""
+def _case(
+    file: Path, scene: Scene, *, changes: Sequence[str], options: str, meshes: Sequence[Path], frames: int
+) -> Case:
+    """Return the run of the scene's first frames, its surfaces as they were prepared."""
     time = scene.time
+    prepared = dict(zip((".".join(map(str, path)) for path in scene.meshes), meshes, strict=True))
     all_changes = (
-        *changes, f"mesh={inline({'source': str(mesh)})}", f"time.duration={min(frames, time.steps) * time.step!r}",
+        *changes, *(f"{key}={inline({'source': str(mesh)})}" for key, mesh in prepared.items()),
+        f"time.duration={min(frames, time.steps) * time.step!r}",
         "output.surface=false", "output.every=1",
     )  # fmt: skip
     return Case(

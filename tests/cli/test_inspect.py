@@ -17,7 +17,7 @@ from msmpetsc.cli.commands.inspect import largest
 from msmpetsc.cli.main import main
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.build import build_model, fill_cages, read_body
+from msmpetsc.model.build import build_model, fill_cages, read_bodies
 from msmpetsc.model.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.ghosted import Ghosted
@@ -57,9 +57,9 @@ def own_log():
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
     """What count_partition says."""
     read = load_scene(scene, [f"cages.count={cells}"])
-    body = read_body(SELF, read)
-    cages = fill_cages(body, read)
-    return count_partition(body, cages, build_model(SELF, read).lattice, ranks)
+    bodies = read_bodies(SELF, read)
+    cages = fill_cages(bodies, read)
+    return count_partition(bodies, cages, build_model(SELF, read).lattice, ranks)
 
 
 def test_the_counts_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
@@ -221,7 +221,7 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, o
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):
-        fill_cages(read_body(SELF, load_scene(scene)), load_scene(scene, [many]))
+        fill_cages(read_bodies(SELF, load_scene(scene)), load_scene(scene, [many]))
     assert main(["inspect", str(scene), "--ranks", "8", "--no-times", "--set", many]) == 0
     told = capsys.readouterr()
     assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err

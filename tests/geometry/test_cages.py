@@ -204,7 +204,7 @@ def body_of(mesh: trimesh.Trimesh | Surface) -> Body:
 
 
 def dense(cages: Cages, kind: int) -> np.ndarray:
-    grid = np.zeros(cages.grid.shape, bool)
+    grid = np.zeros(cages.grids.grids[0].shape, bool)
     grid[tuple(cages.ijk[cages.kind == kind].T)] = True
     return grid
 
@@ -234,14 +234,14 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_interior_is_what_a_dense_flood_fill_finds(name):
     mesh, cell_size = SHAPES[name]
-    cages = fill(body_of(mesh), cell_size, boundary="whole")
+    cages = fill([body_of(mesh)], cell_size, boundary="whole")
     assert np.array_equal(dense(cages, INTERIOR), enclosed(dense(cages, BOUNDARY)))
 
 
 @pytest.mark.parametrize("name", ["torus", "two balls"])
 def test_valid_cells_have_the_bodys_volume_and_half_its_boundary_cells_more(name):
     mesh, cell_size = SHAPES[name]
-    cages = fill(body_of(mesh), cell_size)
+    cages = fill([body_of(mesh)], cell_size)
     boundary = (cages.kind == BOUNDARY).sum()
     # a smooth surface cuts its cells in half on average
     assert (len(cages.kind) - boundary / 2) * cell_size**3 == pytest.approx(mesh.volume, rel=0.02)
@@ -251,8 +251,8 @@ def test_valid_cells_have_the_bodys_volume_and_half_its_boundary_cells_more(name
 @pytest.mark.parametrize("boundary", ["whole", "fill"])
 def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(turned, boundary):
     # the flood comes from outside and cannot reach it: the paper's interior is what is enclosed
-    cages = fill(body_of(hollow_ball(turned)), 0.1, boundary=boundary)
-    middle = np.floor((0 - cages.grid.origin) / 0.1).astype(int)
+    cages = fill([body_of(hollow_ball(turned))], 0.1, boundary=boundary)
+    middle = np.floor((0 - cages.grids.grids[0].origin) / 0.1).astype(int)
     assert dense(cages, INTERIOR)[tuple(middle)] != (turned and boundary == "fill")
 
 
@@ -260,12 +260,12 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
     # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3: a bit for each of its cells is 1 TB
     ends = np.array([[0, 0, 0], [20_000, 20_000, 20_000]])
     body = body_of(trimesh.creation.cylinder(radius=1.5, segment=ends, sections=5))
-    fill(body, 2000.0)  # compile
+    fill([body], 2000.0)  # compile
     tracemalloc.start()
-    cages = fill(body, 1.0)
+    cages = fill([body], 1.0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert cages.grid.shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
+    assert cages.grids.grids[0].shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
     assert peak < 700 * len(cages.kind)  # bytes, 64 of them a cell's shares
 
 
@@ -281,8 +281,8 @@ def aligned_box(lid: bool = True) -> Body:
 
 
 def test_an_aligned_box_is_filled_with_its_own_cells():
-    cages = fill(aligned_box(), 0.1)
-    assert cages.grid.shape.tolist() == [10, 5, 3] and len(cages.kind) == cages.table.total == 150
+    cages = fill([aligned_box()], 0.1)
+    assert cages.grids.grids[0].shape.tolist() == [10, 5, 3] and len(cages.kind) == cages.table.total == 150
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 1
     assert np.array_equal(dense(cages, BOUNDARY), ~np.pad(np.ones((8, 3, 1), bool), 1))
 
@@ -290,16 +290,16 @@ def test_an_aligned_box_is_filled_with_its_own_cells():
 def test_without_its_lid_the_winding_number_fills_the_box():
     body = aligned_box(lid=False)
     assert not body.report.closed
-    cages = fill(body, 0.1)
+    cages = fill([body], 0.1)
     assert len(cages.kind) == 150
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
 
 
 def test_the_longest_side_may_be_any():
-    whole = fill(aligned_box(), 0.1).ijk
+    whole = fill([aligned_box()], 0.1).ijk
     for turns in (1, 2):
         points = np.roll(aligned_box().surface.points, turns, axis=1)
-        turned = fill(body_of(Surface(points, aligned_box().surface.triangles)), 0.1).ijk
+        turned = fill([body_of(Surface(points, aligned_box().surface.triangles))], 0.1).ijk
         assert set(map(tuple, np.roll(turned, -turns, axis=1))) == set(map(tuple, whole))
 
 
@@ -313,7 +313,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Ca
             mesh.update_faces(np.arange(len(mesh.faces)) > 20)
         body = body_of(mesh)
         np.savez(folder / f"{name}.npz", points=body.surface.points, triangles=body.surface.triangles)
-        cages[name] = fill(body, cell_size, method)
+        cages[name] = fill([body], cell_size, method)
     return folder, cages
 
 
@@ -332,12 +332,12 @@ def test_ranks_find_the_same_cells_in_the_same_order_and_what_random_labyrinths_
 
 def test_too_many_cells_are_refused():
     with pytest.raises(InputError, match=r"above cages.max_cells = 149"):
-        fill(aligned_box(), 0.1, max_cells=149)
-    assert len(fill(aligned_box(), 0.1, max_cells=150).kind) == 150
+        fill([aligned_box()], 0.1, max_cells=149)
+    assert len(fill([aligned_box()], 0.1, max_cells=150).kind) == 150
     with pytest.raises(InputError, match=r"above cages.max_cells"):
-        fill(aligned_box(), 1e-5)  # at once: 1.5e14 cells are not tried
+        fill([aligned_box()], 1e-5)  # at once: 1.5e14 cells are not tried
     with pytest.raises(InputError, match=r"cages.cell_size: 1e-08 m would cut the body into 1e"):
-        fill(aligned_box(), 1e-8)
+        fill([aligned_box()], 1e-8)
 
 
 @with_meshes
@@ -346,8 +346,8 @@ def test_an_unrepaired_scan_has_the_cells_of_the_repaired_one():
     whole = body_of(prepare(scan, ["repair"]))
     open_body = body_of(scan)
     assert whole.report.closed and not open_body.report.closed
-    cells = fill(whole, 2.0), fill(open_body, 2.0)
-    found, expected = (set(map(tuple, np.rint(c.grid.node_positions(c.ijk) / 2 * 4))) for c in cells)
+    cells = fill([whole], 2.0), fill([open_body], 2.0)
+    found, expected = (set(map(tuple, np.rint(c.grids.node_positions(c.ijk) / 2 * 4))) for c in cells)
     assert len(found) == pytest.approx(len(expected), rel=0.03)
     assert len(expected) > 3000
 
@@ -360,7 +360,7 @@ def test_an_unrepaired_scan_has_the_cells_of_the_repaired_one():
 @pytest.mark.parametrize("name", ["armadillo", "bunny", "dragon", "heart", "lung"])
 def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
     body = body_of(read_surface(MESHES / f"{name}.ply"))
-    cages = fill(body, choose_cell_size(body, count))
+    cages = fill([body], choose_cell_size([body], count))
     assert cages.table.total == pytest.approx(count, rel=0.01)
 
 
@@ -368,11 +368,11 @@ def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
     # a cube has its own k^3 cells, and no other number: 8 and 27 lie around 20
     cube = body_of(trimesh.creation.box((1, 1, 1)))
     with caplog.at_level("WARNING", logger="msmpetsc"):
-        cages = fill(cube, choose_cell_size(cube, 20))
+        cages = fill([cube], choose_cell_size([cube], 20))
     assert cages.table.total == 27
     assert "20 cells within 1%; taking 27" in caplog.text
 
 
 def test_more_cells_than_allowed_are_not_sought():
     with pytest.raises(InputError, match=r"cages.count: 151 is more than cages.max_cells = 150"):
-        choose_cell_size(aligned_box(), 151, max_cells=150)
+        choose_cell_size([aligned_box()], 151, max_cells=150)

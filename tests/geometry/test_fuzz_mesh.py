@@ -25,7 +25,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import repair
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
-from msmpetsc.model.build import read_body
+from msmpetsc.model.build import read_bodies
 from msmpetsc.scene.reading import load_scene
 
 BOX = trimesh.creation.box(extents=[1, 2, 3])
@@ -105,7 +105,7 @@ def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
     (folder / "scene.toml").write_text(SCENE.format(f"x.{kind}"))
 
     def check() -> None:
-        body = read_body(MPI.COMM_SELF, load_scene(folder / "scene.toml", changes))
+        (body,) = read_bodies(MPI.COMM_SELF, load_scene(folder / "scene.toml", changes))
         points, triangles = body.surface.points, body.surface.triangles
         assert points.shape[1] == triangles.shape[1] == 3 and np.isfinite(points).all()
         assert 0 <= triangles.min() <= triangles.max() < len(points)

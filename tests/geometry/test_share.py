@@ -80,34 +80,34 @@ def body_of(mesh: trimesh.Trimesh) -> Body:
 
 
 def volume(cages: Cages) -> float:
-    return cages.share.mean(axis=(1, 2, 3)).sum() * cages.grid.cell_size**3
+    return cages.share.mean(axis=(1, 2, 3)).sum() * cages.grids.cell_size**3
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
     """Cages cycle the axes, so that the longest side is the first."""
     mesh = trimesh.creation.box(bounds=[[0, 0, 0], np.roll([1.0, 0.53, 0.38], axis)])
-    expected = fill(body_of(mesh), 0.1)
+    expected = fill([body_of(mesh)], 0.1)
     top = expected.ijk[:, (axis + 2) % 3] == 3
     assert volume(expected) == pytest.approx(mesh.volume, rel=1e-3)  # the least share of corners that are out of it
     along = np.moveaxis(expected.share[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
     assert along.max() < 0.8**2 + 1e-12
     mesh.invert()
-    np.testing.assert_allclose(fill(body_of(mesh), 0.1).share, expected.share, atol=1e-12)
+    np.testing.assert_allclose(fill([body_of(mesh)], 0.1).share, expected.share, atol=1e-12)
 
 
 def test_no_share_is_less_than_the_least_and_rounding_leaves_whole_cells_whole():
-    cages = fill(body_of(BODIES["ball"]), 0.1)
+    cages = fill([body_of(BODIES["ball"])], 0.1)
     assert cages.share.min() == LEAST_SHARE and (cages.share[cages.kind != BOUNDARY] == 1).all()
     aligned = trimesh.creation.box(bounds=[[0.1, 0.2, 0.3], [1.0, 0.9, 0.8]])
-    assert (fill(body_of(aligned), 0.1).share == 1).all()
+    assert (fill([body_of(aligned)], 0.1).share == 1).all()
 
 
 def test_an_open_surface_is_sampled_to_about_a_hundredth():
     ball = trimesh.creation.icosphere(4)
-    closed = fill(body_of(ball), 0.2)
+    closed = fill([body_of(ball)], 0.2)
     ball.update_faces(np.arange(len(ball.faces)) > 3)
-    sampled = fill(body_of(ball), 0.2)
+    sampled = fill([body_of(ball)], 0.2)
     assert np.array_equal(sampled.ijk, closed.ijk)
     error = (sampled.share - closed.share).mean(axis=(1, 2, 3))
     assert np.sqrt((error**2).mean()) < 0.02 and volume(sampled) == pytest.approx(volume(closed), rel=0.01)
@@ -117,5 +117,5 @@ def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(caplo
     ball = trimesh.creation.icosphere(3)
     ball.faces[:7] = ball.faces[:7, ::-1]
     with caplog.at_level(logging.WARNING, "msmpetsc"):
-        assert fill(body_of(ball), 0.2).share is None
+        assert fill([body_of(ball)], 0.2).share is None
     assert 'wound against each other, so boundary cells count whole: prepare = ["orient"]' in caplog.text

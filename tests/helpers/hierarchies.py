@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import Grid, encode_morton
+from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.material import CellMaterial
@@ -94,7 +94,7 @@ def build(
     grid = Grid(ORIGIN, CELL, cells.max(axis=0) + 1)
     mine = encode_morton(cells)[comm.rank :: comm.size]
     table = SortedKeys(comm, mine)
-    cages = Cages(grid, table, np.ones(len(table.keys), np.uint8))
+    cages = Cages(BodyGrids((grid,)), table, np.ones(len(table.keys), np.uint8))
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:

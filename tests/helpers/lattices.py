@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import Grid, encode_morton
+from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -23,7 +23,7 @@ def cages_of(cells: np.ndarray, cell_size: float = H) -> Cages:
     """Cages made of exactly these cells (c, 3)."""
     grid = Grid(np.array([1.0, -2.0, 3.0]), cell_size, cells.max(axis=0) + 1)
     table = SortedKeys(MPI.COMM_SELF, encode_morton(cells))
-    return Cages(grid, table, np.ones(len(table.keys), np.uint8))
+    return Cages(BodyGrids((grid,)), table, np.ones(len(table.keys), np.uint8))
 
 
 def block(*sides: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.build import build_model, fill_cages, read_body
+from msmpetsc.model.build import build_model, fill_cages, read_bodies
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
@@ -193,7 +193,7 @@ def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
     """The corners of an aligned block: its far faces belong to its last cells."""
     path = block_scene(tmp_path, time={"step": T, "duration": T}, pin=[{"region": {"painted": [0]}}])
     scene = load_scene(path)
-    points = read_body(MPI.COMM_SELF, scene).surface.points
+    points = read_bodies(MPI.COMM_SELF, scene)[0].surface.points
     far = int(np.argmax(points.sum(axis=1)))
     lattice = build_model(MPI.COMM_SELF, load_scene(path, [f"pin.0.region.painted=[{far}]"])).lattice
     last = (lattice.nodes >= SIDES - CELL).all(axis=1)
@@ -204,10 +204,11 @@ def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
 def test_painted_cells_are_cells_of_the_body(balls: Path):
     """Every point of the surface lies in a valid cell, whose eight corners are nodes."""
     scene = load_scene(balls / "scene.toml")
-    body = read_body(MPI.COMM_SELF, scene)
-    cages = fill_cages(body, scene)
+    bodies = read_bodies(MPI.COMM_SELF, scene)
+    cages = fill_cages(bodies, scene)
     valid = {tuple(cell) for cell in cages.ijk.tolist()}
-    assert {tuple(cell) for cell in cages.grid.to_cells(body.surface.points).astype(int).tolist()} <= valid
+    points = cages.grids.grids[0].to_cells(bodies[0].surface.points)
+    assert {tuple(cell) for cell in points.astype(int).tolist()} <= valid
 
 
 WRONG = {

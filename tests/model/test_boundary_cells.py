@@ -99,9 +99,9 @@ def test_a_sheet_within_a_layer_weighs_what_it_should():
 def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():
     surface = Surface(*(np.array(part) for part in (BALL.vertices, BALL.faces)))
     body = Body(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
-    cages = fill(body, 0.2)
+    cages = fill([body], 0.2)
     lattice = build_lattice(cages, DENSITY, E)
-    outside = distance_outside(body, cages, lattice)
+    outside = distance_outside([body], cages, lattice)
     np.testing.assert_allclose(outside, np.maximum(np.linalg.norm(lattice.nodes, axis=1) - 1, 0), atol=2e-3)
     for normal in np.random.default_rng(0).standard_normal((50, 3)):
         normal /= np.linalg.norm(normal)

@@ -26,7 +26,8 @@ def springs_by_definition(cells: np.ndarray) -> dict[frozenset, int]:
 
 
 def grid_index(lattice: Lattice, cages: Cages) -> list[tuple[int, ...]]:
-    return [tuple(i) for i in np.rint((lattice.nodes - cages.grid.origin) / cages.grid.cell_size).astype(int)]
+    (grid,) = cages.grids.grids
+    return [tuple(i) for i in np.rint((lattice.nodes - grid.origin) / grid.cell_size).astype(int)]
 
 
 @settings(max_examples=30, deadline=None)

@@ -55,7 +55,7 @@ def aligned_beam():
     points = np.array([1, 0.5, 0.3]) * (box.vertices > 0)
     surface = Surface(points, np.asarray(box.faces, np.int64))
     bounds = np.array([points.min(axis=0), points.max(axis=0)])
-    return build_lattice(fill(Body(MPI.COMM_SELF, surface, examine(surface), bounds), 0.1), 1000.0, 1e5), bounds
+    return build_lattice(fill([Body(MPI.COMM_SELF, surface, examine(surface), bounds)], 0.1), 1000.0, 1e5), bounds
 
 
 def within_three() -> int:

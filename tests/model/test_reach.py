@@ -16,7 +16,7 @@ from one_process import IN_ONE_PROCESS
 from msmpetsc.cli.main import main
 from msmpetsc.cli.running.march import log_model, taken
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model, build_model, read_body
+from msmpetsc.model.build import Model, build_model, read_bodies
 from msmpetsc.model.reach import Reach
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
@@ -164,7 +164,7 @@ def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator,
 )
 def test_a_body_of_an_odd_size_is_warned_of_before_it_is_filled(tmp_path, heard, side, mesh, words):
     path = block_scene(tmp_path, [side, side / 2, side / 2], mesh={"source": "scene.ply"} | mesh, time=TIME)
-    read_body(MPI.COMM_SELF, load_scene(path))
+    read_bodies(MPI.COMM_SELF, load_scene(path))
     assert heard() == ([("WARNING", f"scene.ply: {words}")] if words else [])
 
 
@@ -207,7 +207,7 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
 
 
 def test_of_many_tables_the_first_are_named():
-    reaches = [Reach(f"force.{number}", 5, 0) for number in range(20)]
+    reaches = [Reach(f"force.{number}", 5, 0, "force") for number in range(20)]
     assert taken(reaches)[-2:] == ["force.11 pulls 5 nodes", "and 8 more"] and len(taken(reaches)) == 13
     assert len(taken(reaches[:13])) == 13
 

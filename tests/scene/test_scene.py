@@ -278,14 +278,14 @@ def test_all_problems_at_once_each_with_its_line(tmp_path):
         "scene.toml: cages.count: must be > 0, got 0 (line 2)",
         "scene.toml: cages.cell_size: must be > 0, got -1 (line 3)",
         "scene.toml: time.setp: unknown key, did you mean 'step'? (line 6)",
-        "scene.toml: colour: unknown key, valid: title, mesh, cages, material, part, time, start, gravity, "
-        "obstacle, pin, anchor, force, solver, safety, output, budget, picture (line 8)",
+        "scene.toml: colour: unknown key, valid: title, mesh, cages, material, time, body, part, start, "
+        "gravity, obstacle, pin, anchor, force, solver, safety, output, budget, picture (line 8)",
     ]
 
 
 def test_empty_file_names_every_required_table(tmp_path):
-    names = ["mesh", "cages", "material", "time"]
-    assert problems(tmp_path, "") == [f"scene.toml: {name}: required, but missing" for name in names]
+    missing = [f"scene.toml: {name}: required, but missing" for name in ("cages", "material", "time")]
+    assert problems(tmp_path, "") == ["scene.toml: must give exactly one of mesh, body; has none", *missing]
 
 
 def test_text_and_folder_are_no_keys_of_the_file(tmp_path):

@@ -49,7 +49,7 @@ def body_of(path: Path) -> Body:
 
 def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
     """Writes all cells in the order of the ranks beside the mesh."""
-    cages = fill(body_of(mesh), cell_size, method)
+    cages = fill([body_of(mesh)], cell_size, method)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
     parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.share))
     if comm.rank == 0:
@@ -63,7 +63,7 @@ def check_force() -> None:
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     surface = Surface(points, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     body = Body(comm, surface if comm.rank == 0 else None, examine(surface), np.array([[0.0] * 3, [1.0] * 3]))
-    lattice = build_lattice(fill(body, 0.1), 1000.0, 1e5)
+    lattice = build_lattice(fill([body], 0.1), 1000.0, 1e5)
     where = lattice.nodes[: lattice.owned, 2] < 0.35
     force = spread_by_mass(comm, (1.0, -2.0, 30.0), where, lattice.mass)
     total = comm.allreduce(force.sum(axis=0))

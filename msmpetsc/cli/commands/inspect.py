@@ -4,7 +4,7 @@ import argparse
 import json
 import shlex
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     refuse_ranks("inspect", "it counts for --ranks R on one process")
     refuse_bad_numbers(args)
     initialise(MPI.COMM_WORLD, list(args.petsc_options))
-    from msmpetsc.model.build import read_body
+    from msmpetsc.model.build import read_bodies
     from msmpetsc.model.partition import partition_of
     from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.presets import preset_names
@@ -45,10 +45,9 @@ def run(args: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, interrupt)
     scene = load_scene(args.scene, args.set, preset_names())
     before = peak_memory()
-    body = read_body(MPI.COMM_WORLD, scene)
-    assert body.surface is not None  # which rank 0 has
+    bodies = read_bodies(MPI.COMM_WORLD, scene)
     mesh = peak_memory() - before
-    partition, counted = partition_of(body, scene.cages, args.ranks, MOST_BUILT)
+    partition, counted = partition_of(bodies, scene.cages, args.ranks, MOST_BUILT)
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
@@ -57,7 +56,8 @@ def run(args: argparse.Namespace) -> int:
         print_counts(args, scene, partition, report)
         print_budget(scene)
     if not args.no_times:
-        report["needs"] = needs_of(args, scene, body.surface, partition, mesh)
+        surfaces = [body.surface for body in bodies if body.surface is not None]
+        report["needs"] = needs_of(args, scene, surfaces, partition, mesh)
         if not args.json:
             print_needs(report["needs"])
     report["limits"] = limits_of(partition)
@@ -129,20 +129,20 @@ def print_budget(scene: Scene) -> None:
 
 
 def needs_of(
-    args: argparse.Namespace, scene: Scene, surface: "Surface", partition: "Partition", mesh: float
+    args: argparse.Namespace, scene: Scene, surfaces: Sequence["Surface"], partition: "Partition", mesh: float
 ) -> dict[str, Any]:
-    """Return memory [byte] and time of a frame [s], and what they rest on; ``mesh``: bytes that its surface took."""
+    """Return memory [byte] and time of a frame [s], and what they rest on; ``mesh``: bytes that its surfaces took."""
     from msmpetsc.study.forecast import Network, forecast
 
     options, cells = shlex.join(args.petsc_options), partition.cells.sum()
     try:
         expected = forecast(
-            file=args.scene, changes=args.set, options=options, scene=scene, surface=surface, cells=cells,
+            file=args.scene, changes=args.set, options=options, scene=scene, surfaces=surfaces, cells=cells,
             frames=args.frames, again=args.measure_here,
         )  # fmt: skip
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from None
-    memory = expected.memory(partition, len(surface.points) if scene.output.surface else 0, mesh)
+    memory = expected.memory(partition, sum(len(each.points) for each in surfaces) if scene.output.surface else 0, mesh)
     every, network = scene.output.every, Network(args.latency, args.bandwidth)
     trials = expected.coarse, expected.fine
     explicit = scene.time.integrator == "verlet"

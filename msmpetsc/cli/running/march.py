@@ -240,7 +240,7 @@ def live_page(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model
         return
     from msmpetsc.output.drawing.live import LivePage
 
-    page = LivePage(path, plan.scene, model.surface, file.newest_surface)
+    page = LivePage(path, plan.scene, model.surface, file.newest_surface, model.body_of_point)
     try:
         yield [PageWriter(page)]
     finally:
@@ -286,9 +286,14 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     file.write("lattice/stiffness", lattice.stiffness[springs])
     file.write("lattice/mass", lattice.mass)
     file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
+    several = len(model.bodies) > 1
+    if several:
+        file.write("lattice/body", lattice.body[:owned].astype("i4"))
     surface, embedding = model.surface, model.embedding
     if embedding is None:
         return
+    if several:
+        file.write("surface/body", model.body_of_point.astype("i4"))
     file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
     file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
     offset = comm.exscan(len(embedding.indices)) or 0
@@ -339,24 +344,33 @@ def tell_stop(number: int, path: Path, simulation: Simulation) -> int:
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
-    """Log size, volume and mass of body and lattice, counts, and nodes that the scene's tables take (collective)."""
-    lattice, body = model.lattice, model.body
-    assert body is not None  # as in every model that build_model makes
+    """Log size, volume and mass of bodies and lattice, counts, and nodes that the scene's tables take (collective)."""
+    lattice = model.lattice
+    log_bodies(comm, model)
     held = int(lattice.pinned[: lattice.owned].sum())
-    own = len(lattice.cells), lattice.springs_owned, held, float(lattice.mass.sum()), float(lattice.cell_share.sum())
-    cells, springs, pinned, mass, share = (comm.allreduce(number) for number in own)
-    volume, enclosed = share * lattice.cell_size**3, abs(body.report.volume)
-    mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
-    if body.report.closed:
-        mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
-    size = sides(body.bounds[1] - body.bounds[0])
-    log.info("body of %s m; %s; lattice of %.4g m^3, %.4g kg", size, mesh, volume, mass)
+    cells, springs, pinned = (comm.allreduce(number) for number in (len(lattice.cells), lattice.springs_owned, held))
     log.info(
         "%d cells of %.4g m, %d nodes (%d pinned), %d springs on %d rank%s",
         cells, lattice.cell_size, lattice.table.total, pinned, springs, comm.size, "s" * (comm.size > 1),
     )  # fmt: skip
     if named := taken(model.reaches):
         log.info("%s", ", ".join(named))
+
+
+def log_bodies(comm: MPI.Comm, model: Model) -> None:
+    """Log size, volume and mass of each body and its part of the lattice (collective)."""
+    lattice, bodies = model.lattice, model.bodies
+    masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(bodies))
+    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(bodies))
+    sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
+    for number, (body, (mass, volume)) in enumerate(zip(bodies, sums.T, strict=True)):
+        mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
+        if body.report.closed:
+            enclosed = abs(body.report.volume)
+            mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
+        name = f"body.{number}" if len(bodies) > 1 else "body"
+        size = sides(body.bounds[1] - body.bounds[0])
+        log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
 
 
 def sides(lengths: Iterable[float]) -> str:
@@ -368,9 +382,9 @@ def taken(reaches: Iterable[Reach]) -> list[str]:
     """Name what each anchor and force takes; of a force's nodes some may be held, which take their part of it, too."""
     named = []
     for reach in reaches:
-        if reach.key.startswith("anchor"):
+        if reach.kind == "anchor":
             named.append(f"{reach.key} leads {reach.nodes - reach.held} nodes")
-        elif reach.key.startswith("force"):
+        elif reach.kind == "force":
             held = f" ({reach.held} of them held)" if reach.held else ""
             named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
     more = len(named) - MOST_NAMED

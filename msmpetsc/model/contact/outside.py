@@ -5,6 +5,8 @@ it is d deep: there the surface is. Where the surface is flat as far as a cell t
 turned. Where cells count whole there is nothing to correct: the lattice is the body.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from msmpetsc.comm import Route
@@ -16,17 +18,21 @@ from msmpetsc.model.lattice import Lattice
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
 
 
-def distance_outside(body: Body, cages: Cages, lattice: Lattice) -> np.ndarray:
-    """Return how far each node (l,) sticks out of the surface at rest [m], 0 within it (collective)."""
-    owned = lattice.owned
+def distance_outside(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> np.ndarray:
+    """Return how far each node (l,) sticks out of its body's surface at rest [m], 0 within it (collective)."""
+    owned, comm = lattice.owned, bodies[0].comm
     springs = np.bincount(lattice.springs.ravel(), minlength=len(lattice.nodes))[:owned]
-    rows = np.flatnonzero(springs < INNER_SPRINGS)
-    to_root = Route(body.comm, np.zeros(len(rows), np.int64))
-    points = to_root.send(lattice.nodes[rows])
-    distance = np.empty(0) if body.surface is None else _distance_outside(body, points)
+    body = lattice.body
+    rows = np.flatnonzero((springs < INNER_SPRINGS) & np.array(cages.fills)[body[:owned]])
+    to_root = Route(comm, np.zeros(len(rows), np.int64))
+    points, of_point = to_root.send(lattice.nodes[rows]), to_root.send(body[rows])
+    distance = np.zeros(len(points))
+    for number in np.unique(of_point):
+        own = of_point == number
+        distance[own] = _distance_outside(bodies[number], points[own])
     outside = np.zeros(owned)
     outside[rows] = to_root.answer(distance)
-    ghosts = encode_morton(cages.grid.nearest_nodes(lattice.nodes[owned:]))
+    ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
     return np.concatenate([outside, lattice.table.rows_of(ghosts, outside)])
 
 
@@ -36,7 +42,5 @@ def _distance_outside(body: Body, points: np.ndarray) -> np.ndarray:
 
     surface = body.surface
     assert surface is not None
-    if len(points) == 0:
-        return np.empty(0)
     squares = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0]
     return np.where(is_inside(surface, points), 0.0, np.sqrt(squares))

@@ -117,14 +117,14 @@ def _error(subject: Subject, reference: Result | None) -> Colouring:
 
 def _part(subject: Subject, _: Result | None) -> Colouring:
     """Colour by the last of the scene's parts that the nearest cell belongs to."""
-    rest, parts = subject.rest, subject.scene.part if subject.scene else ()
+    rest, parts = subject.rest, list(subject.scene.tables("part")) if subject.scene else []
     if not parts:
         raise InputError(f"--colour part: the scene of {subject.name} has no part")
     number = np.zeros(len(rest.cells))
     for index, part in enumerate(parts):
-        number[rest.find_cells(part.region)] = index + 1
+        number[rest.find_cells(part)] = index + 1
     of_points = number[KDTree(rest.middles).query(rest.points, p=np.inf)[1]]
-    return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(f"part.{i}" for i in range(len(parts)))))
+    return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
 
 
 COLOURINGS: dict[str, Callable[[Subject, Result | None], Colouring]] = {

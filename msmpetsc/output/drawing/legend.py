@@ -55,7 +55,8 @@ def entries_of(
     if "springs" in shown:
         entries.append(Entry("line", "spring", SPRING))
     if fixed and scene is not None:
-        entries.append(Entry("swatch", " or ".join(["pinned"] * bool(scene.pin) + ["led"] * bool(scene.anchor)), FIXED))
+        held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
+        entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(shot.arrows for shot in overlays):
         entries.append(Entry("arrow", "force", ARROW, 30))
     if entries and any(shot.glass for shot in overlays):

@@ -36,13 +36,21 @@ class LivePage:
     Call update(frame) for every frame, and end() at the end, whatever the end.
     """
 
-    def __init__(self, path: Path, scene: "Scene", surface: "Surface | None", newest: Callable[[], np.ndarray | None]):
+    def __init__(
+        self,
+        path: Path,
+        scene: "Scene",
+        surface: "Surface | None",
+        newest: Callable[[], np.ndarray | None],
+        body: np.ndarray | None = None,
+    ):
         """Make a page for a run of a scene.
 
         surface : at rest; newest : returns the surface points (v, 3) of the newest frame [m], None where none is stored
+        body    : (v,) numbers of the bodies of these points; None: there is but one
         """
         self._path, self._scene, self._newest = path, scene, newest
-        self._subject = None if surface is None else subject_of_surface(path, surface, scene)
+        self._subject = None if surface is None else subject_of_surface(path, surface, scene, body)
         self._box = np.empty((0, 3))  # corners of the box around all frames drawn so far
         self._frame: Frame | None = None
         self._begun: tuple[float, int] | None = None  # when the first frame came [s], and its index

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from msmpetsc.model.loads import LoadTable, Motion, within
-from msmpetsc.model.region import inside
+from msmpetsc.model.region import inside_bodies
 from msmpetsc.output.drawing.camera import Camera, unit
-from msmpetsc.scene.body import Region
+from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.schema import SceneFile
 
 ARROW = 0.2  # length of an arrow, of the body's longest side
@@ -50,23 +50,33 @@ class Overlays:
 
 @dataclass(frozen=True)
 class Rest:
-    """The body at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m]."""
+    """The bodies at rest: nodes (n, 3) [m], cells (c, 8) of them, surface points (v, 3) [m].
+
+    body_of_node, body_of_point : numbers (n,), (v,) of their bodies
+    """
 
     nodes: np.ndarray
     cells: np.ndarray
     points: np.ndarray
+    body_of_node: np.ndarray
+    body_of_point: np.ndarray
 
     @property
     def bounds(self) -> np.ndarray:
-        """Corners (2, 3) of the surface's bounding box [m]."""
-        return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+        """Corners (b, 2, 3) of the bounding box of each body's surface [m]."""
+        of_bodies = (self.points[self.body_of_point == number] for number in range(self.body_of_point.max() + 1))
+        return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
-    def find(self, region: Region) -> np.ndarray:
-        """Tell which nodes (n,) a region means; none if it is painted in a file, which the result does not hold."""
+    def find(self, table: OfBody) -> np.ndarray:
+        """Tell which nodes (n,) the region of a scene's table means.
+
+        There are none if it is painted in a file, which the result does not hold.
+        """
+        region = table.table.region
         if region.painted is None:
-            return inside(region, self.nodes, self.bounds)
+            return inside_bodies(region, self.nodes, self.bounds, self.body_of_node, table.body)
         where = np.zeros(len(self.nodes), bool)
-        where[self.cells[self._painted_cells(region.painted)]] = True
+        where[self.cells[self._painted_cells(table)]] = True
         return where
 
     @property
@@ -74,33 +84,40 @@ class Rest:
         """Centres (c, 3) of the cells [m]."""
         return self.nodes[self.cells].mean(axis=1)
 
-    def find_cells(self, region: Region) -> np.ndarray:
-        """Tell which cells (c,) a region means, by their centres; none if it is painted in a file."""
+    def find_cells(self, table: OfBody) -> np.ndarray:
+        """Tell which cells (c,) the region of a table means, by their centres; none if it is painted in a file."""
+        region = table.table.region
         if region.painted is None:
-            return inside(region, self.middles, self.bounds)
+            return inside_bodies(region, self.middles, self.bounds, self.body_of_node[self.cells[:, 0]], table.body)
         where = np.zeros(len(self.cells), bool)
-        where[self._painted_cells(region.painted)] = True
+        where[self._painted_cells(table)] = True
         return where
 
-    def _painted_cells(self, painted: str | tuple[int, ...]) -> np.ndarray:
-        """Return the numbers of the cells around painted points."""
-        if isinstance(painted, str):
+    def painted_points(self, table: OfBody) -> np.ndarray:
+        """Return the numbers of a table's painted points among all; none if they are listed in a file."""
+        painted = table.table.region.painted
+        if not isinstance(painted, tuple):
             return np.empty(0, int)
+        return np.flatnonzero(self.body_of_point == (table.body or 0))[list(painted)]
+
+    def _painted_cells(self, table: OfBody) -> np.ndarray:
+        """Return the numbers of the cells of the table's body around painted points."""
+        own = np.flatnonzero(self.body_of_node[self.cells[:, 0]] == (table.body or 0))
         # cubes: the nearest is around it
-        return KDTree(self.middles).query(self.points[list(painted)], p=np.inf)[1]
+        return own[KDTree(self.middles[own]).query(self.points[self.painted_points(table)], p=np.inf)[1]]
 
 
 @dataclass(frozen=True)
 class SurfaceAtRest(Rest):
-    """A body known by its surface alone: its nodes are the surface points, and it has no cells."""
+    """Bodies known by their surfaces alone: the nodes are the surface points, and there are no cells."""
 
-    def find(self, region: Region) -> np.ndarray:
-        """Tell which surface points (v,) a region means; none if it is painted in a file."""
+    def find(self, table: OfBody) -> np.ndarray:
+        """Tell which surface points (v,) the region of a table means; none if it is painted in a file."""
+        region = table.table.region
         if region.painted is None:
-            return inside(region, self.points, self.bounds)
+            return inside_bodies(region, self.points, self.bounds, self.body_of_point, table.body)
         where = np.zeros(len(self.points), bool)
-        if not isinstance(region.painted, str):
-            where[list(region.painted)] = True
+        where[self.painted_points(table)] = True
         return where
 
 
@@ -170,11 +187,12 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
 
 
 def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:
-    length = ARROW * np.ptp(rest.bounds, axis=0).max()
+    length = ARROW * np.ptp(rest.bounds, axis=1).max()
     arrows = []
-    for force in scene.force:
+    for table in scene.tables("force"):
+        force = table.table
         total = LoadTable.of(force.total or (0.0, 0.0, 0.0)).at(time)  # a function has no one direction
-        if within(time, force.start, force.stop) and any(total) and (where := rest.find(force.region)).any():
+        if within(time, force.start, force.stop) and any(total) and (where := rest.find(table)).any():
             tail = position[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))
     return arrows
@@ -182,6 +200,6 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
 
 def fixed_nodes(scene: SceneFile, time: float, rest: Rest) -> np.ndarray:
     """Tell which nodes (n,) are pinned or anchored at a time [s]."""
-    regions = [pin.region for pin in scene.pin]
-    regions += [anchor.region for anchor in scene.anchor if within(time, 0.0, anchor.stop)]
-    return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, regions)], axis=0)
+    holding = list(scene.tables("pin"))
+    holding += [anchor for anchor in scene.tables("anchor") if within(time, 0.0, anchor.table.stop)]
+    return np.any([np.zeros(len(rest.nodes), bool), *map(rest.find, holding)], axis=0)

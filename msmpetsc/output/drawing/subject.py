@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.overlays import Overlays, Rest, SurfaceAtRest, fixed_nodes, overlays_at
 from msmpetsc.output.reader import Result
+from msmpetsc.scene.bodies import OF_REGIONS
 from msmpetsc.scene.schema import SceneFile
 
 if TYPE_CHECKING:
@@ -91,7 +93,13 @@ def subject_of_result(run: Result) -> Subject:
     return Subject(
         name=str(run.path),
         scene=scene,
-        rest=Rest(run.lattice.nodes[:], run.lattice.cells[:], run.surface.points[:]),
+        rest=Rest(
+            run.lattice.nodes[:],
+            run.lattice.cells[:],
+            run.surface.points[:],
+            run.body_of("lattice"),
+            run.body_of("surface"),
+        ),
         triangles=run.surface.triangles[:],
         times=run.frames.time[:],
         nodes=lambda index: run.frames.position[index],
@@ -118,7 +126,13 @@ def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
     return Subject(
         name=str(path),
         scene=with_painted_points(scene),
-        rest=Rest(lattice.nodes[: lattice.owned], lattice.cells, surface.points),
+        rest=Rest(
+            lattice.nodes[: lattice.owned],
+            lattice.cells,
+            surface.points,
+            lattice.body[: lattice.owned],
+            model.body_of_point,
+        ),
         triangles=surface.triangles,
         times=np.zeros(1),
         nodes=lambda _: start,
@@ -128,13 +142,18 @@ def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
     )
 
 
-def subject_of_surface(path: Path, surface: "Surface", scene: "SceneFile | None" = None) -> Subject:
-    """Return a mesh as it lies in its file, in the file's own unit; or the surface of a scene without its lattice."""
-    no_cells = np.empty((0, 8), int)
+def subject_of_surface(
+    path: Path, surface: "Surface", scene: "SceneFile | None" = None, body: np.ndarray | None = None
+) -> Subject:
+    """Return a mesh as it lies in its file, in the file's own unit; or the surface of a scene without its lattice.
+
+    body : (v,) numbers of the bodies of its points; None: there is but one
+    """
+    no_cells, body = np.empty((0, 8), int), np.zeros(len(surface.points), int) if body is None else body
     return Subject(
         name=str(path),
         scene=scene,
-        rest=SurfaceAtRest(surface.points, no_cells, surface.points),
+        rest=SurfaceAtRest(surface.points, no_cells, surface.points, body, body),
         triangles=surface.triangles,
         times=np.zeros(1),
         nodes=lambda _: surface.points,
@@ -153,8 +172,10 @@ def with_painted_points(scene: "Scene") -> SceneFile:
         numbers = tuple(int(word) for word in (scene.folder / table.region.painted).read_text().split())
         return table.model_copy(update={"region": table.region.model_copy(update={"painted": numbers})})
 
-    kinds = ("part", "pin", "anchor", "force")
-    return scene.model_copy(update={kind: tuple(map(read, getattr(scene, kind))) for kind in kinds})
+    def with_points(tables):
+        return tables.model_copy(update={kind: tuple(map(read, getattr(tables, kind))) for kind in OF_REGIONS})
+
+    return with_points(scene).model_copy(update={"body": tuple(map(with_points, scene.body))})
 
 
 def refuse_what_cannot_be_drawn(run: Result, scene: SceneFile) -> None:
@@ -168,12 +189,23 @@ def refuse_what_cannot_be_drawn(run: Result, scene: SceneFile) -> None:
         numbers = run[name][:]
         if numbers.size == 0 or not 0 <= numbers.min() <= numbers.max() < count:
             raise InputError(f"{run.path} is damaged: {name} is empty, or names what is not among its {count}")
-    regions = [table.region.painted for tables in (scene.pin, scene.anchor, scene.force) for table in tables]
-    if any(max(painted) >= points for painted in regions if isinstance(painted, tuple)):
-        raise InputError(f"{run.path} is damaged: its scene names painted points beyond its {points}")
+    refuse_other_bodies(run, scene)
     if not (np.abs(run["lattice/nodes"][:]) < FARTHEST).all() or not np.isfinite(run["embedding/weights"][:]).all():
         raise InputError(f"{run.path} is damaged: its lattice or its embedding has numbers that are none")
     _ = run.embedding  # which checks itself
+
+
+def refuse_other_bodies(run: Result, scene: SceneFile) -> None:
+    """Raise InputError unless the result has the bodies of its scene, and these the points that it paints."""
+    of_point = run.body_of("surface")
+    for of_body in (of_point, run.body_of("lattice")):
+        if not np.array_equal(np.unique(of_body), np.arange(len(scene.meshes))):
+            raise InputError(f"{run.path} is damaged: its bodies are not those of its scene")
+    own = np.bincount(of_point)
+    for table in chain.from_iterable(scene.tables(kind) for kind in ("pin", "anchor", "force")):
+        painted, number = table.table.region.painted, table.body or 0
+        if isinstance(painted, tuple) and max(painted) >= own[number]:
+            raise InputError(f"{run.path} is damaged: its scene names painted points beyond its {own[number]}")
 
 
 def read_scene(run: Result) -> SceneFile:

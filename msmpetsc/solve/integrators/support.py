@@ -5,6 +5,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.errors import InputError
+from msmpetsc.model.locate import of_body
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import Bodies, bodies_of
 
@@ -23,9 +24,9 @@ def refuse_free_bodies(comm: MPI.Comm, unknowns: Unknowns) -> None:
     loose = np.flatnonzero(spans < len(WAYS))
     if not len(loose):
         return
-    nodes, positions = _nodes(comm, unknowns, bodies, int(loose[0]))
-    place = ", ".join(f"{x:.4g}" for x in positions)
-    what = "the body" if len(spans) == 1 else f"a part of {nodes} nodes about ({place}) m at rest"
+    nodes, positions, first = _nodes(comm, unknowns, bodies, int(loose[0]))
+    place, whose = ", ".join(f"{x:.4g}" for x in positions), of_body(unknowns.lattice, first)
+    what = "the body" if len(spans) == 1 else f"a part {whose}of {nodes} nodes about ({place}) m at rest"
     more = f", and so are {len(loose) - 1} more parts" if len(loose) > 1 else ""
     raise InputError(
         f'time.integrator = "static": {what} is held {WAYS[spans[loose[0]]]}{more}: it has no equilibrium without '
@@ -57,9 +58,11 @@ def _middle(comm: MPI.Comm, nodes: np.ndarray) -> np.ndarray:
     return sums[:3] / sums[3]
 
 
-def _nodes(comm: MPI.Comm, unknowns: Unknowns, bodies: Bodies, body: int) -> tuple[int, np.ndarray]:
-    """Return how many nodes a body has, and their mean (3,) [m] at rest."""
+def _nodes(comm: MPI.Comm, unknowns: Unknowns, bodies: Bodies, body: int) -> tuple[int, np.ndarray, int]:
+    """Return how many nodes a body has, their mean (3,) [m] at rest, and the least of their global numbers."""
     lattice = unknowns.lattice
-    own = to_host(lattice.nodes[: lattice.owned])[bodies.number[: lattice.owned] == body]
+    rows = np.flatnonzero(bodies.number[: lattice.owned] == body)
+    own = to_host(lattice.nodes[: lattice.owned])[rows]
     sums = comm.allreduce(np.append(own.sum(axis=0), len(own)))
-    return int(sums[3]), sums[:3] / sums[3]
+    least = comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
+    return int(sums[3]), sums[:3] / sums[3], least

@@ -39,7 +39,9 @@ def grid_indices(unknowns: Unknowns) -> np.ndarray:
     nodes, keys = to_host(lattice.nodes), lattice.table.keys
     if not len(nodes):
         return np.empty((0, 3), np.int64)
-    return decode_morton(keys[:1]) + np.rint((nodes - nodes[0]) / lattice.cell_size).astype(np.int64)
+    # the first node of its body that this rank owns: it owns one, for a spring joins ghosts with such
+    first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
+    return decode_morton(keys[first]) + np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
 
 
 def parents_of(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -62,7 +62,8 @@ def test_parts_are_those_of_the_nearest_cell(subject):
     """Two cells; the later of two parts that both mean the second one counts."""
     x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
-    rest = Rest(np.stack([x, y, z], axis=1).astype(float), cells, np.array([[0.2, 0.5, 0.5], [1.9, 0.1, 0.1]]))
+    nodes, points = np.stack([x, y, z], axis=1).astype(float), np.array([[0.2, 0.5, 0.5], [1.9, 0.1, 0.1]])
+    rest = Rest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(2, int))
     east = "region = { half_space = { point = [1, 0, 0], normal = [1, 0, 0] } }\n"
     tables = f"[[part]]\n{east}density = 2.0\n[[part]]\n{east}density = 3.0\n"
     parted = replace(subject, rest=rest, scene=SceneFile.model_validate(toml_of(BARE + tables)))

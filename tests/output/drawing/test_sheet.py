@@ -18,7 +18,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.drawing import legend, moments, overlays, sheet, stage, subject
 from msmpetsc.output.drawing.camera import YAW, camera_facing
 from msmpetsc.output.reader import Result
+from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Region
+from msmpetsc.scene.motion import Pin
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -127,10 +129,15 @@ def test_painted_points_mean_the_corners_of_their_cells():
     x, y, z = np.mgrid[0:4, 0:2, 0:2].reshape(3, -1)  # three cells in a row along x
     nodes = np.stack([x, y, z], axis=1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(3)])
-    rest = overlays.Rest(nodes, cells, np.array([(0.9, 0.1, 0.1), (2.9, 0.9, 0.9), (1.1, 0.1, 0.9)]))
-    assert (rest.find(Region(painted=(0,))) == (x <= 1)).all()
-    assert (rest.find(Region(painted=(0, 2))) == (x <= 2)).all()
-    assert not rest.find(Region(painted="spots.txt")).any()
+    points = np.array([(0.9, 0.1, 0.1), (2.9, 0.9, 0.9), (1.1, 0.1, 0.9)])
+    rest = overlays.Rest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(3, int))
+
+    def find(painted: tuple[int, ...] | str) -> np.ndarray:
+        return rest.find(OfBody(("pin", 0), None, Pin(region=Region(painted=painted))))
+
+    assert (find((0,)) == (x <= 1)).all()
+    assert (find((0, 2)) == (x <= 2)).all()
+    assert not find("spots.txt").any()
 
 
 FORCE = """

@@ -20,6 +20,7 @@ from conftest import ENVIRONMENT, ROOT
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
+from msmpetsc.scene.bodies import BodyTable
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.solve.presets import PRESETS
@@ -170,10 +171,12 @@ def test_python_runs(path: Path, tmp_path: Path):
 
 
 def test_the_scene_with_every_table_is_one(tmp_path: Path):
-    text = blocks(ROOT / "scenes" / "README.md", "toml")[0]
-    assert set(tomllib.loads(text)) == set(SceneFile.model_fields)
-    (tmp_path / "scene.toml").write_text(text)
-    assert load_scene(tmp_path / "scene.toml").text == text
+    one, several = blocks(ROOT / "scenes" / "README.md", "toml")
+    assert set(tomllib.loads(one)) == set(SceneFile.model_fields) - {"body"}
+    assert set(tomllib.loads(several)["body"][1]) == set(BodyTable.model_fields)
+    for text in (one, several):
+        (tmp_path / "scene.toml").write_text(text)
+        assert load_scene(tmp_path / "scene.toml").text == text
 
 
 def test_the_study_files_are_some(tmp_path: Path):

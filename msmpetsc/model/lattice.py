@@ -112,10 +112,8 @@ def build_lattice(
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.region)
     topology      : that of the cages, where it is known already
     """
-    h = cages.grids.cell_size
-    net = topology or topology_of(cages)
-    given = young_modulus if stiffness is None else stiffness
-    mass, of_spring, of_cell = _sums(net, h, density, given, of_cells)
+    h, net = cages.grids.cell_size, topology or topology_of(cages)
+    mass, of_spring, of_cell = _sums(net, h, density, stiffness or young_modulus, of_cells)
     if stiffness is None:
         of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
     kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)

@@ -2,7 +2,7 @@
 
 An error is the greatest difference at a frame over the scale of its field, which is the same for all frames:
 
-    position, surface                       the largest displacement from rest, at least 1e-6 of the body's longest side
+    position, surface                       the largest displacement from rest, at least 1e-6 of a body's longest side
     kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
                                             at least that of the stiffest spring strained by 1e-6
     momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least

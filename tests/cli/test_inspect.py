@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ENVIRONMENT, WORKERS
+from conftest import ENVIRONMENT, ROOT, WORKERS
 from mpi4py import MPI
 
 from msmpetsc.cli.commands.inspect import largest
@@ -70,6 +70,20 @@ def test_the_counts_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Pat
     found = counted(scene, 3000, ranks)
     assert {name: getattr(found, name).tolist() for name in real} == real
     assert min(real["ghosts"]) > 0 and sum(real["cells"]) == pytest.approx(3000, rel=0.01)
+
+
+def test_the_counts_of_several_bodies_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
+    """Each body has slabs of its own, along its own longest side."""
+    turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
+    (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
+    bodies = [f"{{ mesh = {{ source = 'bar.obj', prepare = [{turn}] }} }}" for turn in ("", turned)]
+    text = scene.read_text().replace('mesh = { source = "ball.ply" }', f"body = [{', '.join(bodies)}]")
+    (tmp_path / "scene.toml").write_text(text)
+    done = on_ranks(3, WORKER, tmp_path / "scene.toml", tmp_path / "held.json", "cages.count=2000")
+    assert done.returncode == 0, done.stderr
+    real = json.loads((tmp_path / "held.json").read_text())
+    found = counted(tmp_path / "scene.toml", 2000, 3)
+    assert {name: getattr(found, name).tolist() for name in real} == real
 
 
 def test_one_rank_holds_all(scene: Path):

@@ -7,7 +7,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.build import Model
-from msmpetsc.model.contact.obstacle import Obstacle, depths
+from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 from msmpetsc.model.loads import Anchor, Load, OwnForce
 
@@ -199,7 +199,7 @@ class Environment:
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
                 way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
                 reach = 2 * (speed * (time - start) + np.linalg.norm(way))
-                inside, _ = depths(q, p.obstacle.points_at(start), p.obstacle.normals, outside=p.obstacle.outside)
+                inside, _ = p.obstacle.depths(q, start)
                 stiffness += p.stiffness * ((inside > -reach) | (side > 0))
         return stiffness
 
@@ -212,8 +212,8 @@ class Environment:
         for p, side in self._pressing(time, sides):
             way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
             if way.any():
-                inside, face = p.at(time, side).depths(q)
-                along = like(q, to_host(p.obstacle.normals) @ way)[face]
+                inside, face = p.obstacle.depths(q, time, side)
+                along = p.obstacle.along(q, time, face, way)
                 power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
         return power
 

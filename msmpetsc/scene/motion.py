@@ -133,14 +133,16 @@ PATH = "from no displacement at time 0 in straight lines through these, and stay
 
 
 class ObstacleTable(Table):
-    """What nodes bounce off or are pressed by: a plane, or a box; it may move, and act for a while only."""
+    """What nodes bounce off or are pressed by: a plane, a box or a sphere; it may move, and act for a while only."""
 
-    shape: Literal["plane", "box"] = Field(description="kind of obstacle")
+    shape: Literal["plane", "box", "sphere"] = Field(description="kind of obstacle")
     point: Vector | None = Field(None, description="a point of the plane [m]")
     normal: UnitVector | None = Field(
         None, description="of the plane, towards its free side, normalised on reading [-]"
     )
     box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
+    center: Vector | None = Field(None, description="of the sphere [m]")
+    radius: Positive | None = Field(None, description="of the sphere [m]")
     path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
     start: NotNegative = Field(0.0, description="is there from this time [s]")
     stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
@@ -157,11 +159,11 @@ class ObstacleTable(Table):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "ObstacleTable":
-        needed = ("box",) if self.shape == "box" else ("point", "normal")
-        missing = [name for name in needed if getattr(self, name) is None]
+        needed = {"plane": ("point", "normal"), "box": ("box",), "sphere": ("center", "radius")}
+        missing = [name for name in needed[self.shape] if getattr(self, name) is None]
         if missing:
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
-        uses = {"point": "plane", "normal": "plane", "box": "box"}
+        uses = {name: shape for shape, names in needed.items() for name in names}
         uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
         for name, use in uses.items():
             if getattr(self, name) is not None and use not in (self.shape, self.response):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from block_scene import DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
-from obstacles import box, plane
+from obstacles import box, plane, sphere
 
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
@@ -37,7 +37,18 @@ CASES = {  # during a step, nodes slip by about 0.02; below 0.1 * stick they hol
         Penalty(OBLIQUE, 50.0, 0.8, 2.0),
     ],
 }
-cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
+BALL = sphere([0.1, -0.2, 0.1], 0.7)
+BALLS = {
+    "sphere": [Penalty(BALL, 300.0, 0.0, 1.0)],
+    "sphere, sticking": [Penalty(BALL, 300.0, 0.5, 2.0)],
+    "sphere, slipping": [Penalty(BALL, 300.0, 0.5, 1e-3)],
+    "moving sphere, and a plane": [
+        Penalty(sphere([0.1, -0.2, 0.1], 0.7, SIDEWAYS), 300.0, 0.3, 0.4),
+        Penalty(OBLIQUE, 50.0, 0.8, 2.0),
+    ],
+}
+cases = pytest.mark.parametrize("penalties", [*CASES.values(), *BALLS.values()], ids=[*CASES, *BALLS])
+flat_cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
 
 
 def pressed(penalties: list[Penalty]) -> tuple[Contact, np.ndarray, np.ndarray]:
@@ -85,7 +96,7 @@ def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
     assert contact.change(moved, q) == pytest.approx((gradient(contact, q) * v).sum() + second, rel=1e-8, abs=0)
 
 
-@cases
+@flat_cases
 def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
     contact, q, v = pressed(penalties)
     step = 1e-7
@@ -95,6 +106,20 @@ def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
     product[nodes] = np.einsum("aij,aj->ai", blocks, v[nodes])
     np.testing.assert_allclose(product, slope, atol=1e-5 * np.abs(slope).max())
     assert 5 < len(nodes) < len(q) and (np.diff(nodes) > 0).all()
+
+
+def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
+    """The energy 1/2 k d^2 has the block k (n n^T - d / r (I - n n^T)), d = R - r, of which the first part is kept."""
+    contact, q, v = pressed(BALLS["sphere"])
+    step = 1e-7
+    slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
+    nodes, blocks = hessian(contact, q, true=True)
+    out = q[nodes] - BALL.points[0]
+    r = np.linalg.norm(out, axis=1)
+    across = np.eye(3) - np.einsum("ai,aj->aij", out, out) / r[:, None, None] ** 2
+    blocks = blocks - (300.0 * (BALL.radius - r) / r)[:, None, None] * across
+    np.testing.assert_allclose(np.einsum("aij,aj->ai", blocks, v[nodes]), slope[nodes], atol=1e-5 * np.abs(slope).max())
+    assert len(nodes) > 5 and (r < BALL.radius).all()
 
 
 @cases

@@ -251,7 +251,7 @@ log.addHandler(logging.StreamHandler(sys.stdout))
 log.setLevel(logging.INFO)
 with compilation_logged(empty):
     for kind in sys.argv[1:]:
-        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0, 0.0)
+        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0, 0.0, 0.0)
 """
 
 

@@ -1,12 +1,13 @@
-"""Solids that nodes stay out of: convex, so that a few planes say what is inside."""
+"""Solids that nodes stay out of: convex, so that a few planes, or a ball, say what is inside."""
 
+import math
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.arrays import greatest, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import Motion, within
@@ -15,14 +16,17 @@ from msmpetsc.scene.motion import ObstacleTable
 
 TOUCHING = 1e-6  # cells: no depth, but what was rounded
 OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
+TINY = 1e-300  # [m]
 ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """The points behind all faces: one face is a plane, six are a box.
+    """The points behind all faces: one face is a plane, six are a box; or of a ball, whose one face is its sphere.
 
-    points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side
+    points, normals : (f, 3) a point of each face at time 0 [m], its unit normal towards the free side; of a ball its
+        centre, and no normal: that is away from it
+    radius          : of the ball [m]; 0: there are planes
     path            : how it moves
     start, stop     : it is there while start <= time < stop [s]; None: to the end
     key             : of its table in the scene, for messages
@@ -37,6 +41,7 @@ class Obstacle:
     stop: float | None = None
     key: str = "obstacle"
     outside: np.ndarray | None = None
+    radius: float = 0.0
 
     @classmethod
     def of(cls, table: ObstacleTable, key: str = "obstacle", outside: np.ndarray | None = None) -> "Obstacle":
@@ -44,9 +49,12 @@ class Obstacle:
         if table.shape == "box":
             points = np.repeat(np.array(table.box), 3, axis=0)  # the faces that meet at each of the two corners
             normals = np.concatenate([-np.eye(3), np.eye(3)])
+        elif table.shape == "sphere":
+            points, normals = np.array([table.center]), np.zeros((1, 3))
         else:
             points, normals = np.array([table.point]), np.array([table.normal])
-        return cls(points, normals, Motion.through(table.path), table.start, table.stop, key, outside)
+        path, radius = Motion.through(table.path), table.radius or 0.0
+        return cls(points, normals, path, table.start, table.stop, key, outside, radius)
 
     def acts_at(self, time: float) -> bool:
         """Return whether the obstacle is there at a time [s]."""
@@ -55,6 +63,20 @@ class Obstacle:
     def points_at(self, time: float) -> np.ndarray:
         """Return a point of each face (f, 3) [m] at a time [s]."""
         return self.points + like(self.points, self.path.at(time)) if self.path.leads_away else self.points
+
+    def depths(self, q: np.ndarray, time: float, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``depth`` of positions (n, 3) [m] at a time [s]: depths (n,) [m] and faces (n,)."""
+        return depths(q, self.points_at(time), self.normals, sides, self.outside, self.radius)
+
+    def normals_at(self, q: np.ndarray, time: float, face: np.ndarray) -> np.ndarray:
+        """Return the unit normals (n, 3) of faces (n,) at positions (n, 3) [m], at a time [s]."""
+        return normals_at(q, self.points_at(time), self.normals, face, self.radius)
+
+    def along(self, q: np.ndarray, time: float, face: np.ndarray, way: np.ndarray) -> np.ndarray:
+        """Return the part (n,) [m] of a way (3,) [m] along these normals."""
+        if self.radius > 0:
+            return self.normals_at(q, time, face) @ like(q, way)
+        return like(q, to_host(self.normals) @ way)[face]
 
     @property
     def has_sides(self) -> bool:
@@ -91,13 +113,33 @@ def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 
 
 @numba.njit(cache=True)
-def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int, outside: float) -> tuple[float, int]:
+def away(x: np.ndarray, points: np.ndarray) -> float:
+    """Return how far x (3,) is from the first of the points (f, 3), a ball's centre [m]."""
+    return math.sqrt((x[0] - points[0, 0]) ** 2 + (x[1] - points[0, 1]) ** 2 + (x[2] - points[0, 2]) ** 2)
+
+
+@numba.njit(cache=True)
+def normal_at(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int, radius: float) -> tuple:
+    """Return the three components of the unit normal of a face at x (3,); at a ball's very centre there is none."""
+    if radius > 0.0:
+        far = max(away(x, points), TINY)
+        return (x[0] - points[0, 0]) / far, (x[1] - points[0, 1]) / far, (x[2] - points[0, 2]) / far
+    return normals[face, 0], normals[face, 1], normals[face, 2]
+
+
+@numba.njit(cache=True)
+def depth(
+    x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int, outside: float, radius: float
+) -> tuple[float, int]:
     """Return how deep the surface at x (3,) lies behind the face of its ``side`` [m], and that face.
 
     Without a side: how deep in the solid, not positive outside, and the nearest face.
 
     outside : how far the node at x sticks out of the surface [m]
+    radius  : of a ball [m]; 0: there are planes
     """
+    if radius > 0.0:
+        return radius - away(x, points) - outside, 0
     if side > 0:
         return behind(x, points, normals, side - 1) - outside, side - 1
     least, face = np.inf, 0
@@ -109,9 +151,9 @@ def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int, out
 
 
 @kernel
-def _depth_of(first, count, step, q, points, normals, sides, outside, least, face):
+def _depth_of(first, count, step, q, points, normals, sides, outside, radius, least, face):
     for i in range(first, count, step):
-        least[i], face[i] = depth(q[i], points, normals, sides[i], outside[i])
+        least[i], face[i] = depth(q[i], points, normals, sides[i], outside[i], radius)
 
 
 def depths(
@@ -120,11 +162,21 @@ def depths(
     normals: np.ndarray,
     sides: np.ndarray | None = None,
     outside: np.ndarray | None = None,
+    radius: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``depth`` of positions (n, 3), with sides and outside (n or more,): depths (n,) [m], faces (n,)."""
     least, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
-    _depth_of(len(q), q, points, normals, no_sides(q) if sides is None else sides, of_nodes(outside, q), least, face)
+    sides = no_sides(q) if sides is None else sides
+    _depth_of(len(q), q, points, normals, sides, of_nodes(outside, q), radius, least, face)
     return least, face
+
+
+def normals_at(q: np.ndarray, points: np.ndarray, normals: np.ndarray, face: np.ndarray, radius: float) -> np.ndarray:
+    """Return the unit normals (n, 3) at positions (n, 3) of faces (n,); as ``normal_at`` does."""
+    if radius > 0:
+        from_centre = q - points[0]
+        return from_centre / np.maximum(np.linalg.norm(from_centre, axis=1), TINY)[:, None]
+    return normals[face]
 
 
 def of_nodes(outside: np.ndarray | None, q: np.ndarray) -> np.ndarray:
@@ -168,7 +220,7 @@ def side_of(
     """
     if side > 0 and _stays(x, points, normals, side - 1):
         return side
-    inside, face = depth(x, points, normals, 0, 0.0)
+    inside, face = depth(x, points, normals, 0, 0.0, 0.0)
     if inside > 0.0:
         return face + 1
     enter, leave, side = -1.0, 1.0, 0  # fractions of the way
@@ -201,7 +253,7 @@ def describe_overlap(
     q, held : (l, 3) [m]; (l,) bool, the nodes that are not free
     """
     owned = slice(lattice.owned)
-    inside, _ = depths(q[owned], obstacle.points_at(time), obstacle.normals, outside=obstacle.outside)
+    inside, _ = obstacle.depths(q[owned], time)
     rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~held[owned])
     count = comm.allreduce(len(rows))
     if not count:

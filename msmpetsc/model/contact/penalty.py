@@ -12,13 +12,23 @@ also beyond the far face: a plate that a node passes within a step pushes it bac
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from msmpetsc.backend.arrays import like
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.model.contact.obstacle import Obstacle, depth, depths, no_sides, of_nodes
+from msmpetsc.model.contact.obstacle import (
+    TINY,
+    Obstacle,
+    away,
+    depth,
+    depths,
+    no_sides,
+    normal_at,
+    normals_at,
+    of_nodes,
+)
 
 Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -34,21 +44,21 @@ class Penalty:
 
     def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
-        points, normals, outside = self.obstacle.points_at(time), self.obstacle.normals, self.obstacle.outside
-        return ContactState(points, normals, self.stiffness, None, sides, outside)
+        obstacle = self.obstacle
+        points, normals = obstacle.points_at(time), obstacle.normals
+        return ContactState(points, normals, self.stiffness, None, sides, obstacle.outside, obstacle.radius)
 
     def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m]."""
+        state = self.at(time, sides)
         if self.friction == 0:
-            return self.at(time, sides)
-        points, normals, outside = self.obstacle.points_at(time), self.obstacle.normals, self.obstacle.outside
-        before = self.obstacle.points_at(time - time_step)
-        inside, face = depths(q, before, normals, sides, outside)
+            return state
+        inside, face = self.obstacle.depths(q, time - time_step, sides)
         nodes = np.flatnonzero(inside > 0)
-        carried = q[nodes] + (points - before)[0]
+        normal = self.obstacle.normals_at(q[nodes], time - time_step, face[nodes])
+        carried = q[nodes] + (state.points - self.obstacle.points_at(time - time_step))[0]
         limit = self.friction * self.stiffness * inside[nodes]
-        friction = Friction(nodes, normals[face[nodes]], carried, limit, self.stick * time_step)
-        return ContactState(points, normals, self.stiffness, friction, sides, outside)
+        return replace(state, friction=Friction(nodes, normal, carried, limit, self.stick * time_step))
 
 
 @dataclass(frozen=True)
@@ -128,6 +138,7 @@ class ContactState:
     friction        : of the step, if any
     sides           : (owned or more,) by which face each node came in (obstacle.side_of); None: the nearest
     outside         : (owned or more,) how far nodes stick out of the surface [m]; None: they do not
+    radius          : of a ball [m]; 0: there are planes
     """
 
     points: np.ndarray
@@ -136,14 +147,20 @@ class ContactState:
     friction: Friction | None
     sides: np.ndarray | None = None
     outside: np.ndarray | None = None
+    radius: float = 0.0
 
     def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
-        return depths(q, self.points, self.normals, self.sides, self.outside)
+        return depths(q, self.points, self.normals, self.sides, self.outside, self.radius)
 
-    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return what kernels take: points, normals, and of positions (n, 3) the sides and how far they stick out."""
-        return self.points, self.normals, no_sides(q) if self.sides is None else self.sides, of_nodes(self.outside, q)
+    def normals_at(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Return the unit normals (n, 3) at positions (n, 3) of faces (n,)."""
+        return normals_at(q, self.points, self.normals, face, self.radius)
+
+    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Return what kernels take: points, normals, of positions (n, 3) sides and how far they stick out, radius."""
+        sides = no_sides(q) if self.sides is None else self.sides
+        return self.points, self.normals, sides, of_nodes(self.outside, q), self.radius
 
 
 class Contact:
@@ -194,7 +211,8 @@ class Contact:
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield of each push and each friction the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
-        The Hessian is the sum of all; each block is positive semidefinite.
+        The Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
+        the centre is pressed the true block has -k d / r across the normal, too, which is left out.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
             Hessian, nothing along a slip, would let nodes run to and fro
@@ -203,7 +221,7 @@ class Contact:
         for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
             inside, face = state.depths(q[: self.owned])
             pressed = np.flatnonzero(inside > 0)
-            yield pressed, state.stiffness * _squares(state.normals[face[pressed]])
+            yield pressed, state.stiffness * _squares(state.normals_at(q[pressed], face[pressed]))
             if state.friction:
                 yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
@@ -223,15 +241,20 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _change_of(first, count, step, q, base, points, normals, sides, outside, stiffness, parts):
+def _change_of(first, count, step, q, base, points, normals, sides, outside, radius, stiffness, parts):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i], outside[i])
-        d_base, face_base = depth(base[i], points, normals, sides[i], outside[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
+        d_base, face_base = depth(base[i], points, normals, sides[i], outside[i], radius)
         parts[i] = 0.0
         if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
             deeper = 0.0
-            for c in range(3):
-                deeper -= normals[face, c] * (q[i, c] - base[i, c])
+            if radius > 0.0:  # |u| - |v| = (u - v) (u + v) / (|u| + |v|)
+                for c in range(3):
+                    deeper -= (q[i, c] - base[i, c]) * ((q[i, c] - points[0, c]) + (base[i, c] - points[0, c]))
+                deeper /= max(away(q[i], points) + away(base[i], points), TINY)
+            else:
+                for c in range(3):
+                    deeper -= normals[face, c] * (q[i, c] - base[i, c])
             parts[i] = 0.5 * stiffness * deeper * (d + d_base)
         elif d > 0.0 or d_base > 0.0:
             d, d_base = max(d, 0.0), max(d_base, 0.0)
@@ -239,30 +262,32 @@ def _change_of(first, count, step, q, base, points, normals, sides, outside, sti
 
 
 @kernel
-def _add_gradient_of(first, count, step, q, points, normals, sides, outside, stiffness, gradient):
+def _add_gradient_of(first, count, step, q, points, normals, sides, outside, radius, stiffness, gradient):
     for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i], outside[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
         if d > 0.0:
+            normal = normal_at(q[i], points, normals, face, radius)
             for c in range(3):
-                gradient[i, c] -= stiffness * d * normals[face, c]
+                gradient[i, c] -= stiffness * d * normal[c]
 
 
 @kernel
-def _friction_of(first, count, step, rows, q, points, normals, sides, outside, carried, impulse, per_mass, v):
+def _friction_of(first, count, step, rows, q, points, normals, sides, outside, radius, carried, impulse, per_mass, v):
     for row in range(first, count, step):
         i = rows[row]
-        d, face = depth(q[i], points, normals, sides[i], outside[i])
+        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
         if d > 0.0:
             along, speed = 0.0, 0.0
+            normal = normal_at(q[i], points, normals, face, radius)
             for c in range(3):
-                along += (v[i, c] - carried[c]) * normals[face, c]
+                along += (v[i, c] - carried[c]) * normal[c]
             for c in range(3):
-                speed += (v[i, c] - carried[c] - along * normals[face, c]) ** 2
+                speed += (v[i, c] - carried[c] - along * normal[c]) ** 2
             speed = math.sqrt(speed)
             if speed > 0.0:
                 lost = min(1.0, impulse * d * per_mass[i] / speed)
                 for c in range(3):
-                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normals[face, c])
+                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normal[c])
 
 
 def apply_friction(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.contact.obstacle import Obstacle, depths
+from msmpetsc.model.contact.obstacle import Obstacle
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Reflection:
     def _behind(self, q: np.ndarray, time: float, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes (k,) on or behind the faces of their ``sides``, and these faces' normals (k, 3)."""
         obstacle = self.obstacle
-        inside, face = depths(q, obstacle.points_at(time), obstacle.normals, sides, obstacle.outside)
+        inside, face = obstacle.depths(q, time, sides)
         behind = inside >= 0
         if sides is not None and obstacle.has_sides:
             behind &= sides > 0
         rows = np.flatnonzero(behind)
-        return rows, obstacle.normals[face[rows]]
+        return rows, obstacle.normals_at(q[rows], time, face[rows])
 
     def _speed(self, v: np.ndarray, normal: np.ndarray, time: float, time_step: float) -> np.ndarray:
         """Return the part along the normals of displacements v (k, 3) [m] in a step, (k,) [m].

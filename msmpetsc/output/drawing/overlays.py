@@ -30,22 +30,39 @@ class Ground:
 
 
 @dataclass(frozen=True)
+class Ball:
+    """A sphere: center (3,), radius [m], and corners (8, 3) of the part of its bounding box that is worth showing."""
+
+    center: np.ndarray
+    radius: float
+    seen: np.ndarray
+
+
+@dataclass(frozen=True)
 class Overlays:
     """What stands beside the body in one panel.
 
     grounds : planes drawn as they are
     glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
     arrows  : (2, 3) each, tail and tip
+    balls   : of spheres, seen through like glass
     """
 
     grounds: list[Ground]
     glass: list[np.ndarray]
     arrows: list[np.ndarray]
+    balls: list[Ball]
+
+    @property
+    def sharp(self) -> list[np.ndarray]:
+        """Points (n, 3) [m] of what must be in the picture with a margin: all but grounds."""
+        return [*self.glass, *self.arrows, *(ball.seen for ball in self.balls)]
 
     @property
     def corners(self) -> np.ndarray:
-        """Corners (n, 3) of all obstacles [m]."""
-        return np.concatenate([np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass])
+        """Corners (n, 3) of all obstacles, of what of a ball is to be seen [m]."""
+        grounds, seen = (ground.corners for ground in self.grounds), (ball.seen for ball in self.balls)
+        return np.concatenate([np.empty((0, 3)), *grounds, *self.glass, *seen])
 
 
 @dataclass(frozen=True)
@@ -129,18 +146,23 @@ def overlays_at(
     position : (n, 3) of the nodes at that time [m]
     bodies   : (b, 3) surface points of all panels [m], which say how much of an obstacle is worth showing
     """
-    grounds, glass = _obstacles(scene, time, bodies, camera)
-    return Overlays(grounds, glass, _arrows(scene, time, rest, position))
+    grounds, glass, balls = _obstacles(scene, time, bodies, camera)
+    return Overlays(grounds, glass, _arrows(scene, time, rest, position), balls)
 
 
-def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera) -> tuple[list[Ground], list]:
-    grounds, glass = [], []
+def _obstacles(
+    scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera
+) -> tuple[list[Ground], list[np.ndarray], list[Ball]]:
+    grounds, glass, balls = [], [], []
     for obstacle in scene.obstacle:
         if not within(time, obstacle.start, obstacle.stop):
             continue
         by = Motion.through(obstacle.path).at(time)
         if obstacle.shape == "box":
             glass += _box(np.array(obstacle.box) + by, bodies)
+            continue
+        if obstacle.shape == "sphere":
+            balls += _ball(np.array(obstacle.center) + by, obstacle.radius or 0.0, bodies)
             continue
         point, normal = np.array(obstacle.point) + by, np.array(obstacle.normal)
         if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
@@ -149,7 +171,7 @@ def _obstacles(scene: SceneFile, time: float, bodies: np.ndarray, camera: Camera
             grounds.append(_patch(point, normal, bodies, np.array([camera.right, camera.away])))
         else:
             glass.append(_plate(_patch(point, normal, bodies, np.eye(3)), THICKNESS * _reach(bodies)))
-    return grounds, glass
+    return grounds, glass, balls
 
 
 def _reach(bodies: np.ndarray) -> float:
@@ -184,6 +206,13 @@ def _box(box: np.ndarray, bodies: np.ndarray) -> list[np.ndarray]:
     if gap > NEAR * _reach(bodies) or (box[0] >= box[1]).any():
         return []
     return [np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])]
+
+
+def _ball(center: np.ndarray, radius: float, bodies: np.ndarray) -> list[Ball]:
+    """Return a sphere, of which no more is shown than of a box; none if it is far from the bodies."""
+    gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
+    seen = _box(np.array([center - radius, center + radius]), bodies)
+    return [Ball(center, radius, seen[0])] if seen and gap <= NEAR * _reach(bodies) else []
 
 
 def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> list[np.ndarray]:

@@ -164,6 +164,7 @@ def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
             "grounds": [{"corners": g.corners.tolist(), "normal": g.normal.tolist()} for g in shown.grounds],
             "glass": [corners.tolist() for corners in shown.glass],
             "arrows": [arrow.tolist() for arrow in shown.arrows],
+            "balls": [{"center": b.center.tolist(), "radius": b.radius, "seen": b.seen.tolist()} for b in shown.balls],
         }
         numbers.append(states.setdefault(json.dumps(state), len(states)))
     return {"states": [json.loads(state) for state in states], "numbers": numbers}

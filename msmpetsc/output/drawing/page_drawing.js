@@ -114,7 +114,8 @@ function axesOfEye() {
 }
 
 function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
-  const beside = data.overlays.states.flatMap(({ grounds, glass }) => [...grounds.map((ground) => ground.corners), ...glass]);
+  const beside = data.overlays.states.flatMap(
+    ({ grounds, glass, balls }) => [...grounds.map((ground) => ground.corners), ...glass, ...balls.map((ball) => ball.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
 }
@@ -192,6 +193,18 @@ function drawGlass(camera, corners) {
   drawFlat(camera, corners, gl.LINES, [...colour("#667e90"), 1], EDGES);
 }
 
+const TURNS = Array.from({ length: 72 }, (_, n) => 2 * Math.PI * n / 72);
+
+function drawBall(camera, { center, radius }, eye) { // without perspective a sphere is a disk that faces the eye
+  const rim = TURNS.map((turn) => sum(sum(center, eye.across, radius * Math.cos(turn)), eye.upward, radius * Math.sin(turn)));
+  gl.enable(gl.BLEND);
+  gl.depthMask(false);
+  drawFlat(camera, rim, gl.TRIANGLE_FAN, [...colour("#a3b6c4"), 0.3]);
+  gl.depthMask(true);
+  gl.disable(gl.BLEND);
+  drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
+}
+
 function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every side
   const along = sum(tip, tail, -1), aside = scaled(unit(cross(along, eye.toEye)), Math.hypot(...along));
   const at = (far, wide) => sum(sum(tail, along, far), aside, wide);
@@ -236,6 +249,7 @@ function draw() {
   drawBody(matrix, eye);
   drawAxes(matrix, rows, shift);
   for (const corners of state.glass) drawGlass(matrix, corners);
+  for (const ball of state.balls) drawBall(matrix, ball, eye);
   gl.clear(gl.DEPTH_BUFFER_BIT); // arrows are in front of all
   for (const arrow of state.arrows) drawArrow(matrix, arrow, eye);
   showState();

@@ -157,7 +157,7 @@ def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]
     """Return lower left and upper right (2,), (2,) [m] of what every panel shows, in the picture's plane."""
     bodies = np.concatenate([panel.points for panel in panels])
     margin = (LABELS if panels[0].axes is not None else MARGIN) * np.ptp(bodies, axis=0).max()
-    sharp = [points for panel in panels for points in (*panel.overlays.glass, *panel.overlays.arrows)]
+    sharp = [points for panel in panels for points in panel.overlays.sharp]
     inner = camera.flat(np.concatenate([bodies, *sharp]))
     grounds = [camera.flat(ground.corners) for panel in panels for ground in panel.overlays.grounds]
     rows = np.concatenate([inner - margin, inner + margin, *grounds])

@@ -117,7 +117,7 @@ def room_of(shots: Iterable[Shot], seen: Survey, margin: float = MARGIN) -> tupl
     rows, reach = [], np.ptp(seen.box, axis=0).max()
     corners = [seen.extremes]
     for shot in shots:
-        flat = shot.camera.flat(np.concatenate([seen.extremes, *shot.overlays.glass, *shot.overlays.arrows]))
+        flat = shot.camera.flat(np.concatenate([seen.extremes, *shot.overlays.sharp]))
         grounds = [shot.camera.flat(ground.corners) for ground in shot.overlays.grounds]
         every = np.concatenate([flat - margin * reach, flat + margin * reach, *grounds])
         rows += [every.min(axis=0), every.max(axis=0)]

@@ -113,6 +113,9 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
         _draw_fabric(plotter, fabric)
     for corners in panel.overlays.glass:
         _draw_glass(plotter, corners)
+    for ball in panel.overlays.balls:
+        sphere = pv.Sphere(ball.radius, ball.center, theta_resolution=96, phi_resolution=96)
+        plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, smooth_shading=True, ambient=0.6, diffuse=0.4)
     shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
     shape |= dict(tip_resolution=40, shaft_resolution=40)
     for tail, tip in panel.overlays.arrows:  # without perspective, nearer to the eye is the same point of the picture

@@ -80,7 +80,7 @@ class Subject:
     def overlays(self, index: int, bodies: np.ndarray, camera: "Camera") -> Overlays:
         """Return what stands beside the body at a frame; bodies: (b, 3) [m] as `overlays_at` has them."""
         if self.scene is None:
-            return Overlays([], [], [])
+            return Overlays([], [], [], [])
         return overlays_at(self.scene, float(self.times[index]), self.rest, self.nodes(index), bodies, camera)
 
 

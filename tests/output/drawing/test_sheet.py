@@ -212,6 +212,16 @@ def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
     assert panels(box.format(1.0, 1.01), frames=[0])[0].overlays.glass == []
 
 
+def test_spheres_are_shown_where_they_are_and_large_ones_cut(panels):
+    ball = '[[obstacle]]\nshape = "sphere"\ncenter = [0, 0, {}]\nradius = {}\n'
+    path = "path = [{ time = 1.0, by = [0, 0, -0.1] }]\n"
+    start, end = (panel.overlays.balls for panel in panels(ball.format(0.8, 0.05) + path, frames=[0, 10]))
+    assert start[0].center == pytest.approx([0, 0, 0.8]) and end[0].center[2] < 0.8 and start[0].radius == 0.05
+    (large,) = panels(ball.format(-49.61, 50), frames=[0])[0].overlays.balls
+    assert large.radius == 50 and np.ptp(large.seen, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
+    assert panels(ball.format(3, 0.1), frames=[0])[0].overlays.balls == []
+
+
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
     level = "picture.eye = [0, -1, 0]"
     path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + level + PLATE)

@@ -13,7 +13,6 @@ The numbers and their tolerance are those of `msmpetsc baseline` and `msmpetsc c
 
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 from time import perf_counter
 
@@ -21,6 +20,7 @@ from clone import ROOT, parser
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
+from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.baselines import baseline
 from msmpetsc.study.baselines.baseline import HEAD, Recipe, allowed, judged, nearest_to_limit, row
 
@@ -50,7 +50,8 @@ def recipe(scene: str) -> Recipe:
 def run(scene: str, path: Path, ranks: int) -> None:
     """Simulate; InputError if the mesh is not here, RuntimeError with the last line if the run fails."""
     file = SCENES / f"{scene}.toml"
-    locate(tomllib.loads(file.read_text())["mesh"]["source"], SCENES)
+    for mesh in load_scene(file).meshes.values():
+        locate(mesh.source, SCENES)
     baseline.simulate(file, recipe(scene), path, ranks)
 
 

@@ -11,11 +11,11 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.scene.reading import load_scene
 
-FLAT = 1e4  # [m]: over the block's 0.5 m it sinks by 3e-6 m, and a depth is rounded to 2e-12 m
+FLAT = 1e5  # [m]: over the block's 0.5 m it sinks by 3e-7 m, and a depth is rounded to 1e-11 m
 PLANE = {"shape": "plane", "point": [0, 0, -0.02], "normal": [0, 0, 1]}
 SPHERE = {"shape": "sphere", "center": [0.25, 0.25, -0.02 - FLAT], "radius": FLAT}
 SLOPED = {"acceleration": [2.0, 0, -G]}  # it slides
-SOLVER = {"preset": "newton", "error": 1e-6}
+ERRORS = {"reflect": 1e-9, "penalty": 1e-6}  # of steps: the push is known to no more than a depth is
 RESPONSES = [{"response": "reflect", "restitution": 0.5}, {"response": "penalty", "friction": 0.3}]
 
 
@@ -23,13 +23,14 @@ RESPONSES = [{"response": "reflect", "restitution": 0.5}, {"response": "penalty"
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 def test_a_large_sphere_is_a_plane(tmp_path: Path, integrator: str, response: dict):
     time = {"step": 1 / 240, "duration": 0.15, "integrator": integrator}
+    solver = {"preset": "newton", "error": ERRORS[response["response"]]}
     moved = []
     for obstacle in (PLANE, SPHERE):
-        path = block_scene(tmp_path, time=time, gravity=SLOPED, obstacle=[{**obstacle, **response}], solver=SOLVER)
+        path = block_scene(tmp_path, time=time, gravity=SLOPED, obstacle=[{**obstacle, **response}], solver=solver)
         model, frames = play(path)
         moved.append(frames[-1].position - model.lattice.nodes)
     assert moved[0][:, 2].mean() > -0.06 and np.abs(moved[0]).max() > 0.01  # it has met the ground, and slid
-    np.testing.assert_allclose(moved[1], moved[0], atol=2e-3 * np.abs(moved[0]).max())
+    np.testing.assert_allclose(moved[1], moved[0], atol=5e-3 * np.abs(moved[0]).max())
 
 
 def test_a_node_is_turned_back_along_the_radius():

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,13 @@ from mpi4py import MPI
 
 import msmpetsc as package
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.grid import LIMIT, BodyGrids, encode_morton
+from msmpetsc.geometry.grid import LIMIT, BodyGrids, decode_morton, encode_morton
 from msmpetsc.model.build import build_model
 from msmpetsc.model.lattice import CORNERS
 from msmpetsc.output.compare import compare
 from msmpetsc.output.drawing.overlays import Rest, fixed_nodes
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.multigrid.grids import grid_indices
 from msmpetsc.study.distances import distance_of_shapes, shape_error
 
 H = 0.125
@@ -183,6 +185,11 @@ def test_coarse_cells_join_no_bodies_until_they_are_as_large():
     for level in range(4):  # at 3 a body is one cell
         reached = [{*range((x := int(several.first(body)[0])) >> level, ((x + 7) >> level) + 2)} for body in range(3)]
         assert not reached[0] & reached[1] and not reached[1] & reached[2]
+
+
+def test_multigrid_knows_the_numbers_of_nodes(folder: Path):
+    lattice = build_model(MPI.COMM_SELF, load_scene(write(folder, "numbers", body=BODIES))).lattice
+    np.testing.assert_array_equal(grid_indices(SimpleNamespace(lattice=lattice)), decode_morton(lattice.table.keys))
 
 
 def test_more_cells_than_can_be_numbered_are_refused():

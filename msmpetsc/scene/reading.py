@@ -54,8 +54,12 @@ def scene_of(
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else ())
-    given = {name: getattr(checked, name) for name in checked.model_fields_set}
-    return Scene(**given, text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+    return Scene(**_given(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+
+
+def _given(scene: SceneFile) -> dict[str, Any]:
+    """Return the tables that a scene has, not those that are absent: of mesh and body it has but one."""
+    return {name: getattr(scene, name) for name in scene.model_fields_set}
 
 
 def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] = ()) -> Scene:
@@ -69,7 +73,7 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     keys = {_override(data, override): override for override in overrides}
     checked = _checked(path, data, None, "", keys)
     try:
-        return Scene(**dict(checked), text=tomli_w.dumps(data), folder=folder)
+        return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 

@@ -85,7 +85,7 @@ def test_changes_are_checked_as_a_file_is(scene: Path):
         simulation.frames(0)
     with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
         next(simulation.frames(preset="newtno"))
-    with pytest.raises(InputError, match="scene: mesh: required"):
+    with pytest.raises(InputError, match="scene: must give exactly one of mesh, body"):
         msm.Scene.of({"cages": {"count": 3}})
 
 
@@ -103,7 +103,7 @@ def counted(patch: pytest.MonkeyPatch, *names: str) -> list[str]:
 
 
 def test_the_lattice_is_kept_while_mesh_and_cages_are(scene: Path, monkeypatch: pytest.MonkeyPatch):
-    calls = counted(monkeypatch, "read_body", "fill_cages", "topology_of", "embed")
+    calls = counted(monkeypatch, "read_bodies", "fill_cages", "topology_of", "embed")
     changes = [
         {"output.surface": True},
         {"output.surface": True, "material.young_modulus": 3e5, "material.density": 500.0},
@@ -114,13 +114,13 @@ def test_the_lattice_is_kept_while_mesh_and_cages_are(scene: Path, monkeypatch: 
     simulation = msm.Simulation(scene)
     for change in changes:
         kept = [frame for frame in simulation.frames(set=change)]
-        assert calls == ["read_body", "fill_cages", "topology_of", "embed"]
+        assert calls == ["read_bodies", "fill_cages", "topology_of", "embed"]
         fresh = [frame for frame in msm.frames(scene, set=change)]
         del calls[4:]
         assert np.array_equal([f.position for f in kept], [f.position for f in fresh])
         assert np.array_equal([f.surface for f in kept], [f.surface for f in fresh])
     list(simulation.frames(set={"cages.cell_size": 1 / 4}))
-    assert calls[4:] == ["read_body", "fill_cages", "topology_of"]  # another lattice; no surface was asked for
+    assert calls[4:] == ["read_bodies", "fill_cages", "topology_of"]  # another lattice; no surface was asked for
     assert simulation.model is not None and simulation.model.lattice.cell_size == 1 / 4
 
 

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo
 from msmpetsc.scene.body import Mesh, OwnMaterial, PartTable, refuse_unlike
 from msmpetsc.scene.motion import AnchorTable, Force, Pin, Start
 from msmpetsc.scene.problems import KeyPath, rule
-from msmpetsc.scene.statics import refuse_motion
+from msmpetsc.scene.statics import refuse_functions, refuse_motion
 from msmpetsc.scene.values import ListOf, Table
 
 OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
@@ -65,9 +65,10 @@ def as_the_material(cls, tables: tuple[Any, ...], info: ValidationInfo) -> tuple
 
 
 def no_moving_body(cls, bodies: tuple[BodyTable, ...], info: ValidationInfo) -> tuple[BodyTable, ...]:
-    """Refuse bodies that start in motion in statics (a validator of ``body``)."""
+    """Refuse bodies that start in motion, or whose forces go by the state, in statics (a validator of ``body``)."""
     for number, body in enumerate(bodies):
         refuse_motion(body.start, info, f"body.{number}.start ")
+        refuse_functions(body.force, info, f"body.{number}.")
     return bodies
 
 

@@ -60,11 +60,16 @@ def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
 
 def no_functions(cls: Any, forces: Any, info: ValidationInfo) -> Any:
     """Refuse forces that go by the state (a validator of ``force``)."""
+    refuse_functions(forces, info)
+    return forces
+
+
+def refuse_functions(forces: Any, info: ValidationInfo, whose: str = "") -> None:
+    """Raise a broken rule for forces that go by the state; ``whose`` they are, for the message."""
     for number, force in enumerate(forces if _is_static(info) else ()):
         if force.function is not None:
             raise rule(
-                f'may be no function where time.integrator = "{STATIC}", as force.{number} is: it is that of the state '
-                "before, which is not at rest under it",
+                f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is that of '
+                "the state before, which is not at rest under it",
                 "time",
             )
-    return forces

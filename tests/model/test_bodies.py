@@ -244,6 +244,9 @@ def test_in_statics_each_body_must_be_held(folder: Path):
     with pytest.raises(InputError, match=r"a part of body\.1 of 80 nodes about \(.*\) m at rest is held by nothing"):
         play(write(folder, "loose", body=bodies, **tables))
     bodies[1] |= {"pin": [{"region": UPPER}]}
+    pulled = [bodies[0], {**bodies[1], "force": [{"region": UPPER, "function": "drag"}]}]
+    with pytest.raises(InputError, match=r"may be no function .* as body\.1\.force\.0 is"):
+        load_scene(write(folder, "pulled", body=pulled, **tables))
     _, frames = play(write(folder, "held", body=bodies, **tables))
     assert len(frames) == 2
 

@@ -75,3 +75,11 @@ def test_a_mesh_without_its_package_names_the_extra(tmp_path: Path):
     done = without(("manifold3d",), "run", beam, "-o", tmp_path / "x.h5", "--set", 'mesh.prepare=["union"]')
     assert done.returncode == 2 and "manifold3d is not installed" in done.stderr, done.stderr
     assert "msmpetsc[mesh]" in done.stderr
+
+
+def test_self_contact_without_its_package_names_the_extra(tmp_path: Path):
+    beam, touching = ROOT / "scenes" / "studies" / "atlas" / "beam.toml", ("--set", "self_contact.distance=1e-3")
+    done = without(("ipctk",), "run", beam, "-o", tmp_path / "x.h5", *touching)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.endswith("ipctk is not installed: pip install 'msmpetsc[contact]' brings it\n"), done.stderr
+    assert without(("ipctk",), "run", beam, "-o", tmp_path / "x.h5", "--frames", "1").returncode == 0

@@ -24,6 +24,8 @@ from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
 from msmpetsc.model.reach import Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
+from msmpetsc.model.self_contact.contacts import CollisionSurface
+from msmpetsc.model.self_contact.surface import collision_surface
 from msmpetsc.scene.motion import ForceTable
 from msmpetsc.scene.schema import Scene
 
@@ -44,6 +46,7 @@ class Model:
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
     surface   : of all bodies, one after the other
     damping   : of velocities, by the mass [1/s]
+    collision : the surface that meets itself, where it does
     bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
     """
 
@@ -55,6 +58,7 @@ class Model:
     reflections: list[Reflection]
     penalties: list[Penalty]
     start: InitialState
+    collision: CollisionSurface | None = None
     bodies: tuple[Body, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
@@ -129,6 +133,9 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         penalties=_penalties(comm, scene, lattice, finder.bounds, outside),
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
+        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
+        if scene.self_contact
+        else None,
         reaches=reaches,
         damping=scene.material.damping,
     )

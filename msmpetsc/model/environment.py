@@ -10,6 +10,8 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 from msmpetsc.model.loads import Anchor, Load, OwnForce
+from msmpetsc.model.self_contact.contacts import Contacts, Touch
+from msmpetsc.model.self_contact.term import SurfaceContact
 
 
 class Environment:
@@ -25,6 +27,8 @@ class Environment:
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.reflections = model.penalties, model.reflections
+        self.self_contact = Contacts(self.lattice.table.comm, model.collision) if model.collision else None
+        self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [r.obstacle for r in self.reflections]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
         self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
@@ -149,11 +153,20 @@ class Environment:
             np.array_equal(np.maximum(a.depths(rows)[0], 0), np.maximum(b.depths(rows)[0], 0)) for a, b in states
         )
 
-    def contact(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray) -> Contact | None:
-        """Return what presses in the step that starts from q, friction included; None if nothing does."""
-        owned = self.lattice.owned
+    def contact(
+        self, q: np.ndarray, end: np.ndarray, time: float, time_step: float, sides: np.ndarray
+    ) -> Contact | None:
+        """Return what presses in the step from q to about ``end``, friction included; None if nothing does."""
+        owned, surface = self.lattice.owned, None
         states = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
-        return Contact(states, owned) if states else None
+        if self.self_contact:
+            self.self_contact.expect(q, end)
+            surface = SurfaceContact(self.self_contact, q, time_step)
+        return Contact(states, owned, surface) if states or surface else None
+
+    def touch(self, q: np.ndarray) -> Touch:
+        """Return what there is of contacts of the surface with itself at q (collective)."""
+        return self.self_contact.touch(q) if self.self_contact else Touch()
 
     def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""

@@ -81,6 +81,9 @@ class Frame:
     energy_gained: Annotated[float, _number("f8", "J", "energy that came from nowhere")] = 0.0
     steps: Annotated[int, _number("i8", "1", "time steps taken")] = 0
     time_error: Annotated[float, _number("f8", "1", "estimated relative error of the motion so far")] = math.nan
+    self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
+    self_distance: Annotated[float, _number("f8", "m", "least distance of a contact with itself")] = math.nan
+    self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
 
 
 FRAME_FIELDS: dict[str, Field] = {
@@ -124,6 +127,7 @@ CHECKPOINT = {  # two slots, of which the one with the greater step holds
     "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
     "mode": Field("f8", (2, "n", 3), "1", "highest mode, which limits the explicit step"),
     "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of the least curvature"),
+    "pairs_q": Field("f8", (2, "n", 3), "m", "positions that pairs which may meet were looked for at"),
     "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
 }
 GROUPS = {

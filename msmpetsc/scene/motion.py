@@ -171,6 +171,23 @@ class ObstacleTable(Table):
         return self
 
 
+class SelfContactTable(Table):
+    """The surface does not cross itself, nor one part of it another."""
+
+    distance: Positive | None = Field(
+        None,
+        description="parts nearer than this push each other [m]; a thousandth of the rest bounding box's diagonal "
+        "if absent",
+    )
+    friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
+    surface: int | None = Field(
+        None,
+        ge=4,
+        lt=2**63,
+        description="triangles of a coarser surface that meets itself in its place [-]; the whole surface if absent",
+    )
+
+
 class Pin(Table):
     """Nodes that stay where they are."""
 

@@ -19,8 +19,9 @@ from msmpetsc.scene.bodies import (
     tables_of,
 )
 from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable
-from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, Start, Time
+from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, SelfContactTable, Start, Time
 from msmpetsc.scene.problems import KeyPath
+from msmpetsc.scene.self_contact import only_implicit
 from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
@@ -85,6 +86,7 @@ class SceneFile(Table):
     start: Start | None = Field(None, description="how it is at time 0; at rest in its rest shape if absent")
     gravity: Gravity | None = Field(None, description="a uniform field; none if absent")
     obstacle: ListOf[ObstacleTable] = Field((), description="what nodes bounce off")
+    self_contact: SelfContactTable | None = Field(None, description="what keeps the surface from crossing itself")
     pin: ListOf[Pin] = Field((), description="nodes that stay where they are")
     anchor: ListOf[AnchorTable] = Field((), description="nodes led along a path")
     force: ListOf[Force] = Field((), description="forces on parts of the body")
@@ -101,6 +103,7 @@ class SceneFile(Table):
     _start_at_rest = field_validator("body")(no_moving_body)
     _only_presses = field_validator("obstacle")(no_impact)
     _is_given = field_validator("force")(no_functions)
+    _meets_itself = field_validator("self_contact")(only_implicit)
 
     @property
     def stored(self) -> int:

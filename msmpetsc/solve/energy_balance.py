@@ -29,6 +29,7 @@ from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import describe_inverted, node_of_greatest
+from msmpetsc.model.self_contact.contacts import Touch
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
 
@@ -44,6 +45,7 @@ class Energies:
 
     kinetic  : of all nodes; ``free`` of those that nothing prescribes
     momentum : (3,) [kg m/s]
+    touch    : contacts of the surface with itself
     """
 
     kinetic: float
@@ -52,11 +54,12 @@ class Energies:
     contact: float
     potential: float
     momentum: np.ndarray
+    touch: Touch
 
     @property
     def inner(self) -> float:
         """All but the potential of loads [J]."""
-        return self.free + self.elastic + self.contact
+        return self.free + self.elastic + self.contact + self.touch.energy
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ class EnergyBalance:
         self.credit = CREDIT if swings else 0.0
         self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
         self.ledger, self.gained = Ledger(), 0.0
-        self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3))
+        self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
         self.known: tuple[np.ndarray, float] | None = (
             None  # positions that the last step ended at, their elastic energy [J]
         )
@@ -133,6 +136,7 @@ class EnergyBalance:
         return Energies(
             **dict(zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)),
             momentum=sums[5:],
+            touch=environment.touch(q),
         )
 
     def examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> None:
@@ -214,6 +218,7 @@ class EnergyBalance:
             result.work,
             result.swing,
         )
+        sums[2] += environment.touch(q).energy
         sums[0] += (known[1] if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 

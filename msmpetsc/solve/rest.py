@@ -68,12 +68,12 @@ class Rest:
 
     def _is_at_rest(self, state: State, time: float, limit: float) -> bool:
         """Whether both lengths are within the limit [m sqrt(kg)]."""
-        lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), bool(self.model.penalties)
+        lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), self.environment.touches
         preset = find_preset(PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
         try:
             sides = self.environment.no_sides if state.sides is None else state.sides
-            contact = self.environment.contact(state.q, time, self.time_step, sides)
+            contact = self.environment.contact(state.q, state.q, time, self.time_step, sides)
             stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
             if not distance(stepper, state.q, limit) <= limit:
                 return False

@@ -16,6 +16,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
+from msmpetsc.model.self_contact.contacts import Contacts
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -53,6 +54,8 @@ def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
     """Raise InputError for PETSc options that the solvers of this scene refuse, before there is anything to solve."""
     solvers = solvers_of(scene, probes)
     refuse_bad_steps(scene.time)
+    if scene.self_contact and not all(preset.true_hessian for preset, _ in solvers.values()):
+        raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
     if "" not in solvers:
@@ -218,8 +221,9 @@ class Simulation:
         for part in self._remembering():
             part.restore(checkpoint)
 
-    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest]:
-        return [self.balance, self.recovery, self.monitors, self.cost, *([self.rest] if self.rest else [])]
+    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest | Contacts]:
+        parts = (self.rest, self.environment.self_contact)
+        return [self.balance, self.recovery, self.monitors, self.cost, *(part for part in parts if part)]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -244,6 +248,9 @@ class Simulation:
             momentum=energies.momentum,
             inverted=self.monitors.inverted(index, time, q),
             energy_gained=max(gained, 0.0),
+            self_contacts=energies.touch.contacts,
+            self_distance=energies.touch.distance,
+            self_contact=energies.touch.energy,
             **vars(cost),
         )
 

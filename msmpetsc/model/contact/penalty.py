@@ -13,6 +13,7 @@ also beyond the far face: a plate that a node passes within a step pushes it bac
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from msmpetsc.model.contact.obstacle import (
     normals_at,
     of_nodes,
 )
+
+if TYPE_CHECKING:
+    from msmpetsc.model.self_contact.term import SurfaceContact
 
 Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -164,16 +168,19 @@ class ContactState:
 
 
 class Contact:
-    """What all obstacles add to E in one step. Positions q are (owned or more, 3) [m].
+    """What all obstacles, and the surface that meets itself, add to E in one step. Positions q are (owned or more, 3)
+    [m].
 
-    Gradient and Hessian act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
+    Gradient and Hessian of obstacles act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
+
+    surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int):
-        self.states, self.owned = states, owned
+    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
+        self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: np.ndarray) -> float:
-        """Return the energy [J] of the push alone: friction stores none."""
+        """Return the energy [J] of the push of obstacles alone: friction stores none."""
         energy = 0.0
         for state in self.states:
             inside = np.maximum(state.depths(q[: self.owned])[0], 0)
@@ -182,6 +189,10 @@ class Contact:
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
         """Return the energy at q less that at base, friction included [J]."""
+        return self.change_at_nodes(q, base) + (self.surface.change(q, base) if self.surface else 0.0)
+
+    def change_at_nodes(self, q: np.ndarray, base: np.ndarray) -> float:
+        """Return the same of obstacles alone."""
         total = 0.0
         for state in self.states:
             parts = np.empty(self.owned, like=q)
@@ -197,6 +208,8 @@ class Contact:
             _add_gradient_of(self.owned, q, *state.faces(q), state.stiffness, gradient)
             if state.friction:
                 state.friction.add_gradient(q, gradient)
+        if self.surface:
+            self.surface.add_gradient(q, gradient)
 
     def all_secant(self) -> Secants:
         """Return what ``hessian`` takes for all friction to have its secant."""
@@ -209,9 +222,9 @@ class Contact:
     def hessian(
         self, q: np.ndarray, true: bool, secants: Secants | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield of each push and each friction the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
+        """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
-        The Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
+        Their Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
         the centre is pressed the true block has -k d / r across the normal, too, which is left out.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
@@ -226,13 +239,13 @@ class Contact:
                 yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
     def bound(self, q: np.ndarray) -> np.ndarray:
-        """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes are in contact."""
+        """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""
         bound = np.zeros(self.owned, like=q)
         for state in self.states:
             bound += state.stiffness * (state.depths(q[: self.owned])[0] > 0)
             if state.friction:
                 bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
-        return bound
+        return bound + self.surface.bound(q) if self.surface else bound
 
 
 def _squares(vectors: np.ndarray) -> np.ndarray:

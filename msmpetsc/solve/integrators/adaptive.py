@@ -262,7 +262,7 @@ class Adaptive:
         counts = {f"taken_{name}": count for name, count in vars(self.taken).items()}
         checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | counts)
         self._integrator_last().save(checkpoint, state)
-        if self.environment.penalties:  # as not every level's has it
+        if self.environment.touches:  # as not every level's has it
             checkpoint.rows.setdefault("contact_bound", np.zeros(self.lattice.owned))
 
     def _integrator_last(self) -> Integrator:

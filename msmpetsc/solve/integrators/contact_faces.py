@@ -50,7 +50,7 @@ class ContactFaces:
     def problem(self) -> StepProblem:
         """The step with the faces as they are known now."""
         environment, time = self.environment, self.time
-        contact = environment.contact(self.q, time, self.time_step, self.sides)
+        contact = environment.contact(self.q, self.y, time, self.time_step, self.sides)
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
     def compare(self, x: np.ndarray) -> None:

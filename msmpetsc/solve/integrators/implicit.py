@@ -123,7 +123,7 @@ class ImplicitEuler:
         if self.reference is None:
             lattice = self.stepper.lattice
             self.reference = Reference(
-                self.comm, lattice, self.damped_tau, touches=bool(self.model.penalties), static=self.STATIC
+                self.comm, lattice, self.damped_tau, touches=self.environment.touches, static=self.STATIC
             )
         trace, self.trace, self.stepper.observer = self.trace, None, None
         assert self.problem is not None, "no step was taken"
@@ -141,7 +141,7 @@ class ImplicitEuler:
             find_preset(solver.preset),
             solver.error,
             solver.max_iterations,
-            touches=bool(self.model.penalties),
+            touches=self.environment.touches,
             prefix=self.prefix,
             static=self.STATIC,
         )

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact, Secants
 from msmpetsc.model.elasticity import Elasticity, Hessian
+from msmpetsc.model.self_contact.term import SurfaceHessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
@@ -105,6 +106,7 @@ class TrueHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
         self.elastic: Hessian | None = None  # until it is linearised
+        self.surface: SurfaceHessian | None = None
         self.products = 0
 
     def linearise(
@@ -117,6 +119,7 @@ class TrueHessian(Viewable):
             count_flops(self.elasticity.flops.hessian)
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
+            self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"
@@ -125,6 +128,9 @@ class TrueHessian(Viewable):
             self.unknowns.to_nodes(x, self.v)
             self.product[:] = 0
             self.elastic.add_product(self.v, self.product)
+            if self.surface:
+                with CONTACT:
+                    self.surface.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
             count_flops(self.elasticity.flops.product)
             if self.contact:

@@ -98,6 +98,8 @@ class LatticePreconditioner:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
         if self.translations is None or contact is None:
             return self.translations is not None
+        if contact.surface and len(self.multigrid.bodies.free) > 1 and contact.surface.presses(q):
+            return False  # of one body alone it moves the middle no more than springs do
         pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
         return not self.comm.allreduce(pressed, MPI.LOR)
 
@@ -107,7 +109,8 @@ class LatticePreconditioner:
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
-        return blocks
+        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+        return blocks + surface.blocks if surface else blocks
 
     def setFromOptions(self, _: PETSc.PC) -> None:
         """The options are read when the levels are there."""

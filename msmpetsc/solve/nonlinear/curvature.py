@@ -50,7 +50,8 @@ UNIFORM_EFFORT = Effort(2, 3, 1)  # with multigrid smooth modes come at once; bu
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m; whether a cell resists.
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of its contacts with
+    itself included; whether a cell resists.
 
     inertia : M is part of H, which outweighs what is not positive in the rest
     """
@@ -102,7 +103,10 @@ class LowestCurvature:
         """Compression at positions q (l, 3) [m]."""
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        ratios = functional.t2 * elasticity.concavity(q)[free] / functional.lattice.mass[free]
+        concavity, contact = elasticity.concavity(q)[free], functional.problem.contact
+        if contact and contact.surface:
+            concavity = concavity + contact.surface.concavity(q)[free]
+        ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
         return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)

@@ -3,10 +3,12 @@
 import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
+SHORTER = (0.5, 0.1, 0.0)  # shares of a guess's way, where anchors move on at once
 STORED = ("correction", "correction_before")
 
 
@@ -40,7 +42,29 @@ class FirstGuess:
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
         values = [self.functional.value(self._held(guess)) for guess in guesses]
-        return guesses[int(np.argmin(values))]
+        return self._without_crossing(guesses[int(np.argmin(values))])
+
+    def _without_crossing(self, guess: np.ndarray) -> np.ndarray:
+        """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.
+
+        Raises StepFailed where anchors alone lead the surface through itself.
+        """
+        functional, q = self.functional, self.functional.problem.q
+        share = functional.free_share(q, self._held(guess))
+        if share == 1.0:
+            return guess
+        moved = guess - q
+        drift = self._drift(moved)
+        if functional.problem.prescribed is None:
+            return q + share * moved + (1 - share) * drift
+        for less in SHORTER:
+            guess = q + less * moved
+            if functional.free_share(q, self._held(guess)) == 1.0:
+                return guess
+        raise StepFailed(
+            'has anchors that lead the surface through itself; try safety.on_failure = "substep", or other paths',
+            "contact",
+        )
 
     def learn(self, x: np.ndarray) -> None:
         """The step has come to x (l, 3) [m]."""

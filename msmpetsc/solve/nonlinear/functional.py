@@ -91,12 +91,13 @@ class StepFunctional:
         return Iterate(q, f)
 
     def value(self, q: np.ndarray) -> float:
-        """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart."""
+        """g of positions q (l, 3) but for a constant of the step and self-contact [kg m^2]: to compare guesses that are
+        far apart."""
         problem, owned = self.problem, slice(self.lattice.owned)
         moved = q[owned] - problem.y[owned]
         acting = self.elasticity.energy(q) - float(np.vdot(moved, problem.load))
         if problem.contact:
-            acting += problem.contact.change(q, problem.y)
+            acting += problem.contact.change_at_nodes(q, problem.y)
         inertia = 0.5 * self._inner(moved, moved)
         return self.comm.allreduce(inertia + self.t2 * acting)
 
@@ -114,6 +115,19 @@ class StepFunctional:
                     elastic += problem.contact.change(q, base)
             change, squared = self.comm.allreduce(np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))]))
         return change, squared
+
+    @property
+    def meets_itself(self) -> bool:
+        """Whether the surface does."""
+        return self.problem.contact is not None and self.problem.contact.surface is not None
+
+    def free_share(self, base: np.ndarray, q: np.ndarray) -> float:
+        """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""
+        contact = self.problem.contact
+        if contact is None or contact.surface is None:
+            return 1.0
+        with CONTACT:
+            return contact.surface.free_share(base, q)
 
     def _inner(self, a: np.ndarray, b: np.ndarray) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""

@@ -65,6 +65,10 @@ class Minimum:
         if corrected:
             estimate.correction.copy(self.first)
             self.nearer.axpy(-1.0, self.first)
+        if corrected and not self._is_free(x, self.nearer):
+            x.copy(self.nearer)
+            self.first.set(0.0)
+            corrected = False
         nearer = functional.evaluate(self.nearer, self.f)
         estimate.linearise(nearer.q)
         bent = self._bent()
@@ -87,6 +91,11 @@ class Minimum:
         had."""
         iterate = self.functional.evaluate(x, self.f)
         return bool(np.isfinite(self.estimate(iterate, self.functional.dual_norm(self.f), np.inf)))
+
+    def _is_free(self, x: PETSc.Vec, nearer: PETSc.Vec) -> bool:
+        """Whether the surface meets itself nowhere on the way from one to the other."""
+        positions = self.functional.positions
+        return not self.functional.meets_itself or self.functional.free_share(positions(x), positions(nearer)) == 1.0
 
     def _bent(self) -> float:
         """|F(x - e) - (F - H e)|_(M^-1): what the Hessian at x did not know of F at x - e."""
@@ -132,7 +141,8 @@ class Minimum:
         best = lowest = 0.0
         for _ in range(MOVES):
             self.memory.write(self.f)[:] = self.memory.read(x) + move * direction
-            change, _ = functional.change(functional.positions(self.f), base)
+            q = functional.positions(self.f)
+            change = functional.change(q, base)[0] if functional.free_share(base, q) == 1.0 else np.inf
             if not change < lowest:
                 break
             best, lowest, move = move, change, 2 * move

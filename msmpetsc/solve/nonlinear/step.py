@@ -110,7 +110,7 @@ class Stepper:
                 self.jacobian = self._create_jacobian(comm, time_step, touches)
                 self.x, self.work = (self._keep(self.jacobian.operator.createVecRight()) for _ in range(2))
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
-                self.snes, self.ksp = self._create_solvers(comm)
+                self.snes, self.ksp = self._create_solvers(comm, touches)
                 self.control, self.minimum = self._create_control(error)
         except InputError:
             self.destroy()
@@ -128,7 +128,7 @@ class Stepper:
             comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options
         )
 
-    def _create_solvers(self, comm: MPI.Comm) -> tuple[PETSc.SNES, PETSc.KSP]:
+    def _create_solvers(self, comm: MPI.Comm, touches: bool) -> tuple[PETSc.SNES, PETSc.KSP]:
         """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
         snes, prefix = self._keep(PETSc.SNES().create(comm)), self.options.prefix
         snes.setOptionsPrefix(prefix)
@@ -142,6 +142,8 @@ class Stepper:
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
         snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
         snes.setObjective(self._objective)
+        if touches:
+            snes.setLineSearchPreCheck(self._shorten)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
             ksp.setInitialGuessNonzero(True)
@@ -184,8 +186,7 @@ class Stepper:
             self.kinks.begin(problem.contact)
             self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
             if start is None and self.jacobian.preconditioner.has_to_balance:
-                iterate = self._evaluate(self.x)
-                self.jacobian.preconditioner.balance(iterate.q, problem.contact, iterate.f, self.x)
+                self._balance()
             iterations, is_done = 0, False
             while not is_done:
                 for _ in self._solves():
@@ -196,6 +197,17 @@ class Stepper:
             self.first_guess.learn(q)
             its, error = self.all_its() - its_before, self.control.final_error(q)
             return StepResult(q, problem.q, error, iterations, its, products=self.all_products() - products_before)
+
+    def _balance(self) -> None:
+        """Move bodies as wholes to where their forces balance, as far as they do not meet."""
+        iterate = self._evaluate(self.x)
+        self.jacobian.preconditioner.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
+        if not self.functional.meets_itself:
+            return
+        balanced = self.functional.positions(self.x)
+        share = self.functional.free_share(iterate.q, balanced)
+        if share < 1.0:
+            self.unknowns.from_nodes(iterate.q + share * (balanced - iterate.q), self.x)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on beside its problem."""
@@ -307,6 +319,19 @@ class Stepper:
             self.kinks.see(q, self.base)
             change, distance = self.functional.change(q, self.base)
         return -1.0 if self.control.is_flat and distance > 0 else change
+
+    def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
+        if not self.functional.meets_itself:
+            return False
+        with LOCAL:
+            end = x.copy()
+            end.axpy(-1.0, y)
+            share = self.functional.free_share(self.functional.positions(x), self.functional.positions(end))
+            end.destroy()
+        if share < 1.0:
+            y.scale(share)
+        return share < 1.0
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Called before each linear solve: the Jacobian there, and what that solve starts from."""

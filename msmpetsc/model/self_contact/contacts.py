@@ -1,0 +1,190 @@
+"""Contacts of a surface with itself, wherever the nodes are: looked for as rarely as can be.
+
+Pairs of its parts that may meet are looked for where a step begins, and again where a point has moved farther than was
+allowed for then; a common translation is no such move. Where none of them can come near, positions of nodes tell that
+without a single point's being computed.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import on_root
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw
+from msmpetsc.model.self_contact.points import SurfacePoints
+
+if TYPE_CHECKING:
+    import ipctk
+
+REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
+FARTHEST = 0.25  # edges that a point may move before pairs are looked for anew: with more there are too many pairs
+AHEAD = 2.0  # times the move that is expected
+
+
+@dataclass(frozen=True)
+class CollisionSurface:
+    """The surface that meets itself.
+
+    surface : on rank 0, triangles that cut others taken out; None on the others
+    points  : its points as the nodes carry them
+    """
+
+    surface: Surface | None
+    points: SurfacePoints
+    law: BarrierLaw
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Contacts of one moment: their number, the least distance [m], NaN where there are none, and the energy [J]."""
+
+    contacts: int = 0
+    distance: float = np.nan
+    energy: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs that may meet while no point moves by more than ``reach`` [m] from q (owned, 3), but for a translation.
+
+    points, candidates : S there (p, 3) [m] and the pairs, on rank 0
+    is_clear           : none of them can come near enough to count
+    """
+
+    q: np.ndarray
+    reach: float
+    points: np.ndarray
+    candidates: "ipctk.Candidates | None"
+    is_clear: bool
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Contacts at positions q (owned, 3) [m].
+
+    count    : their number
+    points   : S (p, 3) [m], on rank 0; None on all where it was not needed
+    contacts : on rank 0
+    """
+
+    q: np.ndarray
+    count: int = 0
+    points: np.ndarray | None = None
+    contacts: "ipctk.NormalCollisions | None" = None
+
+
+class Contacts:
+    """Contacts of one run. All methods are collective; positions are (owned or more, 3) [m].
+
+    barrier : on rank 0
+    edge    : mean length of the surface's edges at rest [m]
+    """
+
+    def __init__(self, comm: MPI.Comm, collision: CollisionSurface):
+        self.comm, self.points, self.law = comm, collision.points, collision.law
+        self.owned, surface = collision.points.weights.shape[1], collision.surface
+        self.barrier: Barrier | None = on_root(comm, lambda: Barrier(surface, self.law) if surface else None)
+        self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
+        self._pairs: Pairs | None = None
+        self._moments: list[Moment] = []
+
+    def expect(self, q: np.ndarray, end: np.ndarray) -> None:
+        """Make ready for a step from q to about ``end``: look for pairs anew unless the known ones serve."""
+        if self._pairs and max(self._moved(q, self._pairs), self._moved(end, self._pairs)) <= self._pairs.reach:
+            return
+        self._look(q, AHEAD * self._farthest(end[: self.owned] - q[: self.owned]))
+
+    def _look(self, q: np.ndarray, reach: float) -> Pairs:
+        """Look for pairs at q."""
+        points, reach = self.points(q), min(max(reach, self.law.distance), FARTHEST * self.edge)
+        candidates, is_clear = None, True
+        if self.barrier:
+            candidates = self.barrier.candidates(points, reach)
+            is_clear = self.barrier.is_clear(candidates, points, reach)
+        self._moments.clear()
+        self._pairs = Pairs(q[: self.owned].copy(), reach, points, candidates, self.comm.bcast(is_clear))
+        return self._pairs
+
+    def _moved(self, q: np.ndarray, pairs: Pairs) -> float:
+        """Return no less than how far any point at q is from where the pairs were looked for [m]."""
+        return self._farthest(q[: self.owned] - pairs.q)
+
+    def _farthest(self, moved: np.ndarray) -> float:
+        """Return no less than how far displacements (owned, 3) [m] of nodes move any point, but for a translation."""
+        ends = np.concatenate([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
+        if self.comm.size > 1:
+            most = np.empty_like(ends)
+            self.comm.Allreduce(ends, most, MPI.MAX)
+            ends = most
+        return self.points.spread * 0.5 * float(np.linalg.norm(ends[:3] + ends[3:]))
+
+    def at(self, q: np.ndarray) -> Moment:
+        """Return the contacts at positions q."""
+        q = q[: self.owned]
+        pairs = self._pairs or self._look(q, self.law.distance)
+        bound = self._moved(q, pairs)
+        if pairs.is_clear and bound <= pairs.reach:
+            return Moment(q)
+        for moment in self._moments:
+            if self._is_same(q, moment.q):
+                return moment
+        points = self.points(q)
+        if bound > pairs.reach and not self._serve(pairs, points):
+            pairs = self._look(q, FARTHEST * self.edge)
+        contacts = self.barrier.contacts(pairs.candidates, points) if self.barrier else None
+        count = self.comm.bcast(len(contacts) if contacts is not None else 0)
+        self._moments = [Moment(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
+        return self._moments[0]
+
+    def _is_same(self, a: np.ndarray, b: np.ndarray) -> bool:
+        same = bool(np.array_equal(a, b))
+        return self.comm.allreduce(same, MPI.LAND) if self.comm.size > 1 else same
+
+    def _serve(self, pairs: Pairs, points: np.ndarray) -> bool:
+        """Return whether points S (p, 3) are within the pairs' reach, by what these themselves moved."""
+        serve = True
+        if self.barrier:
+            moved = points - pairs.points
+            moved -= 0.5 * (moved.max(axis=0) + moved.min(axis=0))
+            serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
+        return self.comm.bcast(serve)
+
+    def with_points(self, moment: Moment) -> Moment:
+        """Return the same with the points, which friction asks for."""
+        return Moment(moment.q, moment.count, self.points(moment.q), moment.contacts)
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store where pairs were looked for: in their order contacts are summed."""
+        pairs = self._pairs
+        rows = np.zeros((self.owned, 3)) if pairs is None else pairs.q
+        checkpoint.keep({"pairs_q": rows}, {"pairs_reach": pairs.reach if pairs else 0.0})
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
+        self._pairs, reach = None, checkpoint.number("pairs_reach", 0.0, 0)
+        if reach > 0:
+            self._look(checkpoint.row("pairs_q"), reach)
+
+    def touch(self, q: np.ndarray) -> Touch:
+        """Return what there is of contacts at q."""
+        moment, touch = self.at(q), Touch()
+        if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
+            least = self.barrier.least(moment.contacts, moment.points)
+            touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
+        return self.comm.bcast(touch)
+
+    def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
+        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
+        q, end = q[: self.owned], end[: self.owned]
+        pairs = self._pairs or self._look(q, self.law.distance)
+        within = max(self._moved(q, pairs), self._moved(end, pairs)) <= pairs.reach
+        if within and pairs.is_clear:
+            return 1.0
+        start, moved, share = self.points(q), self.points(end - q), 1.0
+        if self.barrier:
+            share = self.barrier.free_share(start, moved, pairs.candidates if within else None)
+        return self.comm.bcast(share)

@@ -1,0 +1,172 @@
+"""Self-contact as a term of the energy that a step minimises: the barrier between the surface's parts, and friction.
+
+Rank 0 computes what is of points; ranks send it what their nodes make of S = W q, and get the rows of forces that are
+not zero. The Hessian is never formed on nodes: W^T (H_c (W v)) over the points in contact takes a hundredth of that.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+from msmpetsc.model.self_contact.contacts import Contacts, Moment
+from msmpetsc.model.self_contact.friction import SurfaceFriction
+from msmpetsc.model.self_contact.points import Carried
+
+TINY = np.finfo(float).tiny
+
+
+@dataclass(frozen=True)
+class SurfaceHessian:
+    """W^T H_c W over k points in contact.
+
+    carried : those points, as this rank's nodes carry them
+    points  : H_c (3k, 3k) [N/m], on all ranks
+    """
+
+    comm: MPI.Comm
+    carried: Carried
+    points: csr_array
+
+    def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
+        """Add the Hessian times v (owned or more, 3) to the owned rows of ``product`` (collective)."""
+        at, weights = self.carried
+        moved = np.zeros((self.points.shape[0] // 3, 3))
+        moved[at] = weights @ v[: weights.shape[1]]
+        if self.comm.size > 1:
+            total = np.empty_like(moved)
+            self.comm.Allreduce(moved, total)
+            moved = total
+        forces = (self.points @ moved.ravel()).reshape(-1, 3)
+        product[: weights.shape[1]] += weights.T @ forces[at]
+
+    @cached_property
+    def blocks(self) -> np.ndarray:
+        """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
+        at, weights = self.carried
+        own = (3 * at[:, None] + np.arange(3)).ravel()
+        points = self.points[own][:, own]
+        blocks = np.empty((weights.shape[1], 9))
+        for row in range(3):
+            for column in range(3):
+                acting = points[row::3][:, column::3] @ weights
+                blocks[:, 3 * row + column] = (weights * acting).sum(axis=0)
+        return blocks
+
+
+class SurfaceContact:
+    """Self-contact in one step. All methods are collective; positions are (owned or more, 3) [m].
+
+    rubs     : there is friction
+    friction : of the step, on rank 0
+    """
+
+    def __init__(self, contacts: Contacts, start: np.ndarray | None = None, time_step: float = 0.0):
+        """Without a ``start`` of the step there is no friction."""
+        self.contacts, self.comm = contacts, contacts.comm
+        self.rubs = False
+        self.friction: SurfaceFriction | None = None
+        self._hessians: dict[bool, tuple[Moment, SurfaceHessian]] = {}  # with and without their negative parts
+        if start is not None and contacts.law.friction > 0:
+            self._start_friction(contacts.at(start), contacts.law.stick * time_step)
+
+    def _start_friction(self, moment: Moment, stick: float) -> None:
+        self.rubs, barrier = moment.count > 0, self.contacts.barrier
+        if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
+            self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
+
+    def _acting(self, q: np.ndarray) -> Moment | None:
+        """Return the contacts at q, with the points where there is friction; None where nothing acts."""
+        moment = self.contacts.at(q)
+        if moment.count == 0 and not self.rubs:
+            return None
+        return moment if moment.points is not None else self.contacts.with_points(moment)
+
+    def presses(self, q: np.ndarray) -> bool:
+        """Return whether it acts at q."""
+        return self._acting(q) is not None
+
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """Return this rank's part of the energy at q less that at base, friction included [J]."""
+        return self._energy(q) - self._energy(base)
+
+    def _energy(self, q: np.ndarray) -> float:
+        moment, barrier, energy = self._acting(q), self.contacts.barrier, 0.0
+        if moment is None or barrier is None or moment.points is None:
+            return 0.0
+        if moment.contacts is not None:
+            energy += barrier.energy(moment.contacts, moment.points)
+        return energy + (self.friction.energy(moment.points) if self.friction else 0.0)
+
+    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        moment = self._acting(q)
+        if moment is None:
+            return
+        touched, forces = self.comm.bcast(self._forces(moment))
+        at, weights = self.contacts.points.carried(touched)
+        gradient[: weights.shape[1]] += weights.T @ forces[at]
+
+    def _forces(self, moment: Moment) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
+        barrier = self.contacts.barrier
+        if barrier is None or moment.points is None:
+            return None
+        forces = np.zeros_like(moment.points)
+        if moment.contacts is not None:
+            forces += barrier.gradient(moment.contacts, moment.points)
+        if self.friction:
+            forces += self.friction.gradient(moment.points)
+        touched = np.flatnonzero(forces.any(axis=1))
+        return touched, forces[touched]
+
+    def hessian(self, q: np.ndarray, projected: bool) -> SurfaceHessian | None:
+        """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts."""
+        moment = self._acting(q)
+        if moment is None:
+            return None
+        known = self._hessians.get(projected)
+        if known is None or known[0] is not moment:
+            touched, points = self.comm.bcast(self._curvature(moment, projected))
+            known = moment, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
+            self._hessians[projected] = known
+        return known[1]
+
+    def concavity(self, q: np.ndarray) -> np.ndarray:
+        """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
+
+        With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w v)^2 is no more
+        than sum |w| times sum |w| v^2.
+        """
+        whole, kept = (self.hessian(q, projected) for projected in (False, True))
+        if whole is None or kept is None:
+            return np.zeros(self.contacts.owned)
+        sums = np.asarray(np.abs(kept.points - whole.points).sum(axis=1)).reshape(-1, 3).max(axis=1)
+        at, weights = kept.carried
+        return self.contacts.points.spread * (np.abs(weights).T @ sums[at])
+
+    def _curvature(self, moment: Moment, projected: bool) -> tuple[np.ndarray, csr_array] | None:
+        """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
+        barrier = self.contacts.barrier
+        if barrier is None or moment.points is None:
+            return None
+        parts = [barrier.hessian(moment.contacts, moment.points, projected)] if moment.contacts is not None else []
+        parts += [self.friction.hessian(moment.points)] if self.friction else []
+        whole = csr_array(sum(parts))
+        touched = np.flatnonzero(np.diff(whole.indptr).reshape(-1, 3).any(axis=1))
+        numbers = (3 * touched[:, None] + np.arange(3)).ravel()
+        return touched, csr_array(whole[numbers][:, numbers])
+
+    def bound(self, q: np.ndarray) -> np.ndarray:
+        """Return (owned,) [N/m] no less than each node's block of the projected Hessian; a power of 4, to change seldom."""
+        hessian = self.hessian(q, True)
+        if hessian is None:
+            return np.zeros(self.contacts.owned)
+        norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
+        return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)
+
+    def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
+        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
+        return self.contacts.free_share(q, end)

@@ -1,0 +1,27 @@
+"""Rules of a scene whose surface meets itself: what would move it past itself unseen is refused."""
+
+from typing import Any
+
+from pydantic import ValidationInfo
+
+from msmpetsc.scene.problems import rule
+
+INTEGRATORS = ("implicit-euler", "bdf2")
+
+
+def only_implicit(cls: Any, table: Any, info: ValidationInfo) -> Any:
+    """Refuse integrators that take other steps than implicit ones, and obstacles that reflect (a validator of
+    ``self_contact``)."""
+    if table is None:
+        return table
+    integrator = getattr(info.data.get("time"), "integrator", INTEGRATORS[0])
+    if integrator not in INTEGRATORS:
+        raise rule(f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"', "time")
+    for number, obstacle in enumerate(info.data.get("obstacle", ())):
+        if obstacle.response == "reflect":
+            raise rule(
+                f"may not go with obstacles that reflect, as obstacle.{number} does: they move nodes past each other; "
+                'response = "penalty" presses',
+                "obstacle",
+            )
+    return table

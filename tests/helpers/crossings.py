@@ -1,0 +1,48 @@
+"""Whether a surface crosses itself: each edge against each triangle, by signs of volumes, without any library of
+contact."""
+
+import numba
+import numpy as np
+
+
+def unique_edges(triangles: np.ndarray) -> np.ndarray:
+    """Return the edges (e, 2) of triangles (f, 3), each once."""
+    pairs = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    return np.unique(pairs, axis=0)
+
+
+def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
+    """Return how many pairs of an edge and a triangle that share no corner cross; points (v, 3)."""
+    return _count(np.ascontiguousarray(points, float), unique_edges(triangles), np.ascontiguousarray(triangles))
+
+
+@numba.njit(cache=True)
+def _volume(a, b, c, d):
+    u, v, w = b - a, c - a, d - a
+    x, y, z = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    return x * w[0] + y * w[1] + z * w[2]
+
+
+@numba.njit(cache=True)
+def _count(points, edges, triangles):
+    count, low, high = 0, np.empty((len(triangles), 3)), np.empty((len(triangles), 3))
+    for f in range(len(triangles)):
+        for c in range(3):
+            x, y, z = points[triangles[f, 0], c], points[triangles[f, 1], c], points[triangles[f, 2], c]
+            low[f, c], high[f, c] = min(x, y, z), max(x, y, z)
+    for e in range(len(edges)):
+        a, b = edges[e]
+        p, q = points[a], points[b]
+        for f in range(len(triangles)):
+            i, j, k = triangles[f]
+            apart = a in (i, j, k) or b in (i, j, k)
+            for c in range(3):
+                apart = apart or max(p[c], q[c]) < low[f, c] or min(p[c], q[c]) > high[f, c]
+            if apart:
+                continue
+            r, s, t = points[i], points[j], points[k]
+            if _volume(r, s, t, p) * _volume(r, s, t, q) >= 0:
+                continue
+            u, v, w = _volume(p, q, r, s), _volume(p, q, s, t), _volume(p, q, t, r)
+            count += (u > 0 and v > 0 and w > 0) or (u < 0 and v < 0 and w < 0)
+    return count

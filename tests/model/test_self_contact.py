@@ -1,0 +1,224 @@
+"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three, resumed runs, meshes that cut
+themselves, what is refused."""
+
+import copy
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from block_scene import block_scene
+from crossings import count_crossings
+from mpi4py import MPI
+from pinch import ARM, HALF, RADIUS, pinch_scene
+
+import msmpetsc
+from msmpetsc.errors import InputError
+from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.self_contact.contacts import Contacts
+from msmpetsc.model.self_contact.term import SurfaceContact
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.simulate import Simulation
+
+COMM = MPI.COMM_SELF
+GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
+T = 0.01
+pytestmark = pytest.mark.timeout(200)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Model:
+    tables = {"self_contact": {"distance": 1e-3, "friction": 0.5}}
+    return build_model(COMM, load_scene(pinch_scene(tmp_path_factory.mktemp("pinch"), **tables)))
+
+
+def closed(model: Model) -> np.ndarray:
+    """Nodes (n, 3) of the tube with its arms bent together, so that their ends are GAP apart."""
+    q = model.lattice.nodes.copy()
+    end = np.clip(q[:, 2] / ARM, 0, None) ** 2
+    q[:, 0] -= np.sign(q[:, 0]) * (HALF - RADIUS - GAP / 2) * end
+    return q
+
+
+def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray]:
+    """The term of a step in which the left arm slides along the right one by so much [m], and where it ends."""
+    q = closed(model)
+    assert model.collision is not None
+    end = q.copy()
+    end[q[:, 0] < 0, 1] += slid
+    return SurfaceContact(Contacts(COMM, model.collision), q, T), end
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
+def test_gradient_is_that_of_the_energy(model, slid: float):
+    term, q = contact(model, slid)
+    gradient = np.zeros_like(q)
+    term.add_gradient(q, gradient)
+    direction = np.random.default_rng(0).normal(size=q.shape)
+    for step in (1e-7, 1e-8):
+        difference = term.change(q + step * direction, q - step * direction) / (2 * step)
+        assert difference == pytest.approx(np.vdot(gradient, direction), rel=1e-3)
+    assert np.abs(gradient).max() > 0
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-4])
+def test_forces_keep_momentum(model, slid: float):
+    term, q = contact(model, slid)
+    gradient = np.zeros_like(q)
+    term.add_gradient(q, gradient)
+    moments = np.cross(q, gradient).sum(axis=0)
+    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
+    if slid == 0:  # lagged friction acts along where it was
+        assert np.abs(moments).max() < 1e-10 * np.abs(gradient).sum() * HALF
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-7])
+def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: float):
+    term, q = contact(model, slid)
+    hessian, step = term.hessian(q, False), 1e-8
+    assert hessian is not None
+    # the arms come nearer as a whole: where pairs neither turn nor slide nothing is left out
+    direction = np.zeros_like(q)
+    direction[q[:, 0] < 0, 0] = 1.0
+    product, after, before = (np.zeros_like(q) for _ in range(3))
+    hessian.add_product(direction, product)
+    term.add_gradient(q + step * direction, after)
+    term.add_gradient(q - step * direction, before)
+    difference = (after - before) / (2 * step)
+    assert np.linalg.norm(product - difference) < 0.02 * np.linalg.norm(difference)
+    for seed in range(3):
+        v, product = np.random.default_rng(seed).normal(size=q.shape), np.zeros_like(q)
+        hessian.add_product(v, product)
+        assert np.vdot(v, product) > 0
+
+
+def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
+    term, q = contact(model)
+    hessian = term.hessian(q, False)
+    assert hessian is not None
+    node = int(np.abs(hessian.blocks).max(axis=1).argmax())
+    columns = np.empty((3, 3))
+    for c in range(3):
+        unit, product = np.zeros_like(q), np.zeros_like(q)
+        unit[node, c] = 1.0
+        hessian.add_product(unit, product)
+        columns[:, c] = product[node]
+    np.testing.assert_allclose(hessian.blocks[node].reshape(3, 3), columns, rtol=1e-10, atol=1e-12 * columns.max())
+    bound = term.bound(q)
+    assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
+    assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
+
+
+def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
+    term, q = contact(model)
+    through, apart, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
+    through[q[:, 0] < 0, 0] += 2 * GAP
+    apart[q[:, 0] < 0, 0] -= 2 * GAP
+    assert 0.3 < term.free_share(q, through) < 0.5  # they meet halfway
+    assert term.free_share(q, apart) == term.free_share(q, carried) == 1.0
+    far = q.copy()
+    far[q[:, 0] < 0, 0] += 500 * GAP  # many edges, and the ends are apart again
+    assert 0 < term.free_share(q, far) < 1 / 500
+
+
+def positions(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Surface of each frame (T, v, 3) in full precision, its triangles, and the least distances [m]."""
+    with msmpetsc.open(path) as run:
+        surface = np.array([run.embedding @ q for q in run.frames.position[:]])
+        return surface, run.surface.triangles[:], run.frames.self_distance[:]
+
+
+STIFFENING = {"young_modulus": 1e5, "density": 1000, "law": "stiffening"}  # or the arms' ends turn inside out
+
+
+def test_arms_that_close_do_not_cross_on_three_ranks_as_on_one(tmp_path, msmpetsc):
+    scene = pinch_scene(tmp_path, material=STIFFENING, solver={"preset": "newton", "error": 1e-7})
+    without = tmp_path / "without.toml"
+    text = scene.read_text()
+    without.write_text(text[: text.index("[self_contact]")])
+    runs = {"one.h5": (1, scene), "three.h5": (3, scene), "without.h5": (1, without)}
+    for name, (ranks, path) in runs.items():
+        done = msmpetsc(ranks, "run", path, "-o", tmp_path / name, "--frames", 11)
+        assert done.returncode == 0, done.stderr
+    surface, triangles, distance = positions(tmp_path / "one.h5")
+    assert sum(count_crossings(points, triangles) for points in surface) == 0
+    assert 0 < np.nanmin(distance) < 1e-3
+    crossing, triangles, distance = positions(tmp_path / "without.h5")
+    assert count_crossings(crossing[-1], triangles) > 0 and np.isnan(distance).all()
+    others = positions(tmp_path / "three.h5")[0]
+    assert np.abs(others - surface).max() < 1e-5 * np.abs(surface - surface[0]).max()
+
+
+def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
+    friction = {"friction": 0.3, "distance": 1e-3}
+    scene = load_scene(pinch_scene(tmp_path, material=STIFFENING, self_contact=friction), ("time.duration=0.1",))
+    model = build_model(COMM, scene)
+    with Simulation(COMM, scene, model) as simulation:
+        frames = [copy.deepcopy(simulation.saved()) if frame.index == 8 else frame for frame in simulation.frames()]
+    saved, whole = frames[8], frames[9:]
+    with Simulation(COMM, scene, model) as simulation:
+        simulation.restore(saved)
+        resumed = list(simulation.frames())
+    assert whole[0].self_contacts > 0 and len(resumed) == 2
+    for one, other in zip(whole, resumed, strict=True):
+        for name, value in vars(one).items():
+            assert name == "wall_time" or value is None or np.array_equal(value, getattr(other, name), equal_nan=True)
+
+
+def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
+    """Scene of two bars, one of which dips so deep [m] into the other."""
+    first = trimesh.creation.box([0.5, 0.25, 0.25])
+    second = trimesh.creation.box([0.125, 0.125, 0.5])
+    second.apply_translation([0.03, 0.02, 0.125 + 0.25 - deep])
+    for _ in range(subdivisions):
+        first, second = first.subdivide(), second.subdivide()
+    path = block_scene(folder, self_contact={}, time={"step": 0.01, "duration": 0.01})
+    trimesh.util.concatenate([first, second]).export(folder / "scene.ply")
+    return path
+
+
+def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, caplog):
+    path = crossing_boxes(tmp_path, 0.01, 4)
+    model = build_model(COMM, load_scene(path))
+    assert "triangles cut others at rest, the first at (" in caplog.text
+    surface = model.collision.surface
+    assert 0 < len(surface.triangles) < len(model.surface.triangles)
+    assert count_crossings(surface.points, surface.triangles) == 0
+    assert count_crossings(model.surface.points, model.surface.triangles) > 0
+
+
+def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
+    with pytest.raises(InputError, match="too many to do without"):
+        build_model(COMM, load_scene(crossing_boxes(tmp_path, 0.2, 0)))
+
+
+def test_a_coarser_surface_lies_on_the_body(tmp_path):
+    path = pinch_scene(tmp_path, self_contact={"surface": 400})
+    model = build_model(COMM, load_scene(path))
+    surface = model.collision.surface
+    assert 300 < len(surface.triangles) <= 400
+    squares = igl.point_mesh_squared_distance(surface.points, model.surface.points, model.surface.triangles)[0]
+    assert squares.max() < 1e-18
+    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ('time.integrator="verlet"', "is for time.integrator"),
+        ('time.integrator="static"', "is for time.integrator"),
+        ('obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1]}]', "obstacles that reflect"),
+        ("self_contact.distance=0", "self_contact.distance"),
+        ("self_contact.friction=-1", "self_contact.friction"),
+    ],
+)
+def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: str, message: str):
+    path = pinch_scene(tmp_path)
+    with pytest.raises(InputError, match=message):
+        load_scene(path, (override,))
+
+
+def test_presets_of_a_are_refused(tmp_path, msmpetsc):
+    done = msmpetsc(1, "run", pinch_scene(tmp_path), "-o", tmp_path / "out.h5", "--preset", "anderson")
+    assert done.returncode == 2 and "self_contact is for newton's presets, not anderson" in done.stderr

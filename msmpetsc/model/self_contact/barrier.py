@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.self_contact.neighbours import NEAR, neighbours
 
 if TYPE_CHECKING:
     import ipctk
@@ -61,6 +62,13 @@ class Barrier:
         barrier = ipctk.NormalizedClampedLogBarrier()
         self.potential = ipctk.BarrierPotential(barrier, law.distance, law.stiffness)
         self.ccd = ipctk.AdditiveCCD()
+
+    def leave_out_neighbours(self, points: np.ndarray) -> None:
+        """Let no pairs count that are near at rest for being neighbours on the surface; points (p, 3) [m] at rest."""
+        near = NEAR * self.law.distance
+        pairs = neighbours(self.candidates(points, 0.5 * (near - self.law.distance)), self.mesh, points, near)
+        if pairs:
+            self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
 
     def candidates(self, points: np.ndarray, reach: float) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m]."""

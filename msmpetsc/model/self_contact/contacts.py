@@ -87,7 +87,7 @@ class Contacts:
     def __init__(self, comm: MPI.Comm, collision: CollisionSurface):
         self.comm, self.points, self.law = comm, collision.points, collision.law
         self.owned, surface = collision.points.weights.shape[1], collision.surface
-        self.barrier: Barrier | None = on_root(comm, lambda: Barrier(surface, self.law) if surface else None)
+        self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, self.law) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._pairs: Pairs | None = None
         self._moments: list[Moment] = []
@@ -188,3 +188,9 @@ class Contacts:
         if self.barrier:
             share = self.barrier.free_share(start, moved, pairs.candidates if within else None)
         return self.comm.bcast(share)
+
+
+def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:
+    barrier = Barrier(surface, law)
+    barrier.leave_out_neighbours(surface.points)
+    return barrier

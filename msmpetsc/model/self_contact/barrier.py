@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.self_contact.neighbours import NEAR, neighbours
+from msmpetsc.model.self_contact.neighbours import NEAR, NEAR_EDGE, neighbours
 
 if TYPE_CHECKING:
     import ipctk
@@ -65,7 +65,7 @@ class Barrier:
 
     def leave_out_neighbours(self, points: np.ndarray) -> None:
         """Let no pairs count that are near at rest for being neighbours on the surface; points (p, 3) [m] at rest."""
-        near = NEAR * self.law.distance
+        near = max(NEAR * self.law.distance, NEAR_EDGE * self.edge)
         pairs = neighbours(self.candidates(points, 0.5 * (near - self.law.distance)), self.mesh, points, near)
         if pairs:
             self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)

@@ -8,6 +8,7 @@ without a single point's being computed.
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 from mpi4py import MPI
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import ipctk
 
 REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
-FARTHEST = 0.25  # edges that a point may move before pairs are looked for anew: with more there are too many pairs
+FARTHEST = 0.1  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
 AHEAD = 2.0  # times the move that is expected
 
 
@@ -96,7 +97,7 @@ class Contacts:
         """Make ready for a step from q to about ``end``: look for pairs anew unless the known ones serve."""
         if self._pairs and max(self._moved(q, self._pairs), self._moved(end, self._pairs)) <= self._pairs.reach:
             return
-        self._look(q, AHEAD * self._farthest(end[: self.owned] - q[: self.owned]))
+        self._look(q, AHEAD * self._farthest(end, q))
 
     def _look(self, q: np.ndarray, reach: float) -> Pairs:
         """Look for pairs at q."""
@@ -111,11 +112,12 @@ class Contacts:
 
     def _moved(self, q: np.ndarray, pairs: Pairs) -> float:
         """Return no less than how far any point at q is from where the pairs were looked for [m]."""
-        return self._farthest(q[: self.owned] - pairs.q)
+        return self._farthest(q, pairs.q)
 
-    def _farthest(self, moved: np.ndarray) -> float:
-        """Return no less than how far displacements (owned, 3) [m] of nodes move any point, but for a translation."""
-        ends = np.concatenate([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
+    def _farthest(self, end: np.ndarray, start: np.ndarray) -> float:
+        """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
+        ends = np.full(6, -np.inf)
+        _extend(end[: self.owned], start, ends)
         if self.comm.size > 1:
             most = np.empty_like(ends)
             self.comm.Allreduce(ends, most, MPI.MAX)
@@ -188,6 +190,15 @@ class Contacts:
         if self.barrier:
             share = self.barrier.free_share(start, moved, pairs.candidates if within else None)
         return self.comm.bcast(share)
+
+
+@numba.njit(cache=True)
+def _extend(end, start, ends):
+    """Extend the greatest displacements along the axes and against them, ends (6,)."""
+    for i in range(len(end)):
+        for c in range(3):
+            moved = end[i, c] - start[i, c]
+            ends[c], ends[3 + c] = max(ends[c], moved), max(ends[3 + c], -moved)
 
 
 def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:

@@ -160,7 +160,7 @@ class SurfaceContact:
         return touched, csr_array(whole[numbers][:, numbers])
 
     def bound(self, q: np.ndarray) -> np.ndarray:
-        """Return (owned,) [N/m] no less than each node's block of the projected Hessian: powers of 4, which change seldom."""
+        """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
         hessian = self.hessian(q, True)
         if hessian is None:
             return np.zeros(self.contacts.owned)

@@ -30,6 +30,13 @@ FALLS = 30, ("mesh.base=[0, 0, 0.0005]",)  # 0.5 mm above the ground: there afte
 DRAGS = 6, ()
 # Steps, and what is changed so that these few show what the scene is about.
 SETTINGS = {
+    "armadillo_fold": (
+        6,
+        (
+            "self_contact.surface=2000",
+            *(f"anchor.{side}.path.0={{time=0.12, by=[{by}, -0.05, 0]}}" for side, by in ((0, -0.04), (1, 0.04))),
+        ),
+    ),
     "armadillo_forehead": DRAGS,
     "armadillo_leg": DRAGS,
     "armadillo_palm": DRAGS,
@@ -37,6 +44,7 @@ SETTINGS = {
     "bunny_fall": FALLS,
     "dragon_raise_push": (6, ("force.0.stop=0.16", "force.1.start=0.16")),
     "heart_pull": (10, ("anchor.0.path.0.time=0.08", "anchor.0.stop=0.12")),
+    "lung_press_contact": (6, ("self_contact.surface=2000", "obstacle.1.path.0={time=0.08, by=[0, 0, -0.04]}")),
     "lung_press": (6, ("obstacle.1.path.0={time=0.08, by=[0, 0, -0.04]}",)),
 }
 

@@ -1,9 +1,11 @@
 """Surface meshes: measured, and checked to enclose a volume."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
 # Coordinates are often stored in single precision (1.2e-7): thinner than this, relative to its
@@ -21,6 +23,15 @@ class Surface:
 
     points: np.ndarray
     triangles: np.ndarray
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface | None:
+    """Return surfaces as one, one after the other; None for none."""
+    if len(surfaces) < 2:
+        return next(iter(surfaces), None)
+    first = starts(np.array([len(surface.points) for surface in surfaces]))
+    triangles = [surface.triangles + number for surface, number in zip(surfaces, first, strict=True)]
+    return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
 
 
 def bounds_of(surface: Surface) -> np.ndarray:

@@ -7,14 +7,14 @@ from functools import cached_property, reduce
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import log, on_root, starts
+from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
-from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, examine
+from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, examine, joined
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
@@ -199,15 +199,6 @@ def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
         for warning in warnings:
             log.warning("%s%s: %s", whose, mesh.source, warning)
         yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
-
-
-def joined(surfaces: Sequence[Surface]) -> Surface | None:
-    """Return surfaces as one, one after the other; None for none."""
-    if len(surfaces) < 2:
-        return next(iter(surfaces), None)
-    first = starts(np.array([len(surface.points) for surface in surfaces]))
-    triangles = [surface.triangles + number for surface, number in zip(surfaces, first, strict=True)]
-    return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
 
 
 def _check_in_range(surface: Surface) -> None:

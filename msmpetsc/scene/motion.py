@@ -176,8 +176,7 @@ class SelfContactTable(Table):
 
     distance: Positive | None = Field(
         None,
-        description="parts nearer than this push each other [m]; a thousandth of the rest bounding box's diagonal "
-        "if absent",
+        description="parts nearer than this push each other [m]; 3e-4 of the rest bounding box's diagonal if absent",
     )
     friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
     surface: int | None = Field(

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import on_host, to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, to_device
@@ -119,6 +119,8 @@ class Simulation:
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, probes: Probes = Probes()):
         model = to_device(model, sender(comm))
+        if model.collision and not on_host(model.lattice.nodes):
+            raise InputError("self_contact is computed on CPUs: --device cpu")
         self.comm, self.model, self.probes, self.time_step = comm, model, probes, scene.time.step
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until

@@ -224,7 +224,7 @@ class Contact:
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
-        Their Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
+        The Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
         the centre is pressed the true block has -k d / r across the normal, too, which is left out.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true

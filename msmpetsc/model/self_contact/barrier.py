@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.self_contact.neighbours import NEAR, NEAR_EDGE, neighbours
+from msmpetsc.model.self_contact.neighbours import neighbours
 
 if TYPE_CHECKING:
     import ipctk
@@ -63,12 +63,13 @@ class Barrier:
         self.potential = ipctk.BarrierPotential(barrier, law.distance, law.stiffness)
         self.ccd = ipctk.AdditiveCCD()
 
-    def leave_out_neighbours(self, points: np.ndarray) -> None:
-        """Let no pairs count that are near at rest for being neighbours on the surface; points (p, 3) [m] at rest."""
-        near = max(NEAR * self.law.distance, NEAR_EDGE * self.edge)
-        pairs = neighbours(self.candidates(points, 0.5 * (near - self.law.distance)), self.mesh, points, near)
+    def leave_out_neighbours(self, points: np.ndarray) -> int:
+        """Let no pairs of points count that are near at rest for being neighbours on the surface, points (p, 3) [m] at
+        rest; how many these are."""
+        pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
         if pairs:
             self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
+        return len(pairs)
 
     def candidates(self, points: np.ndarray, reach: float) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m]."""

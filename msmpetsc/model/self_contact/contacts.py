@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.comm import on_root
+from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw
@@ -203,5 +203,10 @@ def _extend(end, start, ends):
 
 def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:
     barrier = Barrier(surface, law)
-    barrier.leave_out_neighbours(surface.points)
+    if left_out := barrier.leave_out_neighbours(surface.points):
+        log.info(
+            "self_contact: %d pairs of points in creases of the surface are nearer than self_contact.distance = %.3g m "
+            "at rest: they are left out, and may cross; a smaller distance leaves out fewer",
+            left_out, law.distance,
+        )  # fmt: skip
     return barrier

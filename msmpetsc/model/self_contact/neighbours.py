@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import ipctk
 
 RINGS = 3  # of triangles
-NEAR, NEAR_EDGE = 2.0, 0.25  # times dhat, and edges: what bends a little does not begin to push either
 
 
 def neighbours(

@@ -1,5 +1,7 @@
 """The surface that meets itself: the body's own or a coarser one, without the triangles that cut others at rest."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 
@@ -8,7 +10,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import compact, simplify
-from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.barrier import BarrierLaw, crossings
 from msmpetsc.model.self_contact.contacts import CollisionSurface
@@ -16,25 +18,26 @@ from msmpetsc.model.self_contact.points import SurfacePoints
 from msmpetsc.scene.motion import SelfContactTable
 from msmpetsc.scene.schema import Scene
 
-NEAR = 1e-3  # of the bounding box's diagonal: the distance, if none is given
+NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
 STICK = 1e-2  # longest sides a second: friction holds but for a creep below this, as an obstacle's does
 MOST_CUT = 0.1  # of all triangles: with more of them out little would keep the rest apart
+FEWEST = 20  # triangles of a body
 PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (model.material)
 
 
 def collision_surface(
-    comm: MPI.Comm, table: SelfContactTable, scene: Scene, body: Body, cages: Cages, lattice: Lattice
+    comm: MPI.Comm, table: SelfContactTable, scene: Scene, bodies: Sequence[Body], cages: Cages, lattice: Lattice
 ) -> CollisionSurface:
-    """Return the surface that meets itself (collective). Raises InputError where more than a tenth of it cuts
-    itself."""
-    surface = on_root(comm, lambda: _prepared(body.surface, table.surface))
-    points = np.empty((0, 3)) if surface is None else surface.points
+    """Return the surface of all bodies that meets itself (collective). Raises InputError where more than a tenth of it
+    cuts itself."""
+    surfaces = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table.surface))
+    points = [surface.points for surface in surfaces or ()] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
-    sides = body.bounds[1] - body.bounds[0]
+    sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
     distance = table.distance or NEAR * float(np.linalg.norm(sides))
     stiffness = _stiffness(comm, lattice, distance, scene.time.step)
     law = BarrierLaw(distance, stiffness, table.friction, STICK * float(sides.max()))
-    return CollisionSurface(surface, SurfacePoints(comm, lattice, embedding), law)
+    return CollisionSurface(joined(surfaces or ()), SurfacePoints(comm, lattice, embedding), law)
 
 
 def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: float) -> float:
@@ -49,23 +52,26 @@ def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: flo
     return distance**2 * layer
 
 
-def _prepared(surface: Surface | None, triangles: int | None) -> Surface | None:
-    """Return the surface of about so many triangles, all of them if None, without those that cut others."""
-    if surface is None:
-        return None
+def _prepared(bodies: list[Surface], triangles: int | None) -> list[Surface]:
+    """Return the bodies' surfaces, of about so many triangles together, all of them if None, without those that cut
+    others."""
     if triangles is not None:
-        surface = _coarser(surface, triangles)
-    cut = crossings(surface)
+        share = triangles / sum(len(body.triangles) for body in bodies)
+        bodies = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
+    whole = joined(bodies)
+    assert whole is not None
+    cut = crossings(whole)
     if len(cut) == 0:
-        return surface
-    points = surface.points[surface.triangles[cut]]
-    share = len(cut) / len(surface.triangles)
-    at = ", ".join(f"{c:.4g}" for c in points[0].mean(axis=0))
-    what = f"self_contact: {len(cut)} of {len(surface.triangles)} triangles cut others at rest, the first at ({at}) m"
-    if share > MOST_CUT:
+        return bodies
+    at = ", ".join(f"{c:.4g}" for c in whole.points[whole.triangles[cut[0]]].mean(axis=0))
+    what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at ({at}) m"
+    if len(cut) > MOST_CUT * len(whole.triangles):
         raise InputError(f'{what}: too many to do without; mesh.prepare = ["union"] or "repair" may mend the mesh')
     log.warning("%s: they are left out, and may be crossed", what)
-    return compact(surface.points, np.delete(surface.triangles, cut, axis=0))
+    of_body = np.split(
+        ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
+    )
+    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
 
 
 def _coarser(surface: Surface, triangles: int) -> Surface:

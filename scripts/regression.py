@@ -30,13 +30,6 @@ FALLS = 30, ("mesh.base=[0, 0, 0.0005]",)  # 0.5 mm above the ground: there afte
 DRAGS = 6, ()
 # Steps, and what is changed so that these few show what the scene is about.
 SETTINGS = {
-    "armadillo_fold": (
-        6,
-        (
-            "self_contact.surface=2000",
-            *(f"anchor.{side}.path.0={{time=0.12, by=[{by}, -0.05, 0]}}" for side, by in ((0, -0.04), (1, 0.04))),
-        ),
-    ),
     "armadillo_forehead": DRAGS,
     "armadillo_leg": DRAGS,
     "armadillo_palm": DRAGS,

@@ -93,7 +93,7 @@ def skip_without_mesh(name: str) -> None:
 
 
 def test_every_scene_has_the_papers_cells_and_four_moments():
-    assert len(ALL) == 10
+    assert len(ALL) == 9
     for name in ALL:
         scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
         assert scene.cages.count == PAPER_CELLS[name.split("_")[0]]

@@ -12,6 +12,7 @@ import trimesh
 ROOT = Path(__file__).parent.parent
 WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+os.environ.update(AS_ROOT)  # for what the program itself starts by mpiexec, called within a test
 SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}  # more ranks than cores: who waits makes room
 # Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with IPv6; ranks of one machine need none
 ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}

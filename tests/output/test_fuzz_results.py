@@ -34,7 +34,7 @@ def read_all(path: Path) -> None:
 
 
 def compared(one: Path, other: Path) -> None:
-    compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, fields=None, shared=False))
+    compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, fields=None, shared=False, json=False))
 
 
 NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]

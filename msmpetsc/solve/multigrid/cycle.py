@@ -128,9 +128,7 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation)
-            restriction = PETSc.Mat().createTranspose(level.interpolation)  # of a square P PETSc cannot tell it
-            pc.setMGRestriction(top - i, restriction)
-            self.owned.callback(restriction.destroy)
+            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(level.matrix, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
@@ -138,6 +136,18 @@ class Multigrid:
         finest.setOperators(self.operator, self.operator)
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
+
+    def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
+        """P^T; of a square P its own, for by its shape alone PETSc cannot tell it from P."""
+        rows, columns = interpolation.getSizes()
+        restriction = PETSc.Mat()
+        if rows[1] == columns[1]:
+            restriction.createPython((columns, rows), Restriction(interpolation), interpolation.comm)
+            restriction.setUp()
+        else:
+            restriction.createTranspose(interpolation)
+        self.owned.callback(restriction.destroy)
+        return restriction
 
     def _read_options(self) -> None:
         """Follow PETSc's options; the user's win. A preset's may say what it begins with, not that it is a PCMG. The
@@ -151,6 +161,19 @@ class Multigrid:
 
     def destroy(self) -> None:
         self.owned.close()
+
+
+class Restriction:
+    """P^T (a MATPYTHON context), whichever way PETSc applies it: of a square one 3.18 takes the matrix, 3.22 its
+    transpose."""
+
+    def __init__(self, interpolation: PETSc.Mat):
+        self.interpolation = interpolation
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.interpolation.multTranspose(x, y)
+
+    multTranspose = mult
 
 
 def _possible(asked: int, coarse: int) -> str:

@@ -24,7 +24,7 @@ from msmpetsc.solve.multigrid.bodies import bodies_of
 from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
-from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
+from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev, square_restricts_transposed
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
@@ -138,14 +138,11 @@ class Multigrid:
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
     def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
-        """P^T; of a square P its own, for by its shape alone PETSc cannot tell it from P."""
+        """P^T, or what PETSc takes for it: by its shape alone it cannot tell a square P."""
         rows, columns = interpolation.getSizes()
-        restriction = PETSc.Mat()
-        if rows[1] == columns[1]:
-            restriction.createPython((columns, rows), Restriction(interpolation), interpolation.comm)
-            restriction.setUp()
-        else:
-            restriction.createTranspose(interpolation)
+        if rows[1] == columns[1] and square_restricts_transposed():
+            return interpolation
+        restriction = PETSc.Mat().createTranspose(interpolation)
         self.owned.callback(restriction.destroy)
         return restriction
 
@@ -161,19 +158,6 @@ class Multigrid:
 
     def destroy(self) -> None:
         self.owned.close()
-
-
-class Restriction:
-    """P^T (a MATPYTHON context), whichever way PETSc applies it: of a square one 3.18 takes the matrix, 3.22 its
-    transpose."""
-
-    def __init__(self, interpolation: PETSc.Mat):
-        self.interpolation = interpolation
-
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.interpolation.multTranspose(x, y)
-
-    multTranspose = mult
 
 
 def _possible(asked: int, coarse: int) -> str:

@@ -4,6 +4,7 @@ import ctypes
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 import numpy as np
 from petsc4py import PETSc
@@ -92,6 +93,23 @@ def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
     (KSPChebyshevSetEigenvalues)."""
     bounds = ctypes.c_double(greatest), ctypes.c_double(least)
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
+
+
+@cache
+def square_restricts_transposed() -> bool:
+    """Whether MatRestrict applies a square matrix transposed, as that of PETSc 3.22 does, or as it is, as in 3.18."""
+    matrix = PETSc.Mat().createAIJ((2, 2), comm=PETSc.COMM_SELF)
+    matrix.setUp()
+    matrix[0, 1] = 1.0
+    matrix.assemble()
+    x, y = matrix.createVecs()
+    x[0] = 1.0
+    x.assemble()
+    _check(petsc_library().MatRestrict(*(ctypes.c_void_p(each.handle) for each in (matrix, x, y))))
+    is_transposed = bool(y[1])
+    for owned in (matrix, x, y):
+        owned.destroy()
+    return is_transposed
 
 
 def _address(array: np.ndarray) -> ctypes.c_void_p:

@@ -30,10 +30,13 @@ def _count(points, edges, triangles):
         for c in range(3):
             x, y, z = points[triangles[f, 0], c], points[triangles[f, 1], c], points[triangles[f, 2], c]
             low[f, c], high[f, c] = min(x, y, z), max(x, y, z)
+    order = np.argsort(low[:, 0])
+    begins, widest = low[order, 0], (high[:, 0] - low[:, 0]).max()
     for e in range(len(edges)):
         a, b = edges[e]
         p, q = points[a], points[b]
-        for f in range(len(triangles)):
+        first = np.searchsorted(begins, min(p[0], q[0]) - widest)
+        for f in order[first : np.searchsorted(begins, max(p[0], q[0]), side="right")]:
             i, j, k = triangles[f]
             apart = a in (i, j, k) or b in (i, j, k)
             for c in range(3):

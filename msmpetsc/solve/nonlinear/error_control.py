@@ -19,7 +19,7 @@ DEFAULT_ERROR = 1e-3
 FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left to tell by
 KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
-UNIFORM_RATIO = 30.0  # at least, with multigrid: an estimate that is too early is the next solve's start
+LEAST_RATIO = 10.0  # taken, however near they were: an estimate that comes too early is the next solve's start
 EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
@@ -90,7 +90,7 @@ class ErrorControl:
         if not distance > 0 or not np.isfinite(now.residual):  # the start x = y tells nothing yet
             return 0.0 if now.at_rounding else np.inf
         now.bound = now.residual / distance
-        if now.bound > max(self.ratio, 10.0) * now.early * now.goal and not now.at_rounding:
+        if now.bound > max(self.ratio, LEAST_RATIO) * now.early * now.goal and not now.at_rounding:
             return now.bound
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature

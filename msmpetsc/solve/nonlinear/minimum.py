@@ -84,7 +84,7 @@ class Minimum:
             return self.examine(x, self._estimate_closely(x), compression, alarmed, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Examination(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
-        return Examination(self._second_estimate(nearer, rest, enough, value))
+        return Examination(self._second_estimate(nearer, first, rest, enough, value))
 
     def _estimate_closely(self, x: PETSc.Vec) -> bool:
         """Estimate the error of x without an early end, which says little where g is hardly convex; whether it could be
@@ -102,11 +102,14 @@ class Minimum:
         self.estimate.residual.aypx(-1.0, self.f)
         return self.functional.dual_norm(self.estimate.residual)
 
-    def _second_estimate(self, nearer: Iterate, bound: float, enough: float, lowest: float) -> float:
-        """Estimate the error of x by both corrections. Where the second cannot be had, as CG breaks down on an F of
-        little but rounding, what bounds it has its place if the curvature allows; else the error is infinite."""
+    def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
+        """Estimate the error of x by both corrections, of which the first has the length ``first``.
+
+        Where the second cannot be had, as CG breaks down on an F of little but rounding, what bounds it has its place
+        if the curvature allows; else the error is infinite.
+        """
         functional, correction, relative = self.functional, self.estimate.correction, self.rounding.relative
-        first, distance = functional.norm(self.first), functional.distance(nearer.q)
+        distance = functional.distance(nearer.q)
         will_do = KNOWN * enough - first if lowest > CONVEX else 0.0
         second = self.estimate(nearer, bound, enough, will_do, lowest)
         if not np.isfinite(second):

@@ -19,7 +19,6 @@ import pooch
 
 from msmpetsc.errors import InputError, nearest, printable
 from msmpetsc.geometry.prepare import prepare
-from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
 
 MESH_DIR = "MSMPETSC_MESH_DIR"
@@ -90,6 +89,8 @@ def locate(source: str, folder: str | Path) -> Path:
 
 def load(source: str, folder: str | Path) -> Surface:
     """Return the surface of a registry name or a path; a name's original after the model's own steps."""
+    from msmpetsc.geometry.readers import read_surface  # and trimesh: a third of a second for the one rank that reads
+
     if source not in MODELS:
         return read_surface(locate(source, folder))
     file = _require(source)

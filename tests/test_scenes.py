@@ -228,7 +228,7 @@ def test_on_two_ranks_the_lung_is_pressed_alike(result):
 # ---- Figure 11
 
 
-@pytest.mark.parametrize("name", ["bunny_fall", "brain_fall"])
+@pytest.mark.parametrize("name", ["bunny_fall", pytest.param("brain_fall", marks=pytest.mark.slow)])
 def test_it_falls_freely_hits_the_ground_and_leaps(result, name: str):
     run = result(name)
     gravity, t = np.array(run.scene.gravity.acceleration), run.scene.time.step

@@ -8,13 +8,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from msmpetsc.api.simulation import Simulation, frames
-    from msmpetsc.extensions import register_force, register_preset
+    from msmpetsc.extensions import register_force, register_obstacle, register_preset
     from msmpetsc.model.fields import Frame
     from msmpetsc.output.reader import Result
     from msmpetsc.scene.schema import Scene
 
 __version__ = "0.1.0"
-__all__ = ["Frame", "Result", "Scene", "Simulation", "frames", "open", "register_force", "register_preset", "run"]
+__all__ = [
+    "Frame",
+    "Result",
+    "Scene",
+    "Simulation",
+    "frames",
+    "open",
+    "register_force",
+    "register_obstacle",
+    "register_preset",
+    "run",
+]
 FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
     "Frame": "msmpetsc.model.fields",
     "Result": "msmpetsc.output.reader",
@@ -22,6 +33,7 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
     "Simulation": "msmpetsc.api.simulation",
     "frames": "msmpetsc.api.simulation",
     "register_force": "msmpetsc.extensions",
+    "register_obstacle": "msmpetsc.extensions",
     "register_preset": "msmpetsc.extensions",
 }
 

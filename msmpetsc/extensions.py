@@ -1,4 +1,4 @@
-"""What users add by name: presets and forces, registered in Python or installed under an entry point.
+"""What users add by name: presets, forces and obstacles, registered in Python or installed under an entry point.
 
 A scene file can only name what was registered or installed: nothing in a file is run.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from msmpetsc.errors import InputError, did_you_mean
 
 ForceFunction = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+DistanceFunction = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 T = TypeVar("T")
 
 
@@ -48,6 +49,7 @@ class Extensions(Generic[T]):
 
 
 FORCES: Extensions[ForceFunction] = Extensions("force")
+OBSTACLES: Extensions[DistanceFunction] = Extensions("obstacle")
 PRESETS: Extensions[Mapping[str, Any]] = Extensions("preset")
 
 
@@ -58,6 +60,15 @@ def register_force(name: str, function: ForceFunction) -> None:
         returns the force on each per its mass, (k, 3) [N/kg]. It is called once a step, with the state that starts it
     """
     FORCES.register(name, function)
+
+
+def register_obstacle(name: str, function: DistanceFunction) -> None:
+    """Give a solid a name, which ``[[obstacle]] shape = "function", function = "name"`` then means; on all ranks.
+
+    function : of positions (k, 3) [m], at the obstacle's place at time 0; returns the signed distances to its surface
+        (k,) [m], negative within, and their gradients (k, 3), of length 1. It is called many times a step
+    """
+    OBSTACLES.register(name, function)
 
 
 def register_preset(name: str, options: Mapping[str, Any], based_on: str = "newton", about: str = "") -> None:

@@ -1,7 +1,7 @@
 """From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -15,6 +15,7 @@ from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import compact, prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, examine, joined
+from msmpetsc.model.contact.build import build_obstacles, surfaces_of
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
@@ -63,6 +64,7 @@ class Model:
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
+    solids: dict[int, Surface] = field(default_factory=dict)
 
     @property
     def body_of_point(self) -> np.ndarray:
@@ -122,6 +124,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
+    obstacles = build_obstacles(comm, scene, lattice, outside)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=lattice,
@@ -129,8 +132,8 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         loads=_loads(comm, scene, lattice, masks),
         own_forces=_own_forces(scene, lattice, masks),
         anchors=anchors,
-        reflections=_reflections(scene, outside),
-        penalties=_penalties(comm, scene, lattice, finder.bounds, outside),
+        reflections=_reflections(scene, obstacles),
+        penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
@@ -138,6 +141,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         else None,
         reaches=reaches,
         damping=scene.material.damping,
+        solids=surfaces_of(comm, obstacles, finder.bounds),
     )
 
 
@@ -146,10 +150,6 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
 
     What only prepares steps stays in the memory of the CPU.
     """
-
-    def sent(obstacle: Obstacle) -> Obstacle:
-        outside = None if obstacle.outside is None else send(obstacle.outside)
-        return replace(obstacle, points=send(obstacle.points), normals=send(obstacle.normals), outside=outside)
 
     lattice, (positions, velocities) = model.lattice, model.start
     return replace(
@@ -163,8 +163,8 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
         ),
         loads=[replace(load, force=send(load.force)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
-        reflections=[replace(contact, obstacle=sent(contact.obstacle)) for contact in model.reflections],
-        penalties=[replace(contact, obstacle=sent(contact.obstacle)) for contact in model.penalties],
+        reflections=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.reflections],
+        penalties=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties],
         start=(send(positions), send(velocities)),
     )
 
@@ -288,21 +288,19 @@ def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForc
     return tuple(forces)
 
 
-def _reflections(scene: Scene, outside: np.ndarray | None) -> list[Reflection]:
+def _reflections(scene: Scene, obstacles: list[Obstacle]) -> list[Reflection]:
     return [
-        Reflection(Obstacle.of(o, f"obstacle.{number}", outside), 1.0 if o.restitution is None else o.restitution)
-        for number, o in enumerate(scene.obstacle)
-        if o.response == "reflect"
+        Reflection(obstacle, 1.0 if table.restitution is None else table.restitution)
+        for obstacle, table in zip(obstacles, scene.obstacle, strict=True)
+        if table.response == "reflect"
     ]
 
 
 def _penalties(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray, outside: np.ndarray | None
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray, obstacles: list[Obstacle]
 ) -> list[Penalty]:
-    pressing = [(f"obstacle.{number}", o) for number, o in enumerate(scene.obstacle) if o.response == "penalty"]
+    pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response == "penalty"]
     if not pressing:
         return []
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
-    return [
-        Penalty(Obstacle.of(o, key, outside), o.stiffness or usual, o.friction or 0.0, stick) for key, o in pressing
-    ]
+    return [Penalty(obstacle, o.stiffness or usual, o.friction or 0.0, stick) for obstacle, o in pressing]

@@ -18,7 +18,7 @@ class Environment:
     """Loads, anchors and obstacles of a model. An implicit step asks once for its end, an explicit one in each substep.
 
     Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
-    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (obstacle.side_of): the
+    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (faces.side_of): the
     penalties' first, then the reflections'.
     """
 
@@ -225,9 +225,8 @@ class Environment:
         for p, side in self._pressing(time, sides):
             way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
             if way.any():
-                inside, face = p.obstacle.depths(q, time, side)
-                along = p.obstacle.along(q, time, face, way)
-                power += p.stiffness / (end - begin) * float(np.maximum(inside, 0) @ along)
+                _, depth, normal = p.at(time, side).pressed(q)
+                power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
         return power
 
     def energy_of_new_obstacles(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:

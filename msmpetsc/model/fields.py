@@ -22,6 +22,8 @@ SIZES = {
     "e": "weights",
     "k": "numbers",
     "o": "obstacles",
+    "m": "points of obstacles",
+    "h": "triangles of obstacles",
 }
 
 
@@ -108,6 +110,11 @@ SURFACE = {
     "triangles": Field("i8", ("f", 3), "1", "corner points of a triangle"),
     "body": Field("i4", ("v",), "1", "number of a point's body, where there are several"),
 }
+OBSTACLE = {  # those that are meshes or functions: a scene gives of them but a file or a name
+    "points": Field("f8", ("m", 3), "m", "points of obstacles' surfaces at time 0"),
+    "triangles": Field("i8", ("h", 3), "1", "corner points of a triangle of an obstacle"),
+    "number": Field("i4", ("h",), "1", "number of a triangle's obstacle in the scene"),
+}
 EMBEDDING = {  # W (v, n) in CSR form: surface points = W @ node positions
     "indptr": Field("i8", ("r",), "1", "where a point's weights begin"),
     "indices": Field("i8", ("e",), "1", "node of a weight"),
@@ -133,6 +140,7 @@ CHECKPOINT = {  # two slots, of which the one with the greater step holds
 GROUPS = {
     "lattice": LATTICE,
     "surface": SURFACE,
+    "obstacle": OBSTACLE,
     "embedding": EMBEDDING,
     "frames": FRAME_FIELDS,
     "checkpoint": CHECKPOINT,

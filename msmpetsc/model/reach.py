@@ -17,7 +17,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import SAME, Anchor, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene.motion import Force, ObstacleTable, Time
+from msmpetsc.scene.motion import Force, Time
+from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.schema import Scene
 
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool

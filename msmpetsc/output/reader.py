@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from msmpetsc.errors import InputError, one_line, printable
-from msmpetsc.model.fields import FIELDS, FRAME_FIELDS, GROUPS
+from msmpetsc.model.fields import FIELDS, FRAME_FIELDS
 from msmpetsc.output.lazy import Arrays, LazyArray, xarray_variable
 from msmpetsc.scene.toml import toml_of
 
@@ -63,7 +63,8 @@ class Result:
         except BaseException:
             self.close()
             raise
-        self.lattice, self.surface, self._embedding, self.frames, self._checkpoint = map(self._group, GROUPS)
+        self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
+        self.frames, self._checkpoint = map(self._group, ("frames", "checkpoint"))
 
     def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
         count = finished(self.file)

@@ -1,4 +1,4 @@
-"""Tables of what moves the body: time, its start, gravity, obstacles, pins, anchors, forces."""
+"""Tables of what moves the body: time, its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
 from typing import Annotated, Any, Literal
@@ -20,7 +20,6 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.statics import no_wait
 from msmpetsc.scene.values import (
-    Box,
     Direction,
     FunctionName,
     Integrator,
@@ -28,7 +27,6 @@ from msmpetsc.scene.values import (
     NotNegative,
     Positive,
     Table,
-    UnitVector,
     Vector,
     after_start,
     only_for,
@@ -130,45 +128,6 @@ Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
 
 
 PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
-
-
-class ObstacleTable(Table):
-    """What nodes bounce off or are pressed by: a plane, a box or a sphere; it may move, and act for a while only."""
-
-    shape: Literal["plane", "box", "sphere"] = Field(description="kind of obstacle")
-    point: Vector | None = Field(None, description="a point of the plane [m]")
-    normal: UnitVector | None = Field(
-        None, description="of the plane, towards its free side, normalised on reading [-]"
-    )
-    box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
-    center: Vector | None = Field(None, description="of the sphere [m]")
-    radius: Positive | None = Field(None, description="of the sphere [m]")
-    path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
-    start: NotNegative = Field(0.0, description="is there from this time [s]")
-    stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
-    response: Literal["reflect", "penalty"] = Field("reflect", description="what happens on touching")
-    restitution: float | None = Field(
-        None, ge=0, le=1, description='of "reflect": normal speed after over before the impact; 1 if absent [-]'
-    )
-    stiffness: Positive | None = Field(
-        None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
-    )
-    friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
-
-    _after_start = field_validator("stop")(after_start)
-
-    @model_validator(mode="after")
-    def _fits_together(self) -> "ObstacleTable":
-        needed = {"plane": ("point", "normal"), "box": ("box",), "sphere": ("center", "radius")}
-        missing = [name for name in needed[self.shape] if getattr(self, name) is None]
-        if missing:
-            raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
-        uses = {name: shape for shape, names in needed.items() for name in names}
-        uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
-        for name, use in uses.items():
-            if getattr(self, name) is not None and use not in (self.shape, self.response):
-                raise rule(f"has {name}, which is for {use!r} only")
-        return self
 
 
 class SelfContactTable(Table):

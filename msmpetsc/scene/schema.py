@@ -19,7 +19,8 @@ from msmpetsc.scene.bodies import (
     tables_of,
 )
 from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable
-from msmpetsc.scene.motion import AnchorTable, Force, Gravity, ObstacleTable, Pin, SelfContactTable, Start, Time
+from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactTable, Start, Time
+from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.problems import KeyPath
 from msmpetsc.scene.self_contact import only_implicit
 from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion
@@ -133,7 +134,8 @@ class SceneFile(Table):
 
     def named_files(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
         """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
-        for path, mesh in self.meshes.items():
+        solids = {("obstacle", number, "mesh"): o.mesh for number, o in enumerate(self.obstacle) if o.mesh is not None}
+        for path, mesh in (self.meshes | solids).items():
             yield (*path, "source"), mesh.source
         for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):
             if isinstance(table.region.painted, str):

@@ -114,12 +114,12 @@ def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
     step = 1e-7
     slope = (gradient(contact, q + step * v) - gradient(contact, q - step * v)) / (2 * step)
     nodes, blocks = hessian(contact, q, true=True)
-    out = q[nodes] - BALL.points[0]
+    out = q[nodes] - BALL.solid.center
     r = np.linalg.norm(out, axis=1)
     across = np.eye(3) - np.einsum("ai,aj->aij", out, out) / r[:, None, None] ** 2
-    blocks = blocks - (300.0 * (BALL.radius - r) / r)[:, None, None] * across
+    blocks = blocks - (300.0 * (BALL.solid.radius - r) / r)[:, None, None] * across
     np.testing.assert_allclose(np.einsum("aij,aj->ai", blocks, v[nodes]), slope[nodes], atol=1e-5 * np.abs(slope).max())
-    assert len(nodes) > 5 and (r < BALL.radius).all()
+    assert len(nodes) > 5 and (r < BALL.solid.radius).all()
 
 
 @cases

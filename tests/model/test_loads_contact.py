@@ -13,6 +13,7 @@ from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.reflection import Reflection
+from msmpetsc.model.contact.solids import Faces
 from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import Load, Motion, spread_by_mass
 from msmpetsc.model.region import inside
@@ -107,7 +108,7 @@ STILL = Motion.through(())
 
 def reflect(q, q_previous, point, normal, e):
     """At a plane at rest."""
-    return Reflection(Obstacle(point[None], normal[None], STILL), e).reflect(q, q_previous, 1.0, 0.1)
+    return Reflection(Obstacle(Faces(point[None], normal[None]), STILL), e).reflect(q, q_previous, 1.0, 0.1)
 
 
 def test_reflect_reverses_only_what_goes_into_the_plane():

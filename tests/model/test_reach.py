@@ -245,13 +245,13 @@ import logging, sys
 import numpy as np
 from msmpetsc.backend.compiling import cache_is_empty, compilation_logged
 empty = cache_is_empty()
-from msmpetsc.model.contact.obstacle import depth
+from msmpetsc.model.contact.faces import depth
 from msmpetsc.comm import log
 log.addHandler(logging.StreamHandler(sys.stdout))
 log.setLevel(logging.INFO)
 with compilation_logged(empty):
     for kind in sys.argv[1:]:
-        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0, 0.0, 0.0)
+        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0)
 """
 
 

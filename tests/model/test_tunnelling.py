@@ -15,7 +15,6 @@ from obstacles import box
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
-from msmpetsc.model.contact.obstacle import depths
 from msmpetsc.model.contact.penalty import Contact, Penalty
 from msmpetsc.model.contact.reflection import Reflection
 from msmpetsc.model.environment import Environment
@@ -42,7 +41,7 @@ places = arrays(float, 3, elements=st.integers(-40, 40).map(lambda x: x / 16 + 0
 def test_the_side_is_the_face_that_a_way_first_goes_through(start: np.ndarray, end: np.ndarray):
     """Against 4001 places of the way; grazed corners, which they may miss, are left out."""
     way = start + np.linspace(0, 1, 4001)[:, None] * (end - start)
-    inside, face = depths(way, CUBE.points, CUBE.normals)
+    inside, face = CUBE.solid.depths(way)
     side = CUBE.sides(start[None], end[None], 1.0, 1.0)[0]
     if inside.max() < -1e-2:
         assert side == 0
@@ -51,7 +50,7 @@ def test_the_side_is_the_face_that_a_way_first_goes_through(start: np.ndarray, e
         if first == 0:
             assert side == 1 + face[0]
         else:
-            ahead = ((way[first - 1] - CUBE.points) * CUBE.normals).sum(axis=1)
+            ahead = ((way[first - 1] - CUBE.solid.points) * CUBE.solid.normals_of_faces).sum(axis=1)
             entered = np.flatnonzero(ahead >= 0)
             assert side - 1 in entered and (len(entered) > 1 or side == 1 + entered[0])
 

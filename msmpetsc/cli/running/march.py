@@ -36,6 +36,7 @@ from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.reach import Reach
+from msmpetsc.output.model import write_model
 from msmpetsc.output.progress import duration
 from msmpetsc.output.restart import Earlier
 from msmpetsc.output.writer import Begin, ResultFile
@@ -240,7 +241,7 @@ def live_page(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model
         return
     from msmpetsc.output.drawing.live import LivePage
 
-    page = LivePage(path, plan.scene, model.surface, file.newest_surface, model.body_of_point)
+    page = LivePage(path, plan.scene, model.surface, file.newest_surface, model.body_of_point, model.solids)
     try:
         yield [PageWriter(page)]
     finally:
@@ -270,37 +271,6 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
     points = embedding.points if embedding else None
     file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
     return simulation.stored_until(simulation.step) if simulation.step else 0
-
-
-def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
-    """Write the parts of the file that do not change with time (collective)."""
-    lattice, owned = model.lattice, model.lattice.owned
-    springs = slice(lattice.springs_owned)
-    numbers = lattice.global_numbers
-    file.write("lattice/nodes", lattice.nodes[:owned])
-    file.write("lattice/cells", lattice.cells)
-    file.write("lattice/cell_kind", lattice.cell_kind)
-    file.write("lattice/cell_share", lattice.cell_share)
-    file.write("lattice/springs", numbers[lattice.springs[springs]])
-    file.write("lattice/rest_length", lattice.rest_length[springs])
-    file.write("lattice/stiffness", lattice.stiffness[springs])
-    file.write("lattice/mass", lattice.mass)
-    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
-    several = len(model.bodies) > 1
-    if several:
-        file.write("lattice/body", lattice.body[:owned].astype("i4"))
-    surface, embedding = model.surface, model.embedding
-    if embedding is None:
-        return
-    if several:
-        file.write("surface/body", model.body_of_point.astype("i4"))
-    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
-    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
-    offset = comm.exscan(len(embedding.indices)) or 0
-    indptr = embedding.indptr[1:] + offset
-    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
-    file.write("embedding/indices", embedding.indices)
-    file.write("embedding/weights", embedding.weights)
 
 
 # After the steps

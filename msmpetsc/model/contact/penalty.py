@@ -10,7 +10,6 @@ A node that came into a box by one of its faces has that for its ``side``, and i
 also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -18,18 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.backend.kernel import kernel
-from msmpetsc.model.contact.obstacle import (
-    TINY,
-    Obstacle,
-    away,
-    depth,
-    depths,
-    no_sides,
-    normal_at,
-    normals_at,
-    of_nodes,
-)
+from msmpetsc.model.contact.obstacle import Obstacle
+from msmpetsc.model.contact.solids import TINY
 
 if TYPE_CHECKING:
     from msmpetsc.model.self_contact.term import SurfaceContact
@@ -48,9 +37,7 @@ class Penalty:
 
     def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
-        obstacle = self.obstacle
-        points, normals = obstacle.points_at(time), obstacle.normals
-        return ContactState(points, normals, self.stiffness, None, sides, obstacle.outside, obstacle.radius)
+        return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m]."""
@@ -60,7 +47,8 @@ class Penalty:
         inside, face = self.obstacle.depths(q, time - time_step, sides)
         nodes = np.flatnonzero(inside > 0)
         normal = self.obstacle.normals_at(q[nodes], time - time_step, face[nodes])
-        carried = q[nodes] + (state.points - self.obstacle.points_at(time - time_step))[0]
+        path = self.obstacle.path
+        carried = q[nodes] + like(q, path.at(time) - path.at(time - time_step))
         limit = self.friction * self.stiffness * inside[nodes]
         return replace(state, friction=Friction(nodes, normal, carried, limit, self.stick * time_step))
 
@@ -135,36 +123,39 @@ class Friction:
 
 @dataclass(frozen=True)
 class ContactState:
-    """An obstacle where a step ends.
+    """An obstacle as it stands at a time [s], where a step ends.
 
-    points, normals : of its faces (f, 3)
-    stiffness       : [N/m] on each node
-    friction        : of the step, if any
-    sides           : (owned or more,) by which face each node came in (obstacle.side_of); None: the nearest
-    outside         : (owned or more,) how far nodes stick out of the surface [m]; None: they do not
-    radius          : of a ball [m]; 0: there are planes
+    stiffness : [N/m] on each node
+    friction  : of the step, if any
+    sides     : (owned or more,) by which face each node came in (faces.side_of); None: the nearest
     """
 
-    points: np.ndarray
-    normals: np.ndarray
+    obstacle: Obstacle
+    time: float
     stiffness: float
     friction: Friction | None
     sides: np.ndarray | None = None
-    outside: np.ndarray | None = None
-    radius: float = 0.0
 
     def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
-        return depths(q, self.points, self.normals, self.sides, self.outside, self.radius)
+        return self.obstacle.depths(q, self.time, self.sides)
 
-    def normals_at(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """Return the unit normals (n, 3) at positions (n, 3) of faces (n,)."""
-        return normals_at(q, self.points, self.normals, face, self.radius)
+    def pressed(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which of the positions (n, 3) are pressed, rows (a,), how deep (a,) [m] and the normals (a, 3)."""
+        depths, face = self.depths(q)
+        rows = np.flatnonzero(depths > 0)
+        return rows, depths[rows], self.obstacle.normals_at(q[rows], self.time, face[rows])
 
-    def faces(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Return what kernels take: points, normals, of positions (n, 3) sides and how far they stick out, radius."""
-        sides = no_sides(q) if self.sides is None else self.sides
-        return self.points, self.normals, sides, of_nodes(self.outside, q), self.radius
+    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+        """Return the energy of the push at q less that at base (n, 3) [J]."""
+        (depths, face), (base_depths, base_face) = self.depths(q), self.depths(base)
+        within = np.flatnonzero((depths > 0) & (base_depths > 0) & (face == base_face))
+        depths, base_depths = np.maximum(depths, 0), np.maximum(base_depths, 0)
+        deeper = depths - base_depths
+        if len(within):
+            seen, moved = self.obstacle.seen_from(q[within], self.time), (q - base)[within]
+            deeper[within] = self.obstacle.solid.deeper(seen, moved, face[within])
+        return 0.5 * self.stiffness * float(deeper @ (depths + base_depths))
 
 
 class Contact:
@@ -195,9 +186,7 @@ class Contact:
         """Return the same of obstacles alone."""
         total = 0.0
         for state in self.states:
-            parts = np.empty(self.owned, like=q)
-            _change_of(self.owned, q, base, *state.faces(q), state.stiffness, parts)
-            total += float(parts.sum())
+            total += state.change(q[: self.owned], base[: self.owned])
             if state.friction:
                 total += float(state.friction.change(q, base))
         return total
@@ -205,7 +194,8 @@ class Contact:
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for state in self.states:
-            _add_gradient_of(self.owned, q, *state.faces(q), state.stiffness, gradient)
+            rows, depth, normal = state.pressed(q[: self.owned])
+            gradient[rows] -= (state.stiffness * depth)[:, None] * normal
             if state.friction:
                 state.friction.add_gradient(q, gradient)
         if self.surface:
@@ -224,17 +214,16 @@ class Contact:
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
-        The Hessian is the sum of all; each block is positive semidefinite. Of a ball of which a node at distance r from
-        the centre is pressed the true block has -k d / r across the normal, too, which is left out.
+        The Hessian is the sum of all; each block is positive semidefinite. Across the
+        normal a solid that is round with radius r at a node has -k d / r, too, which is left out.
 
         true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
             Hessian, nothing along a slip, would let nodes run to and fro
         secants : where friction has that of its secant all the same
         """
         for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
-            inside, face = state.depths(q[: self.owned])
-            pressed = np.flatnonzero(inside > 0)
-            yield pressed, state.stiffness * _squares(state.normals_at(q[pressed], face[pressed]))
+            rows, _, normal = state.pressed(q[: self.owned])
+            yield rows, state.stiffness * _squares(normal)
             if state.friction:
                 yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
@@ -253,56 +242,6 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
-@kernel
-def _change_of(first, count, step, q, base, points, normals, sides, outside, radius, stiffness, parts):
-    for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
-        d_base, face_base = depth(base[i], points, normals, sides[i], outside[i], radius)
-        parts[i] = 0.0
-        if d > 0.0 and d_base > 0.0 and face == face_base:  # d - d_base would keep only the digits of a position
-            deeper = 0.0
-            if radius > 0.0:  # |u| - |v| = (u - v) (u + v) / (|u| + |v|)
-                for c in range(3):
-                    deeper -= (q[i, c] - base[i, c]) * ((q[i, c] - points[0, c]) + (base[i, c] - points[0, c]))
-                deeper /= max(away(q[i], points) + away(base[i], points), TINY)
-            else:
-                for c in range(3):
-                    deeper -= normals[face, c] * (q[i, c] - base[i, c])
-            parts[i] = 0.5 * stiffness * deeper * (d + d_base)
-        elif d > 0.0 or d_base > 0.0:
-            d, d_base = max(d, 0.0), max(d_base, 0.0)
-            parts[i] = 0.5 * stiffness * (d - d_base) * (d + d_base)
-
-
-@kernel
-def _add_gradient_of(first, count, step, q, points, normals, sides, outside, radius, stiffness, gradient):
-    for i in range(first, count, step):
-        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
-        if d > 0.0:
-            normal = normal_at(q[i], points, normals, face, radius)
-            for c in range(3):
-                gradient[i, c] -= stiffness * d * normal[c]
-
-
-@kernel
-def _friction_of(first, count, step, rows, q, points, normals, sides, outside, radius, carried, impulse, per_mass, v):
-    for row in range(first, count, step):
-        i = rows[row]
-        d, face = depth(q[i], points, normals, sides[i], outside[i], radius)
-        if d > 0.0:
-            along, speed = 0.0, 0.0
-            normal = normal_at(q[i], points, normals, face, radius)
-            for c in range(3):
-                along += (v[i, c] - carried[c]) * normal[c]
-            for c in range(3):
-                speed += (v[i, c] - carried[c] - along * normal[c]) ** 2
-            speed = math.sqrt(speed)
-            if speed > 0.0:
-                lost = min(1.0, impulse * d * per_mass[i] / speed)
-                for c in range(3):
-                    v[i, c] -= lost * (v[i, c] - carried[c] - along * normal[c])
-
-
 def apply_friction(
     rows: np.ndarray,
     q: np.ndarray,
@@ -318,7 +257,16 @@ def apply_friction(
     the friction's impulse a mass, mu N dt / m, and not below nothing: so what holds does not creep, however long the
     substep.
 
+    rows     : (k,) bool or numbers, of the nodes that move
     impulse  : mu k dt [kg/s], times the depth the impulse
     per_mass : (n,) [1/kg]
     """
-    _friction_of(len(rows), rows, q, *state.faces(q), carried, impulse, per_mass, v)
+    moves = np.zeros(len(q), bool, like=q)
+    moves[rows] = True
+    pressed, depth, normal = state.pressed(q)
+    own = moves[pressed]
+    pressed, depth, normal = pressed[own], depth[own], normal[own]
+    slip = v[pressed] - carried
+    slip -= (slip * normal).sum(axis=1)[:, None] * normal
+    speed = np.maximum(np.linalg.norm(slip, axis=1), TINY)
+    v[pressed] -= np.minimum(1.0, impulse * depth * per_mass[pressed] / speed)[:, None] * slip

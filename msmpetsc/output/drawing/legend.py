@@ -59,7 +59,7 @@ def entries_of(
         entries.append(Entry("swatch", " or ".join(held), FIXED))
     if any(shot.arrows for shot in overlays):
         entries.append(Entry("arrow", "force", ARROW, 30))
-    if entries and any(shot.glass or shot.balls for shot in overlays):
+    if entries and any(shot.glass or shot.balls or shot.shapes for shot in overlays):
         entries.append(Entry("glass", "obstacle", GLASS))
     return entries
 

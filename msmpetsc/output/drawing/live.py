@@ -3,7 +3,7 @@
 A file and no server: it is written under another name and renamed, and loads itself again every few seconds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -43,14 +43,16 @@ class LivePage:
         surface: "Surface | None",
         newest: Callable[[], np.ndarray | None],
         body: np.ndarray | None = None,
+        solids: Mapping[int, "Surface"] | None = None,
     ):
         """Make a page for a run of a scene.
 
         surface : at rest; newest : returns the surface points (v, 3) of the newest frame [m], None where none is stored
         body    : (v,) numbers of the bodies of these points; None: there is but one
+        solids  : surfaces of obstacles that are meshes or functions, by their numbers
         """
         self._path, self._scene, self._newest = path, scene, newest
-        self._subject = None if surface is None else subject_of_surface(path, surface, scene, body)
+        self._subject = None if surface is None else subject_of_surface(path, surface, scene, body, solids)
         self._box = np.empty((0, 3))  # corners of the box around all frames drawn so far
         self._frame: Frame | None = None
         self._begun: tuple[float, int] | None = None  # when the first frame came [s], and its index

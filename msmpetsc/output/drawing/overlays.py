@@ -3,11 +3,13 @@
 Geometry only, in the scene's axes [m]; it comes from the scene and the lattice of a result, nothing is drawn here.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from msmpetsc.geometry.surface import Surface, bounds_of
 from msmpetsc.model.loads import LoadTable, Motion, within
 from msmpetsc.model.region import inside_bodies
 from msmpetsc.output.drawing.camera import Camera, unit
@@ -39,6 +41,16 @@ class Ball:
 
 
 @dataclass(frozen=True)
+class Shape:
+    """A mesh: number of its obstacle, how far it has moved (3,) [m], its surface, and corners (8, 3) as of a Ball."""
+
+    number: int
+    by: np.ndarray
+    surface: Surface
+    seen: np.ndarray
+
+
+@dataclass(frozen=True)
 class Overlays:
     """What stands beside the body in one panel.
 
@@ -46,23 +58,30 @@ class Overlays:
     glass   : (8, 3) corners each, of boxes and of planes that would hide the body; corner number 4i + 2j + k
     arrows  : (2, 3) each, tail and tip
     balls   : of spheres, seen through like glass
+    shapes  : of meshes and functions
     """
 
     grounds: list[Ground]
     glass: list[np.ndarray]
     arrows: list[np.ndarray]
     balls: list[Ball]
+    shapes: list[Shape]
+
+    @property
+    def _seen(self) -> list[np.ndarray]:
+        return [*(ball.seen for ball in self.balls), *(shape.seen for shape in self.shapes)]
 
     @property
     def sharp(self) -> list[np.ndarray]:
         """Points (n, 3) [m] of what must be in the picture with a margin: all but grounds."""
-        return [*self.glass, *self.arrows, *(ball.seen for ball in self.balls)]
+        return [*self.glass, *self.arrows, *self._seen]
 
     @property
     def corners(self) -> np.ndarray:
-        """Corners (n, 3) of all obstacles, of what of a ball is to be seen [m]."""
-        grounds, seen = (ground.corners for ground in self.grounds), (ball.seen for ball in self.balls)
-        return np.concatenate([np.empty((0, 3)), *grounds, *self.glass, *seen])
+        """Corners (n, 3) of all obstacles, of what of a ball or a mesh is to be seen [m]."""
+        return np.concatenate(
+            [np.empty((0, 3)), *(ground.corners for ground in self.grounds), *self.glass, *self._seen]
+        )
 
 
 @dataclass(frozen=True)
@@ -139,15 +158,22 @@ class SurfaceAtRest(Rest):
 
 
 def overlays_at(
-    scene: SceneFile, time: float, rest: Rest, position: np.ndarray, bodies: np.ndarray, camera: Camera
+    scene: SceneFile,
+    time: float,
+    rest: Rest,
+    position: np.ndarray,
+    bodies: np.ndarray,
+    camera: Camera,
+    solids: Mapping[int, Surface],
 ) -> Overlays:
     """Return what stands beside the body at a time [s].
 
     position : (n, 3) of the nodes at that time [m]
     bodies   : (b, 3) surface points of all panels [m], which say how much of an obstacle is worth showing
+    solids   : surfaces of obstacles that are meshes or functions, by their numbers
     """
     grounds, glass, balls = _obstacles(scene, time, bodies, camera)
-    return Overlays(grounds, glass, _arrows(scene, time, rest, position), balls)
+    return Overlays(grounds, glass, _arrows(scene, time, rest, position), balls, _shapes(scene, time, bodies, solids))
 
 
 def _obstacles(
@@ -164,6 +190,8 @@ def _obstacles(
         if obstacle.shape == "sphere":
             balls += _ball(np.array(obstacle.center) + by, obstacle.radius or 0.0, bodies)
             continue
+        if obstacle.shape != "plane":
+            continue
         point, normal = np.array(obstacle.point) + by, np.array(obstacle.normal)
         if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
             continue
@@ -172,6 +200,17 @@ def _obstacles(
         else:
             glass.append(_plate(_patch(point, normal, bodies, np.eye(3)), THICKNESS * _reach(bodies)))
     return grounds, glass, balls
+
+
+def _shapes(scene: SceneFile, time: float, bodies: np.ndarray, solids: Mapping[int, Surface]) -> list[Shape]:
+    shapes = []
+    for number, obstacle in enumerate(scene.obstacle):
+        surface = solids.get(number)
+        if surface is not None and len(surface.points) and within(time, obstacle.start, obstacle.stop):
+            by = Motion.through(obstacle.path).at(time)
+            seen = _box(bounds_of(surface) + by, bodies)
+            shapes += [Shape(number, by, surface, corners) for corners in seen]
+    return shapes
 
 
 def _reach(bodies: np.ndarray) -> float:

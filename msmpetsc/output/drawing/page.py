@@ -19,6 +19,7 @@ import numpy as np
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.output.drawing import colours
 from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.legend import entries_of
@@ -141,6 +142,7 @@ def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Sty
         "scale": scale_colours(colouring),
         "legend": [vars(entry) for entry in bar],
         "overlays": distinct(overlays),
+        "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
         "axes": style.axes,
     }
 
@@ -164,10 +166,23 @@ def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
             "grounds": [{"corners": g.corners.tolist(), "normal": g.normal.tolist()} for g in shown.grounds],
             "glass": [corners.tolist() for corners in shown.glass],
             "arrows": [arrow.tolist() for arrow in shown.arrows],
+            "shapes": [{"number": s.number, "by": s.by.tolist(), "seen": s.seen.tolist()} for s in shown.shapes],
             "balls": [{"center": b.center.tolist(), "radius": b.radius, "seen": b.seen.tolist()} for b in shown.balls],
         }
         numbers.append(states.setdefault(json.dumps(state), len(states)))
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
+
+
+def solid_facts(surface: Surface) -> dict[str, list]:
+    """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
+    corners = surface.points[surface.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
+    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=1e-300) + 1e-300)))
+    return {
+        "corners": np.round(corners, digits).ravel().tolist(),
+        "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel().tolist(),
+    }
 
 
 def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:

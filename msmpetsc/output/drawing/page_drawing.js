@@ -115,7 +115,7 @@ function axesOfEye() {
 
 function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
   const beside = data.overlays.states.flatMap(
-    ({ grounds, glass, balls }) => [...grounds.map((ground) => ground.corners), ...glass, ...balls.map((ball) => ball.seen)]);
+    ({ grounds, glass, balls, shapes }) => [...grounds.map((ground) => ground.corners), ...glass, ...[...balls, ...shapes].map((round) => round.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
 }
@@ -205,6 +205,20 @@ function drawBall(camera, { center, radius }, eye) { // without perspective a sp
   drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
 }
 
+function drawShape(camera, { across, upward, toEye }, { number, by }) { // a mesh, in the colour of obstacles
+  const { corners, normals } = data.solids[number];
+  use(lit, camera, by, [1, 1, 1]);
+  gl.uniformMatrix3fv(lit.uniforms.turning, false, [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]));
+  gl.uniform3fv(lit.uniforms.fixedColour, colour("#a3b6c4"));
+  gl.vertexAttrib1f(lit.attributes.number, 0);
+  gl.vertexAttrib1f(lit.attributes.fixing, 1);
+  filled("corners", new Float32Array(corners));
+  attribute(lit, "position", "corners", 3, gl.FLOAT, false);
+  filled("sides", new Float32Array(normals));
+  attribute(lit, "normal", "sides", 3, gl.FLOAT, false);
+  gl.drawArrays(gl.TRIANGLES, 0, corners.length / 3);
+}
+
 function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every side
   const along = sum(tip, tail, -1), aside = scaled(unit(cross(along, eye.toEye)), Math.hypot(...along));
   const at = (far, wide) => sum(sum(tail, along, far), aside, wide);
@@ -247,6 +261,7 @@ function draw() {
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
   drawBody(matrix, eye);
+  for (const shape of state.shapes) drawShape(matrix, eye, shape);
   drawAxes(matrix, rows, shift);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);

@@ -116,6 +116,10 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
     for ball in panel.overlays.balls:
         sphere = pv.Sphere(ball.radius, ball.center, theta_resolution=96, phi_resolution=96)
         plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, smooth_shading=True, ambient=0.6, diffuse=0.4)
+    for solid in panel.overlays.shapes:
+        surface = pv.PolyData.from_regular_faces(solid.surface.points + solid.by, solid.surface.triangles)
+        look: dict[str, Any] = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
+        plotter.add_mesh(surface, color=GLASS, **look)
     shape: dict[str, Any] = dict(tip_length=0.36, tip_radius=0.12, shaft_radius=0.045)
     shape |= dict(tip_resolution=40, shaft_resolution=40)
     for tail, tip in panel.overlays.arrows:  # without perspective, nearer to the eye is the same point of the picture

@@ -1,6 +1,6 @@
 """What is drawn: a body at its times, of a result, of a scene that was not run yet, or of a mesh alone."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.prepare import compact
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.output.drawing.overlays import Overlays, Rest, SurfaceAtRest, fixed_nodes, overlays_at
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.bodies import OF_REGIONS
@@ -17,7 +19,6 @@ from msmpetsc.scene.schema import SceneFile
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-    from msmpetsc.geometry.surface import Surface
     from msmpetsc.model.build import Model
     from msmpetsc.output.drawing.camera import Camera
     from msmpetsc.scene.schema import Scene
@@ -38,6 +39,7 @@ class Subject:
     surface   : number of a frame -> surface points (v, 3) [m]
     embedding : W (v, n); None where the surface points are the nodes
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
+    solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     """
 
     name: str
@@ -49,6 +51,7 @@ class Subject:
     surface: Callable[[int], np.ndarray]
     embedding: "csr_array | None"
     array: Callable[[str], np.ndarray]
+    solids: Mapping[int, Surface]
 
     @property
     def title(self) -> str:
@@ -80,8 +83,9 @@ class Subject:
     def overlays(self, index: int, bodies: np.ndarray, camera: "Camera") -> Overlays:
         """Return what stands beside the body at a frame; bodies: (b, 3) [m] as `overlays_at` has them."""
         if self.scene is None:
-            return Overlays([], [], [], [])
-        return overlays_at(self.scene, float(self.times[index]), self.rest, self.nodes(index), bodies, camera)
+            return Overlays([], [], [], [], [])
+        time, nodes = float(self.times[index]), self.nodes(index)
+        return overlays_at(self.scene, time, self.rest, nodes, bodies, camera, self.solids)
 
 
 def subject_of_result(run: Result) -> Subject:
@@ -106,6 +110,7 @@ def subject_of_result(run: Result) -> Subject:
         surface=lambda index: surface_points(run, index),
         embedding=run.embedding,
         array=lambda name: run[name][:],
+        solids=solids_of(run),
     )
 
 
@@ -139,15 +144,21 @@ def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
         surface=lambda _: W @ start,
         embedding=W,
         array=arrays.__getitem__,
+        solids=model.solids,
     )
 
 
 def subject_of_surface(
-    path: Path, surface: "Surface", scene: "SceneFile | None" = None, body: np.ndarray | None = None
+    path: Path,
+    surface: Surface,
+    scene: SceneFile | None = None,
+    body: np.ndarray | None = None,
+    solids: Mapping[int, Surface] | None = None,
 ) -> Subject:
     """Return a mesh as it lies in its file, in the file's own unit; or the surface of a scene without its lattice.
 
-    body : (v,) numbers of the bodies of its points; None: there is but one
+    body   : (v,) numbers of the bodies of its points; None: there is but one
+    solids : of its obstacles, as Subject has them
     """
     no_cells, body = np.empty((0, 8), int), np.zeros(len(surface.points), int) if body is None else body
     return Subject(
@@ -160,6 +171,7 @@ def subject_of_surface(
         surface=lambda _: surface.points,
         embedding=None,
         array={"lattice/cell_kind": no_cells[:, 0], "lattice/springs": no_cells[:, :2]}.__getitem__,
+        solids=solids or {},
     )
 
 
@@ -206,6 +218,18 @@ def refuse_other_bodies(run: Result, scene: SceneFile) -> None:
         painted, number = table.table.region.painted, table.body or 0
         if isinstance(painted, tuple) and max(painted) >= own[number]:
             raise InputError(f"{run.path} is damaged: its scene names painted points beyond its {own[number]}")
+
+
+def solids_of(run: Result) -> dict[int, Surface]:
+    """Return the surfaces of obstacles that a result holds. Raises InputError where they are damaged."""
+    if "obstacle/points" not in run:
+        return {}
+    points, triangles, numbers = (run[f"obstacle/{name}"][:] for name in ("points", "triangles", "number"))
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise InputError(f"{run.path} is damaged: obstacle/triangles names what is not among its {len(points)} points")
+    if len(numbers) != len(triangles) or not (np.abs(points) < FARTHEST).all():
+        raise InputError(f"{run.path} is damaged: the surfaces of its obstacles are none")
+    return {int(number): compact(points, triangles[numbers == number]) for number in np.unique(numbers)}
 
 
 def read_scene(run: Result) -> SceneFile:

@@ -1,0 +1,54 @@
+"""The parts of a result file that do not change with time."""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.build import Model
+from msmpetsc.output.writer import ResultFile
+
+
+def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
+    """Write the parts of the file that do not change with time (collective)."""
+    lattice, owned = model.lattice, model.lattice.owned
+    springs = slice(lattice.springs_owned)
+    numbers = lattice.global_numbers
+    file.write("lattice/nodes", lattice.nodes[:owned])
+    file.write("lattice/cells", lattice.cells)
+    file.write("lattice/cell_kind", lattice.cell_kind)
+    file.write("lattice/cell_share", lattice.cell_share)
+    file.write("lattice/springs", numbers[lattice.springs[springs]])
+    file.write("lattice/rest_length", lattice.rest_length[springs])
+    file.write("lattice/stiffness", lattice.stiffness[springs])
+    file.write("lattice/mass", lattice.mass)
+    file.write("lattice/pinned", numbers[:owned][lattice.pinned[:owned]])
+    several = len(model.bodies) > 1
+    if several:
+        file.write("lattice/body", lattice.body[:owned].astype("i4"))
+    if comm.bcast(bool(model.solids)):
+        for name, rows in obstacle_rows(model.solids).items():
+            file.write(f"obstacle/{name}", rows)
+    surface, embedding = model.surface, model.embedding
+    if embedding is None:
+        return
+    if several:
+        file.write("surface/body", model.body_of_point.astype("i4"))
+    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
+    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
+    offset = comm.exscan(len(embedding.indices)) or 0
+    indptr = embedding.indptr[1:] + offset
+    file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
+    file.write("embedding/indices", embedding.indices)
+    file.write("embedding/weights", embedding.weights)
+
+
+def obstacle_rows(solids: dict[int, Surface]) -> dict[str, np.ndarray]:
+    """Return what stands in the file of the surfaces of obstacles, all of them on rank 0."""
+    starts = np.cumsum([0, *(len(solid.points) for solid in solids.values())])
+    triangles = [solid.triangles + start for solid, start in zip(solids.values(), starts[:-1], strict=True)]
+    counts = [len(solid.triangles) for solid in solids.values()]
+    return {
+        "points": np.concatenate([np.empty((0, 3)), *(solid.points for solid in solids.values())]),
+        "triangles": np.concatenate([np.empty((0, 3), np.int64), *triangles]),
+        "number": np.repeat(np.array([*solids], "i4"), counts),
+    }

@@ -1,0 +1,60 @@
+"""The table of what stands in the way of the body."""
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from msmpetsc.scene.body import Mesh
+from msmpetsc.scene.motion import PATH, Path3
+from msmpetsc.scene.problems import rule
+from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
+
+NEEDED = {
+    "plane": ("point", "normal"),
+    "box": ("box",),
+    "sphere": ("center", "radius"),
+    "mesh": ("mesh",),
+    "function": ("function",),
+}
+
+
+class ObstacleTable(Table):
+    """What nodes bounce off or are pressed by: it may move, and be there for a while only."""
+
+    shape: Literal["plane", "box", "sphere", "mesh", "function"] = Field(description="kind of obstacle")
+    point: Vector | None = Field(None, description="a point of the plane [m]")
+    normal: UnitVector | None = Field(
+        None, description="of the plane, towards its free side, normalised on reading [-]"
+    )
+    box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
+    center: Vector | None = Field(None, description="of the sphere [m]")
+    radius: Positive | None = Field(None, description="of the sphere [m]")
+    mesh: Mesh | None = Field(None, description="a closed surface, of which the inside is meant")
+    function: FunctionName | None = Field(
+        None, description="name of a signed distance to a surface, registered in Python or installed"
+    )
+    path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
+    start: NotNegative = Field(0.0, description="is there from this time [s]")
+    stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
+    response: Literal["reflect", "penalty"] = Field("reflect", description="what happens on touching")
+    restitution: float | None = Field(
+        None, ge=0, le=1, description='of "reflect": normal speed after over before the impact; 1 if absent [-]'
+    )
+    stiffness: Positive | None = Field(
+        None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
+    )
+    friction: NotNegative | None = Field(None, description='of "penalty": Coulomb\'s coefficient; 0 if absent [-]')
+
+    _after_start = field_validator("stop")(after_start)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "ObstacleTable":
+        missing = [name for name in NEEDED[self.shape] if getattr(self, name) is None]
+        if missing:
+            raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
+        uses = {name: shape for shape, names in NEEDED.items() for name in names}
+        uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
+        for name, use in uses.items():
+            if getattr(self, name) is not None and use not in (self.shape, self.response):
+                raise rule(f"has {name}, which is for {use!r} only")
+        return self

@@ -3,10 +3,23 @@
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import csr_array
 
+from msmpetsc.backend.kernel import kernel
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.model.lattice import Lattice
+
+
+@kernel
+def _weighted_sums(first, count, step, points, starts, columns, weights, nodes):
+    """Multiply as SciPy's CSR matrices do, a tenth as fast for three columns."""
+    for i in range(first, count, step):
+        x = y = z = 0.0
+        for k in range(starts[i], starts[i + 1]):
+            weight, node = weights[k], columns[k]
+            x += weight * nodes[node, 0]
+            y += weight * nodes[node, 1]
+            z += weight * nodes[node, 2]
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
 
 
 class SurfaceMotion:
@@ -14,9 +27,7 @@ class SurfaceMotion:
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
         columns, local = np.unique(embedding.indices, return_inverse=True)
-        self.weights = csr_array(
-            (embedding.weights, local.ravel(), embedding.indptr), shape=(embedding.points, len(columns))
-        )
+        self.starts, self.columns, self.weights = embedding.indptr, local.ravel(), embedding.weights
         self.nodes = PETSc.Vec().createMPI((3 * lattice.owned, 3 * lattice.table.total), comm=comm)
         self.needed = PETSc.Vec().createSeq(3 * len(columns), comm=PETSc.COMM_SELF)
         index = PETSc.IS().createBlock(3, columns.astype(PETSc.IntType), comm=comm)
@@ -27,7 +38,10 @@ class SurfaceMotion:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
         self.nodes.array[:] = position.ravel()
         self.scatter.scatter(self.nodes, self.needed)
-        return self.weights @ self.needed.array_r.reshape(-1, 3)
+        nodes = np.asarray(self.needed.array_r).reshape(-1, 3)
+        points = np.empty((len(self.starts) - 1, 3))
+        _weighted_sums(len(points), points, self.starts, self.columns, self.weights, nodes)
+        return points
 
     def destroy(self) -> None:
         for owner in (self.scatter, self.nodes, self.needed):

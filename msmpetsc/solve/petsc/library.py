@@ -13,7 +13,9 @@ Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
 
 
+@cache
 def petsc_library() -> ctypes.CDLL:
+    """Return PETSc's library, opened once."""
     return ctypes.CDLL(PETSc.__file__)  # petsc4py's extension; its symbols include those of libpetsc
 
 

@@ -52,7 +52,9 @@ def add_look(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``render`` that say how things look."""
     parser.add_argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)")
     parser.add_argument(
-        "--colour", metavar="FIELD", help="colour by displacement, speed, strain, part, or error, with a legend"
+        "--colour",
+        metavar="FIELD",
+        help="colour by displacement, speed, strain, contact, part or error, with a legend",
     )
     parser.add_argument(
         "--reference",

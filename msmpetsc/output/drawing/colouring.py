@@ -1,4 +1,4 @@
-"""Fields that colour a surface: how far, how fast, how strained, how wrong, of what part."""
+"""Fields that colour a surface: how far, how fast, how strained, how wrong, how near to others, of what part."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -12,9 +12,12 @@ from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.output.compare import common_times
 from msmpetsc.output.drawing.colours import of_classes, on_scale
 from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.output.reader import Result
 from msmpetsc.output.surfaces import refuse_different_meshes
 
+NEAR = 0.01  # of the longest side of a body: gaps up to this are told apart
+ROUNDING = 1e-6  # of the pale end: a least gap below it is 0
 PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
@@ -27,6 +30,7 @@ class Colouring:
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
     classes : names, where the field is a number of a class
+    below   : what is shown is so much less the values, and no more than that; None: the values themselves
     """
 
     title: str
@@ -34,6 +38,7 @@ class Colouring:
     values: Callable[[int], np.ndarray]
     high: float = 1.0
     classes: tuple[str, ...] = ()
+    below: float | None = None
 
     def shares(self, index: int) -> np.ndarray:
         """Return the values (v,) of a frame as shares of the scale's end."""
@@ -44,12 +49,18 @@ class Colouring:
         return of_classes(self.values(index)) if self.classes else on_scale(self.shares(index))
 
     @property
-    def ends(self) -> tuple[str, str]:
-        """The title with its unit, and the end of the scale in that unit: ("displacement [mm]", "12.5")."""
+    def ends(self) -> tuple[str, str, str]:
+        """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
         if self.unit == "%":
-            return f"{self.title} [%]", f"{100 * self.high:.3g}"
-        size = next((size for size in PREFIXES if self.high >= size), 1.0)
-        return f"{self.title} [{PREFIXES[size]}{self.unit}]", f"{self.high / size:.3g}"
+            return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
+        largest = max(self.high, self.below or 0.0)
+        size = next((size for size in PREFIXES if largest >= size), 1.0)
+        title = f"{self.title} [{PREFIXES[size]}{self.unit}]"
+        if self.below is None:
+            return "0", title, f"{self.high / size:.3g}"
+        least = self.below - self.high
+        least = 0.0 if abs(least) < ROUNDING * self.below else least
+        return f"{self.below / size:.3g} or more", title, f"{least / size:.3g}"
 
 
 def colouring_of(subject: Subject, name: str, reference: Result | None = None) -> Colouring:
@@ -127,12 +138,32 @@ def _part(subject: Subject, _: Result | None) -> Colouring:
     return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
 
 
+def _contact(subject: Subject, _: Result | None) -> Colouring:
+    """Colour by the gap to obstacles, and where the scene has self-contact to parts of the surface, as far as near."""
+    scene, rest = subject.scene, subject.rest
+    if scene is None or not (scene.obstacle or scene.self_contact):
+        raise InputError(f"--colour contact: the scene of {subject.name} has neither obstacles nor self-contact")
+    reach = NEAR * float(np.ptp(rest.bounds, axis=1).max())
+    surface = SurfaceGaps(rest.points, subject.triangles, rest.body_of_point, reach) if scene.self_contact else None
+    touched = [word for word, there in (("obstacles", scene.obstacle), ("the surface itself", surface)) if there]
+
+    def values(index: int) -> np.ndarray:
+        points = subject.surface(index)
+        gaps = gaps_to_obstacles(scene.obstacle, points, float(subject.times[index]))
+        if surface is not None:
+            gaps = np.minimum(gaps, surface.at(points))
+        return reach - np.minimum(gaps, reach)
+
+    return Colouring(f"gap to {' and '.join(touched)}", "m", values, below=reach)
+
+
 COLOURINGS: dict[str, Callable[[Subject, Result | None], Colouring]] = {
     "displacement": _displacement,
     "speed": _speed,
     "strain": _strain,
     "error": _error,
     "part": _part,
+    "contact": _contact,
 }
 
 

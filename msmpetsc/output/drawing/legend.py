@@ -48,8 +48,8 @@ def entries_of(
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs]
     elif colouring is not None:
-        title, high = colouring.ends
-        entries.append(Entry("bar", title, width=BAR, low="0", high=high))
+        low, title, high = colouring.ends
+        entries.append(Entry("bar", title, width=BAR, low=low, high=high))
     if "cells" in shown:
         entries += [Entry("swatch", text, colour) for colour, text in KINDS.values()]
     if "springs" in shown:

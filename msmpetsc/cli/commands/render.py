@@ -36,7 +36,6 @@ STILL = (760, 900)  # [px]: a panel of a scene or a mesh
 ONLY = {  # options by the endings of what they are for
     "count": PICTURE_NAMES,
     "size": (*PICTURE_NAMES, *MOVIE_NAMES),
-    "show": (*PICTURE_NAMES, *MOVIE_NAMES),
     "fps": MOVIE_NAMES,
     "speed": MOVIE_NAMES,
     "turntable": MOVIE_NAMES,

@@ -12,6 +12,7 @@ from msmpetsc.output.drawing.subject import Subject
 SHOWN = ("cells", "springs")
 BOUNDARY, INTERIOR = 1, 2  # lattice/cell_kind
 SHRUNK = 0.86  # of a cell's size, so that neighbours are told apart
+THROUGH = 0.3  # opacity of a body whose lattice is shown
 FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])  # VTK's order
 KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
 

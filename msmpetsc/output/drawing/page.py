@@ -10,7 +10,7 @@ import html
 import json
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,17 +22,18 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.output.drawing import colours
 from msmpetsc.output.drawing.colouring import Colouring
+from msmpetsc.output.drawing.fabric import KINDS, SHRUNK, THROUGH, Cut, cut_open
 from msmpetsc.output.drawing.legend import entries_of
 from msmpetsc.output.drawing.overlays import Overlays
 from msmpetsc.output.drawing.shots import Shot, Style, Survey, shots_of, survey
-from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.drawing.subject import FARTHEST, Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
 PARTS = files("msmpetsc.output.drawing")
-SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js", "page_run.js", "page_begin.js")
+SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_run.js", "page_begin.js")
 
 
 def write_page(
@@ -43,9 +44,13 @@ def write_page(
     Raises InputError where they cannot be drawn or the page not be written.
     """
     seen = survey(subject, frames, style, reference)
-    chosen = list(frames)
+    cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
+    chosen, about_lattice = list(frames), None
     while True:
         streams = packed_frames(subject, chosen, seen)
+        if cut is not None:
+            of_lattice, about_lattice = packed_lattice(subject, chosen, cut)
+            streams |= of_lattice
         size = sum(map(len, streams.values())) * 4 / 3
         if size <= MOST or len(chosen) < 3:
             break
@@ -55,28 +60,56 @@ def write_page(
         log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
     shots = shots_of(subject, chosen, seen)
     streams["fixed"], numbers = fixed_states(subject, chosen)
-    facts = page_facts(subject, shots, seen, style) | {"fixed": numbers}
+    facts = page_facts(subject, shots, seen, style) | {"fixed": numbers, "lattice": about_lattice}
     write_whole(path, page_text(subject.title, facts, streams))
 
 
 def packed_frames(subject: Subject, frames: Sequence[int], seen: Survey) -> dict[str, bytes]:
     """Return positions, colours and triangles as deflated bytes, for the script to read."""
-    points = len(subject.rest.points)
-    kind = np.dtype("<u2" if points <= LEVELS else "<u4")
     streams = {
-        "positions": deflated(residuals(quantised(subject, frames, seen.box))),
-        "triangles": zlib.compress(subject.triangles.astype(kind).tobytes(), 6),
+        "positions": deflated(residuals(quantised(subject.surface, frames, seen.box))),
+        "triangles": packed_numbers(subject.triangles, len(subject.rest.points)),
     }
     if seen.colouring is not None:
         streams["colours"] = deflated(changes(levels(seen.colouring, frames)))
     return streams
 
 
-def quantised(subject: Subject, frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the surface points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
+def packed_lattice(subject: Subject, frames: Sequence[int], cut: Cut) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return the nodes of what is left of a lattice, its cells and springs as deflated bytes, and what the script must
+    know beside them. Raises InputError where they cannot be drawn."""
+    cells = np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
+    used = np.unique(np.concatenate([cells.ravel(), cut.springs.ravel()]))
+    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[used] for index in frames)]
+    box = np.array([np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)])
+    if not (np.abs(box) < FARTHEST).all():
+        raise InputError(f"--show: {subject.name} has nodes that cannot be drawn")
+    streams = {
+        "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
+        "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
+        "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
+    }
+    about = {
+        "box": box.tolist(),
+        "nodes": len(used),
+        "kinds": [{"cells": len(part), "colour": KINDS[kind][0]} for kind, part in cut.cells.items()],
+        "springColour": colours.SPRING,
+        "shrunk": SHRUNK,
+        "opacity": THROUGH,
+    }
+    return streams, about
+
+
+def packed_numbers(numbers: np.ndarray, count: int) -> bytes:
+    """Return numbers of so many things, deflated: of 16 bits where these do."""
+    return zlib.compress(numbers.astype("<u2" if count <= LEVELS else "<u4").tobytes(), 6)
+
+
+def quantised(points: Callable[[int], np.ndarray], frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
     scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
     for index in counted(list(frames), "frames packed"):
-        yield np.clip(np.round((subject.surface(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
+        yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
 
 
 def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
@@ -126,7 +159,7 @@ def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Sty
     """Return what the script must know beside the streams, in types of JSON."""
     camera, colouring = seen.camera, seen.colouring
     overlays = [shot.overlays for shot in shots]
-    bar = entries_of(subject.scene, seen.fixed, overlays, colouring, ())
+    bar = entries_of(subject.scene, seen.fixed, overlays, colouring, style.shown)
     return {
         "title": subject.title,
         "points": len(subject.rest.points),

@@ -7,14 +7,15 @@ async function begin() {
     for (const id of ["player", "keys", "legend"]) byId(id).hidden = true;
     return;
   }
-  const wide = points > 65535, packed = await inflated("triangles");
-  triangles = new (wide ? Uint32Array : Uint16Array)(packed.buffer);
+  triangles = await numbersOf("triangles", points);
   fixing = await inflated("fixed");
-  all = predicted(await inflated("positions"));
+  all = predicted(await inflated("positions"), points);
   numbers = data.streams.colours ? summed(await inflated("colours")) : null;
   extent = firstExtent();
+  if (data.lattice) await unpackLattice();
   start();
   makeLegend();
+  makeSwitches();
   makePlayer();
   readAddress();
   draw();

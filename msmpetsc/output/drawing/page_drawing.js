@@ -1,5 +1,11 @@
 // Drawing with WebGL: the body, its ground and shadow, glass, arrows and axes.
 
+const LIGHT = `
+float light(vec3 n) {
+  n.z = abs(n.z); // what is seen faces the eye, though normals between points may not
+  return 0.42 + 0.62 * (0.85 * max(0.0, dot(n, normalize(vec3(-0.5, 1.1, 1.3))))
+    + 0.35 * max(0.0, dot(n, normalize(vec3(1.0, 0.15, 0.65)))));
+}`;
 const LIT = [`#version 300 es
 in vec3 position; in vec3 normal; in float number; in float fixing;
 uniform mat4 camera; uniform mat3 turning; uniform vec3 low; uniform vec3 size; uniform sampler2D scale;
@@ -11,13 +17,10 @@ void main() {
   gl_Position = camera * vec4(low + size * position, 1.0);
 }`, `#version 300 es
 precision mediump float;
-in vec3 facing; in vec3 paint; out vec4 pixel;
+in vec3 facing; in vec3 paint; uniform float opacity; out vec4 pixel;
+${LIGHT}
 void main() {
-  vec3 n = normalize(facing);
-  n.z = abs(n.z); // what is seen faces the eye, though normals between points may not
-  float light = 0.42 + 0.62 * (0.85 * max(0.0, dot(n, normalize(vec3(-0.5, 1.1, 1.3))))
-    + 0.35 * max(0.0, dot(n, normalize(vec3(1.0, 0.15, 0.65)))));
-  pixel = vec4(paint * light, 1.0);
+  pixel = vec4(paint * light(normalize(facing)), 1.0) * opacity;
 }`];
 const FLAT = [`#version 300 es
 in vec3 position; uniform mat4 camera; uniform vec3 low; uniform vec3 size; uniform vec4 plane; uniform float lift;
@@ -44,7 +47,7 @@ function program(sources) {
   gl.linkProgram(made);
   const attributes = {}, uniforms = {};
   for (const name of ["position", "normal", "number", "fixing"]) attributes[name] = gl.getAttribLocation(made, name);
-  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint"])
+  for (const name of ["camera", "turning", "low", "size", "scale", "fixedColour", "plane", "lift", "paint", "opacity"])
     uniforms[name] = gl.getUniformLocation(made, name);
   return { made, attributes, uniforms };
 }
@@ -76,6 +79,7 @@ function start() {
   for (const what of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, what, gl.NEAREST);
   filled("triangles", triangles, gl.ELEMENT_ARRAY_BUFFER);
   filled("numbers", new Uint8Array(points));
+  if (data.lattice) startLattice();
 }
 
 function normals(at) { // of the points, from the triangles around each, weighed by their areas
@@ -102,6 +106,7 @@ function loadFrame() {
   filled("normals", normals(at));
   filled("fixing", fixing.subarray(points * data.fixed[counted], points * (data.fixed[counted] + 1)));
   if (numbers) filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
+  if (data.lattice) loadLattice(counted);
 }
 
 function axesOfEye() {
@@ -169,16 +174,21 @@ function drawGround(camera, ground, eye) {
   bodyElements();
 }
 
-function drawBody(camera, { across, upward, toEye }) {
+const turningOf = ({ across, upward, toEye }) => [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]);
+
+function drawBody(camera, eye) {
+  const through = shown.size > 0; // what of the lattice is shown is seen through it
   use(lit, camera, box[0], size);
-  const turning = [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]);
-  gl.uniformMatrix3fv(lit.uniforms.turning, false, turning);
+  gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
+  gl.uniform1f(lit.uniforms.opacity, through ? data.lattice.opacity : 1);
   attribute(lit, "position", "positions", 3, gl.UNSIGNED_SHORT, true);
   attribute(lit, "normal", "normals", 3, gl.FLOAT, false);
   attribute(lit, "number", "numbers", 1, gl.UNSIGNED_BYTE, false);
   attribute(lit, "fixing", "fixing", 1, gl.UNSIGNED_BYTE, true);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#46566b"));
+  if (through) { gl.enable(gl.BLEND); gl.depthMask(false); }
   bodyElements();
+  if (through) { gl.depthMask(true); gl.disable(gl.BLEND); }
 }
 
 const FACES = [0, 1, 3, 0, 3, 2, 4, 5, 7, 4, 7, 6, 0, 1, 5, 0, 5, 4, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 3, 7, 1, 7, 5];
@@ -260,6 +270,7 @@ function draw() {
   const eye = axesOfEye(), { matrix, rows, shift } = cameraMatrix(eye);
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
+  if (shown.size) drawLattice(matrix, eye);
   drawBody(matrix, eye);
   for (const shape of state.shapes) drawShape(matrix, eye, shape);
   drawAxes(matrix, rows, shift);

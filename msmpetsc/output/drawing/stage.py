@@ -25,14 +25,13 @@ from msmpetsc.output.drawing.colours import (
     SHADOW,
     rgb,
 )
-from msmpetsc.output.drawing.fabric import Fabric
+from msmpetsc.output.drawing.fabric import THROUGH, Fabric
 from msmpetsc.output.drawing.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
 # of a box: four along z, y and x each, between corners 4i + 2j + k
 EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)])
 LABEL_GAP, HALF_LETTER = 14, 4.2  # [px] between an edge and what is written at it; of a letter of that
-THROUGH = 0.3  # opacity of a body whose lattice is shown
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ import base64
 import json
 import logging
 import re
-import shutil
 import subprocess
 import sys
 import zlib
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS, write_ball
+from browser import CHROMIUM
 from conftest import ENVIRONMENT
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,7 +25,6 @@ from msmpetsc.output.drawing import page
 from msmpetsc.output.drawing.subject import surface_points
 from msmpetsc.output.reader import Result
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 EAST_HELD = """
 [[pin]]
@@ -141,8 +140,8 @@ def seen(path: Path, address: str) -> np.ndarray:
 
 @in_browser
 @pytest.mark.timeout(120)
-def test_the_slider_plays_and_the_mouse_turns(tmp_path):
-    """By the address, which is what they write: the ball falls between two frames, and its dark side turns away."""
+def test_an_address_is_a_frame_and_a_turn(tmp_path):
+    """The ball falls between two frames, and its dark side turns away."""
     path = written_page(tmp_path, "--eye", "1,0,0", scene=BARE + EAST_HELD)
     start, fallen, turned = (seen(path, address) for address in ("frame=0", "frame=3", "frame=0&turn=180,0"))
     rows = [np.flatnonzero(picture.min(axis=2).min(axis=1) < 200) for picture in (start, fallen)]

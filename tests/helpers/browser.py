@@ -1,0 +1,127 @@
+"""A headless Chromium that tests drive by mouse and keys, over its debugging pipe (the Chrome DevTools Protocol).
+
+The pipe needs no package and no port: messages are JSON that ends in a null byte.
+"""
+
+import base64
+import fcntl
+import io
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+PATIENCE = 30.0  # [s] for an answer, or until something holds
+
+
+class Browser:
+    """One page in a browser of its own; a context, which ends it."""
+
+    def __init__(self, page: Path, size: tuple[int, int] = (600, 700), address: str = ""):
+        """Open a page at an address ("frame=3") in a window of so many pixels."""
+        ours, theirs = os.pipe(), os.pipe()  # from it, to it
+        read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
+        profile = page.with_suffix(".profile")
+        words = [str(CHROMIUM), *FLAGS, "--remote-debugging-pipe", f"--user-data-dir={profile}", "--hide-scrollbars"]
+        shell = ["bash", "-c", f'exec "$@" 3<&{read} 4>&{write}', "bash"]  # it reads 3 and writes 4
+        self._process = subprocess.Popen(
+            [*shell, *words, f"--window-size={size[0]},{size[1]}"], pass_fds=(read, write),
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        for fd in (theirs[0], ours[1], read, write):
+            os.close(fd)
+        self._from, self._to, self._rest, self._number, self._session = ours[0], theirs[1], b"", 0, ""
+        target = self._ask(
+            "Target.createTarget", url=f"{page.as_uri()}#{address}", newWindow=True, width=size[0], height=size[1]
+        )
+        self._session = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
+        self.until("document.documentElement?.dataset.ready === '1'")
+
+    def __enter__(self) -> "Browser":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for fd in (self._to, self._from):
+            os.close(fd)
+        self._process.terminate()
+        self._process.wait(PATIENCE)
+
+    def _ask(self, method: str, **params: Any) -> dict[str, Any]:
+        """Return the answer to a command; what the browser says meanwhile is passed over."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": params}
+        message |= {"sessionId": self._session} if self._session else {}
+        os.write(self._to, json.dumps(message).encode() + b"\0")
+        end = time.monotonic() + PATIENCE
+        while True:
+            text, null, rest = self._rest.partition(b"\0")
+            if null:
+                self._rest, answer = rest, json.loads(text)
+                if answer.get("id") == self._number:
+                    assert "error" not in answer, answer
+                    return answer["result"]
+                continue
+            assert select.select([self._from], [], [], max(0.0, end - time.monotonic()))[0], f"no answer to {method}"
+            more = os.read(self._from, 2**20)
+            assert more, "the browser ended"
+            self._rest += more
+
+    def value(self, expression: str) -> Any:
+        """Return what an expression of JavaScript is in the page."""
+        answer = self._ask("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def until(self, expression: str) -> None:
+        """Wait until an expression is true."""
+        end = time.monotonic() + PATIENCE
+        while not self.value(expression):
+            assert time.monotonic() < end, f"it never came that {expression}"
+            time.sleep(0.05)
+
+    def middle(self, selector: str) -> tuple[float, float]:
+        """Return where the middle of an element is [px]."""
+        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        x, y = self.value(f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})")
+        return x, y
+
+    def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def drag(self, start: tuple[float, float], by: tuple[float, float], shift: bool = False) -> None:
+        """Press the left button, move by so many pixels in ten steps, and let go; with the shift key, or without."""
+        held: dict[str, Any] = {"button": "left", "modifiers": 8 if shift else 0}
+        self._mouse("mousePressed", *start, buttons=1, clickCount=1, **held)
+        for share in np.linspace(0.1, 1, 10):
+            self._mouse("mouseMoved", start[0] + share * by[0], start[1] + share * by[1], buttons=1, **held)
+        self._mouse("mouseReleased", start[0] + by[0], start[1] + by[1], clickCount=1, **held)
+
+    def click(self, at: str | tuple[float, float]) -> None:
+        """Click on an element's middle, or on a point."""
+        self.drag(self.middle(at) if isinstance(at, str) else at, (0, 0))
+
+    def wheel(self, at: tuple[float, float], down: float) -> None:
+        """Turn the wheel by so many pixels downwards."""
+        self._mouse("mouseWheel", *at, deltaX=0, deltaY=down)
+
+    def key(self, key: str) -> None:
+        """Press a key and let it go."""
+        self._ask("Input.dispatchKeyEvent", type="keyDown", key=key)
+        self._ask("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def picture(self, selector: str = "#view") -> np.ndarray:
+        """Return what is seen of an element, (h, w, 3), after the page has drawn."""
+        self.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
+        clip = self.value(f"(({{ x, y, width, height }}) => ({{ x, y, width, height, scale: 1 }}))({box})")
+        data = self._ask("Page.captureScreenshot", clip=clip)["data"]
+        return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)

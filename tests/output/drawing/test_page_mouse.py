@@ -1,0 +1,115 @@
+"""The page of a result in a browser, driven by mouse and keys: it turns, comes nearer, plays, goes to a frame."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_result import BARE, write_ball
+from browser import CHROMIUM, Browser
+
+from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
+    pytest.mark.timeout(120),
+]
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball that is dark on its east, seen from there."""
+    folder = tmp_path_factory.mktemp("page")
+    result = write_ball(folder / "x.h5", surface=True, scene=BARE + EAST_HELD)
+    assert command.run(parsed(["render", str(result), "-o", str(folder / "x.html"), "--eye", "1,0,0"])) == 0
+    return folder / "x.html"
+
+
+@pytest.fixture(scope="module")
+def opened(path: Path) -> Iterator[Browser]:
+    with Browser(path) as browser:
+        yield browser
+
+
+@pytest.fixture
+def browser(opened: Browser) -> Browser:
+    """The page as it is when it was opened."""
+    opened.value("setPlaying(false), goTo(0)")
+    opened.key("r")
+    return opened
+
+
+def seen(browser: Browser) -> np.ndarray:
+    """The rows and columns (k, 2) of the pixels of the body, on a white page."""
+    return np.argwhere(browser.picture().min(axis=2) < 200)
+
+
+def dark(browser: Browser) -> int:
+    """How many pixels are as dark as the part that is held."""
+    return int((browser.picture()[..., 0] < 58).sum())
+
+
+def test_dragging_turns_the_body(browser: Browser):
+    """Half a turn is 450 pixels: the dark side, seen first, is behind then, and back after the other half."""
+    before = dark(browser)
+    left, middle = np.array(browser.middle("#view")) - [225, 0], browser.middle("#view")
+    browser.drag(tuple(left), (450, 0))
+    assert abs(browser.value("view.yaw")) == pytest.approx(180) and before > 1000
+    assert dark(browser) < 0.05 * before
+    browser.drag((left[0] + 450, left[1]), (-450, 0))
+    assert browser.value("view.yaw") == pytest.approx(0) and dark(browser) == pytest.approx(before, rel=0.01)
+    browser.drag(middle, (0, 100))
+    assert browser.value("view.pitch") == pytest.approx(40)  # 0.4 degrees a pixel
+
+
+def test_the_wheel_comes_nearer_and_goes_away(browser: Browser):
+    browser.value("goTo(2)")  # where the ball is in the middle
+    first = np.ptp(seen(browser), axis=0)
+    browser.wheel(browser.middle("#view"), -300)
+    browser.until("view.zoom > 1")
+    zoom = browser.value("view.zoom")
+    assert np.ptp(seen(browser), axis=0) == pytest.approx(zoom * first, rel=0.03) and zoom == pytest.approx(np.exp(0.3))
+    browser.wheel(browser.middle("#view"), 600)
+    browser.until("view.zoom < 1")
+    assert np.ptp(seen(browser), axis=0) == pytest.approx(first * np.exp(-0.3), rel=0.03)
+
+
+def test_dragging_with_shift_moves_the_body(browser: Browser):
+    browser.value("goTo(2)")
+    first = seen(browser).mean(axis=0)
+    browser.drag(browser.middle("#view"), (60, -40), shift=True)
+    assert seen(browser).mean(axis=0) - first == pytest.approx([-40, 60], abs=2)  # rows go downwards
+    assert browser.value("[view.yaw, view.pitch]") == [0, 0]
+
+
+def test_play_plays_and_pauses(browser: Browser):
+    assert browser.value("play.textContent") == "▶"
+    start = seen(browser).mean(axis=0)
+    browser.click("#play")
+    browser.until("view.frame >= 3")
+    assert browser.value("play.textContent") == "❚❚"
+    browser.click("#play")
+    frame = browser.value("view.frame")
+    after = seen(browser).mean(axis=0)
+    assert browser.value("[view.frame, view.playing, play.textContent]") == [frame, False, "▶"]
+    assert after[0] > start[0] + 20  # the ball has fallen: frames 3 to 10 are lower than the first
+    browser.key(" ")
+    browser.until(f"view.frame !== {frame}")
+    assert browser.value("view.playing")
+
+
+def test_the_slider_goes_to_a_frame(browser: Browser):
+    """Of eleven frames the fourth stands at 3/10 of the slider; there the ball is 0.4 m lower than at the start."""
+    first = seen(browser)
+    metre = np.ptp(first, axis=0)[0] / 0.2  # pixels, of the ball's 0.2 m
+    x, y = browser.middle("#slider")
+    width = browser.value("slider.getBoundingClientRect().width")
+    browser.click((x + (0.3 - 0.5) * (width - 16), y))  # the thumb is 16 pixels wide
+    assert browser.value("[view.frame, location.hash.split('&')[0]]") == [3, "#frame=3"]
+    assert "0.300 s" in browser.value("byId('time').textContent")
+    assert (seen(browser).mean(axis=0) - first.mean(axis=0))[0] == pytest.approx(0.4 * metre, rel=0.05)

@@ -43,6 +43,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
     "study": ("pandas", "matplotlib", "jinja2", "tomlkit"),
     "contact": ("ipctk",),
     "movie": ("imageio", "imageio_ffmpeg"),
+    "usd": ("pxr",),
     "repair": ("pymeshfix",),
     "xarray": ("xarray",),
     "cuda": ("cupy",),

@@ -36,9 +36,13 @@ class Format(NamedTuple):
 
 
 ONE_FRAME = ("one_frame", "write_one_frame")
+USD = Format(("usd", "write_usd"), True, ("surface",), "Blender, Houdini, Omniverse, usdview")
 FORMATS = {
     ".vtkhdf": Format(("vtkhdf", "write_vtkhdf"), True, ("surface", "lattice"), "ParaView, VTK, pyvista"),
     ".glb": Format(("gltf", "write_glb"), True, ("surface",), "Blender, browsers"),
+    ".usd": USD,
+    ".usda": USD,
+    ".usdc": USD,
     ".obj": Format(ONE_FRAME, False, ("surface",), "nearly everything"),
     ".ply": Format(ONE_FRAME, False, ("surface",), "MeshLab, Blender, trimesh"),
     ".stl": Format(ONE_FRAME, False, ("surface",), "printers"),

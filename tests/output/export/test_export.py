@@ -200,6 +200,8 @@ def test_a_result_without_a_surface(tmp_path: Path):
 
 @pytest.mark.parametrize("ending", FORMATS)
 def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]):
+    if ending.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
     path = tmp_path / "new" / f"y{ending}"
     assert main(["export", str(result), "-o", str(path)]) == 0
     assert capsys.readouterr().out == f"{path}\n" and path.is_file()
@@ -210,8 +212,8 @@ def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.C
 LIMITED = """
 import resource, sys
 from msmpetsc.output.export.formats import FORMATS, export
-for ending, kind in FORMATS.items():
-    kind.load()
+for ending in (".vtkhdf", ".glb"):
+    FORMATS[ending].load()
 import numpy as np
 now = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (now + 64 * 2**20,) * 2)

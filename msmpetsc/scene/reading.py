@@ -14,6 +14,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import Scene, SceneFile
 from msmpetsc.scene.toml import DEEPEST, plain, toml_of
+from msmpetsc.scene.units import with_numbers
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
@@ -54,7 +55,9 @@ def scene_of(
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else ())
-    return Scene(**_given(checked), text=tomli_w.dumps(data) if overrides else file_text, folder=path.parent)
+    numbers = with_numbers(data, checked)
+    text = tomli_w.dumps(numbers) if overrides or numbers != data else file_text
+    return Scene(**_given(checked), text=text, folder=path.parent)
 
 
 def _given(scene: SceneFile) -> dict[str, Any]:
@@ -73,7 +76,7 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     keys = {_override(data, override): override for override in overrides}
     checked = _checked(path, data, None, "", keys)
     try:
-        return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
+        return Scene(**_given(checked), text=tomli_w.dumps(with_numbers(data, checked)), folder=folder)
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 

@@ -15,9 +15,9 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import InitErrorDetails
 
 from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
+from msmpetsc.scene.units import in_si
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -117,11 +117,13 @@ class Table(BaseModel):
     def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Add what pydantic does not check, and lose none of what it does."""
         known = list(cls.model_fields)
-        problems: list[InitErrorDetails] = one_of_problems(data, cls.one_of, known)
+        plain, problems = in_si(data, cls.model_fields)
+        misnamed = {problem["loc"] for problem in problems}
+        problems += one_of_problems(data, cls.one_of, known)
         try:
-            table = handler(data)
+            table = handler(plain)
         except ValidationError as error:
-            problems += restated(error, known)
+            problems += [problem for problem in restated(error, known) if problem["loc"] not in misnamed]
         if problems:
             raise ValidationError.from_exception_data(cls.__name__, problems)
         return table

@@ -1,5 +1,6 @@
 """The keys of a scene as ``msmpetsc keys`` and editors have them: each with its unit, default and range."""
 
+import re
 import tomllib
 
 import pytest
@@ -59,7 +60,10 @@ def accepts(schema: dict, node: dict, value: object) -> bool:
     if "enum" in node and value not in node["enum"]:
         return False
     kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "number": (int, float), "integer": int}
-    if "type" in node and not isinstance(value, kinds[node["type"]]):
+    types = node.get("type", list(kinds))
+    if not any(isinstance(value, kinds[kind]) for kind in ([types] if isinstance(types, str) else types)):
+        return False
+    if isinstance(value, str) and not re.search(node.get("pattern", ""), value):
         return False
     if isinstance(value, dict):
         inner = node.get("properties", {})
@@ -83,6 +87,11 @@ def test_the_json_schema_takes_every_shipped_scene_and_no_mistake(name: str):
     assert not accepts(schema, schema, scene | {"obstacles": []})
     assert not accepts(schema, schema, scene | {"material": {"density": 1000.0}})
     assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": -1.0}})
+    assert accepts(schema, schema, scene | {"time": scene["time"] | {"step": "2.5e-1 ms"}})
+    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "1 mm"}})
+    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "ms"}})
+    assert accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, -9.81]}})
+    assert not accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, "1 m"]}})
 
 
 def test_the_json_schema_has_no_null_which_toml_has_not():

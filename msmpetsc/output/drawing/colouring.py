@@ -100,7 +100,7 @@ def _speed(subject: Subject, _: Result | None) -> Colouring:
 
 def _strain(subject: Subject, _: Result | None) -> Colouring:
     """Colour by the springs' change of length over their rest length, its root mean square around a node."""
-    springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
+    springs, rest_length = subject.springs, subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
     def values(index: int) -> np.ndarray:

@@ -55,7 +55,7 @@ def cut_open(subject: Subject, camera: Camera, shown: tuple[str, ...]) -> Cut:
     parts = {number: cells[behind & (kind == number)] for number in KINDS} if "cells" in shown else {}
     springs = np.empty((0, 2), int)
     if "springs" in shown:
-        springs = subject.array("lattice/springs")
+        springs = subject.springs
         springs = springs[(depth[springs] <= middle).all(axis=1)]
     return Cut({number: part for number, part in parts.items() if len(part)}, springs)
 

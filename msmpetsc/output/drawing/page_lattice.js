@@ -81,7 +81,8 @@ function makeSwitches() {
     label.append(box, name);
     byId("switches").append(label);
   }
-  for (const id of ["switches", "toggles"]) byId(id).hidden = !offered.length;
+  byId("switches").hidden = !offered.length;
+  byId("toggles").textContent = offered.map((name) => ` · ${name[0].toUpperCase()}: ${name}`).join("");
 }
 
 function setShown(name, is) {

@@ -68,6 +68,14 @@ class Subject:
         """Direction (3,) of the scene's picture, from the body to the eye."""
         return self.scene.picture.eye if self.scene else None
 
+    @property
+    def springs(self) -> np.ndarray:
+        """Nodes (s, 2) that springs join. Raises InputError where there are no such nodes."""
+        springs, nodes = self.array("lattice/springs"), len(self.rest.nodes)
+        if springs.size and not 0 <= springs.min() <= springs.max() < nodes:
+            raise InputError(f"{self.name} is damaged: lattice/springs names what is not among its {nodes} nodes")
+        return springs
+
     def fixed(self, index: int) -> np.ndarray:
         """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
         if self.scene is None:

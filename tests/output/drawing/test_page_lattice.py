@@ -16,6 +16,7 @@ from test_page import restored
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.cli.commands.render import subject_of_file
+from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.camera import camera_facing
 from msmpetsc.output.drawing.fabric import BOUNDARY, INTERIOR, cut_open
 from msmpetsc.output.drawing.page import write_page
@@ -87,6 +88,15 @@ def test_a_scene_that_was_not_run_has_its_cells_on_a_page(tmp_path: Path):
     scene = block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), **TABLES)
     assert command.run(parsed(["render", str(scene), "-o", str(path), "--show", "cells"])) == 0
     assert sum(kind["cells"] for kind in data_of(path)["lattice"]["kinds"]) == 32
+
+
+@pytest.mark.parametrize("wrong", [-1, 10**6])
+def test_springs_of_no_nodes_are_damage(tmp_path: Path, falling: Subject, wrong: int):
+    springs = falling.springs.copy()
+    springs[3, 1] = wrong
+    damaged = replace(falling, array=lambda name: springs if name == "lattice/springs" else falling.array(name))
+    with pytest.raises(InputError, match="is damaged: lattice/springs names what is not among its 125 nodes"):
+        written(tmp_path, damaged, "springs")
 
 
 def red_rows(browser: Browser) -> np.ndarray:

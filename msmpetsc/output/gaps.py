@@ -3,14 +3,15 @@
 It goes by positions and the scene alone, so that it is the same for obstacles that reflect and that press.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.loads import Motion, within
-from msmpetsc.scene.motion import ObstacleTable
+from msmpetsc.scene.obstacle import ObstacleTable
 
 USUAL = 0.99  # share of the triangles whose size says how far off the middle of one may be that is near
 CROSSED = 0.1  # of the reach: surfaces that crossed by less are taken for touching
@@ -75,24 +76,44 @@ def unit_vectors(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1), TINY)[:, None]
 
 
-def gaps_to_obstacles(obstacles: Sequence[ObstacleTable], points: np.ndarray, time: float) -> np.ndarray:
+def gaps_to_obstacles(
+    obstacles: Sequence[ObstacleTable], solids: Mapping[int, Surface], points: np.ndarray, time: float
+) -> np.ndarray:
     """Return the distance (n,) [m] of points (n, 3) to the nearest obstacle that is there at a time [s].
 
     It is negative within one, and infinite where there is none.
+
+    solids : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
     """
     gaps = np.full(len(points), np.inf)
-    for obstacle in obstacles:
+    for number, obstacle in enumerate(obstacles):
         if within(time, obstacle.start, obstacle.stop):
-            gaps = np.minimum(gaps, _gaps(obstacle, points - Motion.through(obstacle.path).at(time)))
+            seen_from_it = points - Motion.through(obstacle.path).at(time)
+            own = _gaps(obstacle, seen_from_it) if number not in solids else _gaps_to(solids[number], seen_from_it)
+            gaps = np.minimum(gaps, own)
     return gaps
 
 
 def _gaps(obstacle: ObstacleTable, points: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first."""
-    if obstacle.shape == "sphere":
+    """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first; infinite if unknown."""
+    if obstacle.center is not None:
         return np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
-    if obstacle.shape == "plane":
+    if obstacle.point is not None:
         return (points - np.array(obstacle.point)) @ np.array(obstacle.normal)
+    if obstacle.box is None:
+        return np.full(len(points), np.inf)
     low, high = np.array(obstacle.box)
     beyond = np.maximum(low - points, points - high)  # (n, 3) along the axes, negative within
     return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+
+
+def _gaps_to(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) [m] of points (n, 3) to a surface, negative behind the nearest of its triangles."""
+    if not len(surface.triangles):
+        return np.full(len(points), np.inf)
+    import igl  # for scenes with such obstacles
+
+    squares, number, nearest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)
+    a, b, c = (surface.points[surface.triangles[number, corner]] for corner in range(3))
+    behind = ((points - nearest) * np.cross(b - a, c - a)).sum(axis=1) < 0
+    return np.where(behind, -1, 1) * np.sqrt(squares)

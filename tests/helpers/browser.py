@@ -40,11 +40,14 @@ class Browser:
         for fd in (theirs[0], ours[1], read, write):
             os.close(fd)
         self._from, self._to, self._rest, self._number, self._session = ours[0], theirs[1], b"", 0, ""
-        target = self._ask(
-            "Target.createTarget", url=f"{page.as_uri()}#{address}", newWindow=True, width=size[0], height=size[1]
-        )
-        self._session = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
-        self.until("document.documentElement?.dataset.ready === '1'")
+        window: dict[str, Any] = {"newWindow": True, "width": size[0], "height": size[1]}
+        try:
+            target = self._ask("Target.createTarget", url=f"{page.as_uri()}#{address}", **window)
+            self._session = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
+            self.until("document.documentElement?.dataset.ready === '1'")
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> "Browser":
         return self

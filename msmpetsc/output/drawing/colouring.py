@@ -149,7 +149,7 @@ def _contact(subject: Subject, _: Result | None) -> Colouring:
 
     def values(index: int) -> np.ndarray:
         points = subject.surface(index)
-        gaps = gaps_to_obstacles(scene.obstacle, points, float(subject.times[index]))
+        gaps = gaps_to_obstacles(scene.obstacle, subject.solids, points, float(subject.times[index]))
         if surface is not None:
             gaps = np.minimum(gaps, surface.at(points))
         return reach - np.minimum(gaps, reach)

@@ -215,10 +215,11 @@ function drawBall(camera, { center, radius }, eye) { // without perspective a sp
   drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
 }
 
-function drawShape(camera, { across, upward, toEye }, { number, by }) { // a mesh, in the colour of obstacles
+function drawShape(camera, eye, { number, by }) { // a mesh, in the colour of obstacles
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
-  gl.uniformMatrix3fv(lit.uniforms.turning, false, [0, 1, 2].flatMap((k) => [across[k], upward[k], toEye[k]]));
+  gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
+  gl.uniform1f(lit.uniforms.opacity, 1);
   gl.uniform3fv(lit.uniforms.fixedColour, colour("#a3b6c4"));
   gl.vertexAttrib1f(lit.attributes.number, 0);
   gl.vertexAttrib1f(lit.attributes.fixing, 1);
@@ -270,9 +271,9 @@ function draw() {
   const eye = axesOfEye(), { matrix, rows, shift } = cameraMatrix(eye);
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
-  if (shown.size) drawLattice(matrix, eye);
-  drawBody(matrix, eye);
   for (const shape of state.shapes) drawShape(matrix, eye, shape);
+  if (shown.size) drawLattice(matrix, eye);
+  drawBody(matrix, eye); // after what is seen through it
   drawAxes(matrix, rows, shift);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);

@@ -33,7 +33,7 @@ function startLattice() {
   solid = program(LATTICE);
   const sides = SIDES.flatMap(([a, b, c, d]) => [a, b, c, a, c, d]), all = new Uint32Array(36 * cells.length / 8);
   for (let cell = 0; cell < cells.length / 8; cell++) sides.forEach((corner, k) => { all[36 * cell + k] = 8 * cell + corner; });
-  filled("sides", all, gl.ELEMENT_ARRAY_BUFFER);
+  filled("cellSides", all, gl.ELEMENT_ARRAY_BUFFER);
   filled("springs", Uint32Array.from(springs), gl.ELEMENT_ARRAY_BUFFER);
 }
 
@@ -56,7 +56,7 @@ function drawLattice(camera, eye) {
     use(solid, camera, low, extent);
     gl.uniformMatrix3fv(solid.uniforms.turning, false, turningOf(eye));
     attribute(solid, "position", "cells", 3, gl.FLOAT, false);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers.sides);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers.cellSides);
     let first = 0;
     for (const { cells: count, colour: paint } of data.lattice.kinds) {
       gl.uniform4fv(solid.uniforms.paint, [...colour(paint), 1]);

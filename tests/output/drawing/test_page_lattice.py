@@ -116,6 +116,7 @@ def test_cells_and_springs_are_switched_and_move_with_the_frames(tmp_path: Path,
         browser.value("goTo(2)")
         assert red_rows(browser).mean() - first.mean() == pytest.approx(2 * FALL * metre, abs=2)
         both = browser.picture()
+        assert browser.value("gl.getError()") == 0
         browser.click("#show-cells")
         assert browser.value("[...shown]") == ["springs"] and not len(red_rows(browser))
         lines = browser.picture()

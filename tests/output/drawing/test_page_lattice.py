@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from block_scene import CELL, block_scene
 from browser import CHROMIUM, Browser
 from test_page import restored
@@ -30,8 +31,12 @@ TABLES = {"output": {"surface": True}, "time": {"step": 0.01, "duration": 0.1}}
 
 @pytest.fixture
 def falling(tmp_path: Path) -> Subject:
-    """A cube of four cells along each side, which falls for three frames."""
-    subject, _ = subject_of_file(block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), **TABLES), [])
+    """A cube of four cells along each side, which falls for three frames beside a ball that is drawn as a mesh."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    ball.apply_translation([0.6, 0.25, 0.25])
+    ball.export(tmp_path / "ball.ply")
+    obstacle = {"shape": "mesh", "mesh": {"source": "ball.ply"}}
+    subject, _ = subject_of_file(block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), obstacle=[obstacle], **TABLES), [])
 
     def fallen(points: np.ndarray, index: int) -> np.ndarray:
         return points - np.array([0, 0, FALL * index])
@@ -116,7 +121,7 @@ def test_cells_and_springs_are_switched_and_move_with_the_frames(tmp_path: Path,
         browser.value("goTo(2)")
         assert red_rows(browser).mean() - first.mean() == pytest.approx(2 * FALL * metre, abs=2)
         both = browser.picture()
-        assert browser.value("gl.getError()") == 0
+        assert browser.value("gl.getError()") == 0 and browser.value("data.overlays.states[0].shapes.length") == 1
         browser.click("#show-cells")
         assert browser.value("[...shown]") == ["springs"] and not len(red_rows(browser))
         lines = browser.picture()

@@ -16,6 +16,7 @@ from msmpetsc.model.self_contact.friction import SurfaceFriction
 from msmpetsc.model.self_contact.points import Carried
 
 TINY = np.finfo(float).tiny
+SMALL = 1e-4  # of the barrier's distance: points that move less change the energy by their mean force times that
 
 
 @dataclass(frozen=True)
@@ -89,11 +90,28 @@ class SurfaceContact:
         return self._acting(q) is not None
 
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """Return this rank's part of the energy at q less that at base, friction included [J]."""
-        return self._energy(q) - self._energy(base)
+        """Return this rank's part of the energy at q less that at base, friction included [J].
 
-    def _energy(self, q: np.ndarray) -> float:
-        moment, barrier, energy = self._acting(q), self.contacts.barrier, 0.0
+        Of a small move it is the mean of the forces at both times that: a difference of energies would lose its digits.
+        """
+        after, before = self._acting(q), self._acting(base)
+        if after is None and before is None:
+            return 0.0
+        moved = self.contacts.points(q - base)
+        if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
+            return sum(0.5 * self._work(moment, moved) for moment in (before, after))
+        return self._energy(after) - self._energy(before)
+
+    def _work(self, moment: Moment | None, moved: np.ndarray) -> float:
+        """Return the gradient times a move of the points (p, 3) [m], on rank 0 [J]."""
+        forces = self._forces(moment) if moment else None
+        if forces is None:
+            return 0.0
+        touched, gradient = forces
+        return float(np.vdot(gradient, moved[touched]))
+
+    def _energy(self, moment: Moment | None) -> float:
+        barrier, energy = self.contacts.barrier, 0.0
         if moment is None or barrier is None or moment.points is None:
             return 0.0
         if moment.contacts is not None:

@@ -41,8 +41,12 @@ class FirstGuess:
         guesses = [y, flight, q + self._drift(flight - q)]
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        values = [self.functional.value(self._held(guess)) for guess in guesses]
-        return self._without_crossing(guesses[int(np.argmin(values))])
+        met = self.functional.starts_in_contact
+        if met:  # a free flight cut short, deep in a barrier, is far from where contact holds: q_n is mostly nearer
+            guesses = [self._without_crossing(guess) for guess in guesses]
+        values = [self.functional.value(self._held(guess), met) for guess in guesses]
+        best = guesses[int(np.argmin(values))]
+        return best if met else self._without_crossing(best)
 
     def _without_crossing(self, guess: np.ndarray) -> np.ndarray:
         """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.

@@ -90,14 +90,18 @@ class StepFunctional:
             count_flops(self.elasticity.flops.gradient)
         return Iterate(q, f)
 
-    def value(self, q: np.ndarray) -> float:
-        """g of positions q (l, 3) but for a constant of the step and self-contact [kg m^2]: to compare guesses that are
-        far apart."""
+    def value(self, q: np.ndarray, met: bool = False) -> float:
+        """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart.
+
+        met : self-contact included, which has a value only where no two triangles cross
+        """
         problem, owned = self.problem, slice(self.lattice.owned)
         moved = q[owned] - problem.y[owned]
         acting = self.elasticity.energy(q) - float(np.vdot(moved, problem.load))
         if problem.contact:
             acting += problem.contact.change_at_nodes(q, problem.y)
+            if met and problem.contact.surface:
+                acting += problem.contact.surface.change(q, problem.q)
         inertia = 0.5 * self._inner(moved, moved)
         return self.comm.allreduce(inertia + self.t2 * acting)
 
@@ -120,6 +124,12 @@ class StepFunctional:
     def meets_itself(self) -> bool:
         """Whether the surface does."""
         return self.problem.contact is not None and self.problem.contact.surface is not None
+
+    @property
+    def starts_in_contact(self) -> bool:
+        """Whether parts of the surface push each other where the step begins (collective)."""
+        contact = self.problem.contact
+        return contact is not None and contact.surface is not None and contact.surface.presses(self.problem.q)
 
     def free_share(self, base: np.ndarray, q: np.ndarray) -> float:
         """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""

@@ -98,14 +98,19 @@ def repair(surface: Surface) -> Surface:
     return repaired
 
 
-def simplify(surface: Surface, faces: int) -> Surface:
-    """Reduce to about this many triangles (quadric decimation); a closed surface stays closed."""
+def simplify(surface: Surface, faces: int, haste: int = 7) -> Surface:
+    """Reduce to about this many triangles (quadric decimation); a closed surface stays closed.
+
+    haste : of fast_simplification, which with less goes on to larger errors more slowly, and ends nearer to the surface
+    """
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
     import fast_simplification  # of the extra "mesh"
 
-    points, triangles = fast_simplification.simplify(surface.points, surface.triangles, target_count=int(faces))
+    points, triangles = fast_simplification.simplify(
+        surface.points, surface.triangles, target_count=int(faces), agg=haste
+    )
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     if len(triangles) and examine(surface).closed and not _two_triangles_an_edge(reduced):
         return repair(reduced)  # collapsing edges can pinch thin places

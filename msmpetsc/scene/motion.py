@@ -135,7 +135,8 @@ class SelfContactTable(Table):
 
     distance: Positive | None = Field(
         None,
-        description="parts nearer than this push each other [m]; 3e-4 of the rest bounding box's diagonal if absent",
+        description="parts nearer than this push each other [m]; if absent 3e-4 of the rest bounding box's diagonal, "
+        "or the median distance of a coarser surface from the body's own if that is more",
     )
     friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
     surface: int | None = Field(

@@ -17,6 +17,7 @@ import msmpetsc
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.fields import Frame
+from msmpetsc.model.self_contact.barrier import Barrier
 from msmpetsc.model.self_contact.contacts import Contacts
 from msmpetsc.model.self_contact.term import SMALL, SurfaceContact
 from msmpetsc.scene.reading import load_scene
@@ -218,6 +219,39 @@ def test_a_coarser_surface_lies_on_the_body(tmp_path):
     squares = igl.point_mesh_squared_distance(surface.points, model.surface.points, model.surface.triangles)[0]
     assert squares.max() < 1e-18
     np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
+
+
+def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
+    model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
+    surface, whole = model.collision.surface, model.surface.points
+    off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
+    assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
+    diagonal = np.linalg.norm(np.ptp(whole, axis=0))
+    assert model.collision.law.distance == pytest.approx(np.median(off)) and np.median(off) > 3e-4 * diagonal
+    caplog.clear()
+    far = {"surface": 400, "distance": 1.01 * off.max()}
+    assert build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact=far))).collision.law.distance > off.max()
+    assert "the surface drawn" not in caplog.text
+
+
+def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
+    q, collision, reach = closed(model), model.collision, 8e-4
+    touching = collision.points(q)
+    end = np.clip(model.lattice.nodes[:, 2] / ARM, 0, None) ** 2
+    q[:, 0] -= (2e-3 - GAP) * end * (q[:, 0] < 0)  # the arms are 2 mm apart, of a distance of 1 mm
+    barrier, points = Barrier(collision.surface, collision.law), collision.points(q)
+    barrier.leave_out_neighbours(collision.surface.points)
+    candidates = barrier.candidates(points, reach)
+    clear = barrier.clear_reach(candidates, points, reach)
+    assert 1e-4 < clear < reach
+    least = barrier.least(barrier._pairs(candidates, points, 4e-3), points)
+    assert least == pytest.approx(collision.law.distance + 2 * clear)  # both parts come nearer
+    for seed in range(10):
+        way = np.random.default_rng(seed).normal(size=points.shape)
+        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
+        assert barrier.contacts(candidates, moved).empty()
+    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == 1e-4
+    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == 0
 
 
 @pytest.mark.parametrize(

@@ -77,9 +77,11 @@ class Barrier:
         candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
-    def is_clear(self, candidates: "ipctk.Candidates", points: np.ndarray, reach: float) -> bool:
-        """Return whether none of the pairs can come as near as dhat meanwhile."""
-        return self._pairs(candidates, points, self.law.distance + 2 * reach).empty()
+    def clear_reach(self, candidates: "ipctk.Candidates", points: np.ndarray, reach: float) -> float:
+        """Return how far [m], up to ``reach``, each point may move until a pair comes as near as dhat; 0 where one
+        is."""
+        near = self._pairs(candidates, points, self.law.distance + 2 * reach)
+        return reach if near.empty() else max(0.5 * (self.least(near, points) - self.law.distance), 0.0)
 
     def contacts(self, candidates: "ipctk.Candidates", points: np.ndarray) -> "ipctk.NormalCollisions":
         """Return the pairs nearer than dhat."""

@@ -52,15 +52,15 @@ class Touch:
 class Pairs:
     """Pairs that may meet while no point moves by more than ``reach`` [m] from q (owned, 3), but for a translation.
 
+    clear              : no more than reach [m]; none of them comes near enough to count while no point moves farther
     points, candidates : S there (p, 3) [m] and the pairs, on rank 0
-    is_clear           : none of them can come near enough to count
     """
 
     q: np.ndarray
     reach: float
+    clear: float
     points: np.ndarray
     candidates: "ipctk.Candidates | None"
-    is_clear: bool
 
 
 @dataclass(frozen=True)
@@ -102,12 +102,12 @@ class Contacts:
     def _look(self, q: np.ndarray, reach: float) -> Pairs:
         """Look for pairs at q."""
         points, reach = self.points(q), min(max(reach, self.law.distance), FARTHEST * self.edge)
-        candidates, is_clear = None, True
+        candidates, clear = None, 0.0
         if self.barrier:
             candidates = self.barrier.candidates(points, reach)
-            is_clear = self.barrier.is_clear(candidates, points, reach)
+            clear = self.barrier.clear_reach(candidates, points, reach)
         self._moments.clear()
-        self._pairs = Pairs(q[: self.owned].copy(), reach, points, candidates, self.comm.bcast(is_clear))
+        self._pairs = Pairs(q[: self.owned].copy(), reach, self.comm.bcast(clear), points, candidates)
         return self._pairs
 
     def _moved(self, q: np.ndarray, pairs: Pairs) -> float:
@@ -129,7 +129,7 @@ class Contacts:
         q = q[: self.owned]
         pairs = self._pairs or self._look(q, self.law.distance)
         bound = self._moved(q, pairs)
-        if pairs.is_clear and bound <= pairs.reach:
+        if bound < pairs.clear:
             return Moment(q)
         for moment in self._moments:
             if self._is_same(q, moment.q):
@@ -183,9 +183,10 @@ class Contacts:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
         q, end = q[: self.owned], end[: self.owned]
         pairs = self._pairs or self._look(q, self.law.distance)
-        within = max(self._moved(q, pairs), self._moved(end, pairs)) <= pairs.reach
-        if within and pairs.is_clear:
+        farthest = max(self._moved(q, pairs), self._moved(end, pairs))
+        if farthest < pairs.clear:
             return 1.0
+        within = farthest <= pairs.reach
         start, moved, share = self.points(q), self.points(end - q), 1.0
         if self.barrier:
             share = self.barrier.free_share(start, moved, pairs.candidates if within else None)

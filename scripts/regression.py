@@ -28,8 +28,19 @@ SCENES, STORED = ROOT / "scenes", ROOT / "tests" / "regression"
 CELLS = 400
 FALLS = 30, ("mesh.base=[0, 0, 0.0005]",)  # 0.5 mm above the ground: there after 10 steps of 1 ms
 DRAGS = 6, ()
+FALLING = "{velocity=[0, 0, -1.5]}"  # [m/s]
 # Steps, and what is changed so that these few show what the scene is about.
 SETTINGS = {
+    "armadillo_fold": (
+        8,
+        (
+            "self_contact.surface=2000",
+            "anchor.0.region={box=[[0.9, 0, 0.65], [1, 0.5, 1]], relative=true}",
+            "anchor.0.path=[{time=0.12, by=[-0.075, -0.01, -0.07]}]",
+            "anchor.1.region={box=[[0, 0, 0.65], [0.1, 0.5, 1]], relative=true}",
+            "anchor.1.path=[{time=0.12, by=[0.075, -0.03, -0.07]}]",
+        ),
+    ),
     "armadillo_forehead": DRAGS,
     "armadillo_leg": DRAGS,
     "armadillo_palm": DRAGS,
@@ -39,6 +50,8 @@ SETTINGS = {
     "heart_pull": (10, ("anchor.0.path.0.time=0.08", "anchor.0.stop=0.12")),
     "lung_press_contact": (6, ("self_contact.surface=2000", "obstacle.1.path.0={time=0.08, by=[0, 0, -0.04]}")),
     "lung_press": (6, ("obstacle.1.path.0={time=0.08, by=[0, 0, -0.04]}",)),
+    "pile": (6, ("self_contact.surface=2000", *(f"body.{number}.start={FALLING}" for number in range(4, 8)))),
+    "two_bunnies": (6, ("self_contact.surface=1000", f"body.1.start={FALLING}")),
 }
 
 

@@ -1,4 +1,5 @@
-"""Every scene of the paper at about 1,000 cells: what its figure shows, in numbers from the result file alone.
+"""Every scene of the paper, and those that touch, at about 1,000 cells: what the figure shows, in numbers from the
+result file alone.
 
 Bounds, not values: a coarse lattice is stiffer than the full one, its thin limbs thicker.
 """
@@ -21,6 +22,7 @@ from msmpetsc.scene.schema import SceneFile
 
 SCENES = Path(__file__).parents[1] / "scenes"
 PAPER_CELLS = {"armadillo": 8338, "dragon": 11536, "lung": 6499, "heart": 3126, "bunny": 9946, "brain": 13661}
+TOUCHING_CELLS = {"two_bunnies": 1500, "pile": 1000, "armadillo_fold": 3000}  # of scenes that are not the paper's
 ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
 pytestmark = pytest.mark.timeout(400)
 
@@ -35,6 +37,7 @@ class Result:
             self.nodes, self.mass = file["lattice/nodes"][:], file["lattice/mass"][:]
             self.cells = file["lattice/cells"][:]
             points, self.surface = file["surface/points"][:], file["frames/surface"][:]
+            self.contacts, self.nearest = file["frames/self_contacts"][:], file["frames/self_distance"][:]
         self.h = np.ptp(self.nodes[self.cells[0]], axis=0).max()
         self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
         self.height = np.ptp(self.bounds, axis=0)[2]
@@ -83,20 +86,21 @@ def result(tmp_path_factory):
 
 
 def skip_without_mesh(name: str) -> None:
-    source = tomllib.loads((SCENES / f"{name}.toml").read_text())["mesh"]["source"]
-    try:
-        found = find(source)
-    except InputError as error:
-        pytest.skip(str(error))
-    if found is None:
-        pytest.skip(f"mesh '{source}' is not here: msmpetsc fetch {source}")
+    scene = tomllib.loads((SCENES / f"{name}.toml").read_text())
+    for source in {tables["mesh"]["source"] for tables in scene.get("body", [scene])}:
+        try:
+            found = find(source)
+        except InputError as error:
+            pytest.skip(str(error))
+        if found is None:
+            pytest.skip(f"mesh '{source}' is not here: msmpetsc fetch {source}")
 
 
-def test_every_scene_has_the_papers_cells_and_four_moments():
-    assert len(ALL) == 9
+def test_every_scene_has_the_papers_cells_or_its_own_and_four_moments():
+    assert len(ALL) == 9 + len(TOUCHING_CELLS)
     for name in ALL:
         scene = SceneFile.model_validate(tomllib.loads((SCENES / f"{name}.toml").read_text()))
-        assert scene.cages.count == PAPER_CELLS[name.split("_")[0]]
+        assert scene.cages.count == (TOUCHING_CELLS.get(name) or PAPER_CELLS[name.split("_")[0]])
         assert len(scene.picture.times) == 4 and scene.picture.times[-1] <= scene.time.duration
 
 
@@ -248,3 +252,26 @@ def test_the_bunnys_ears_move_on_while_its_body_has_stopped(result):
     ears = run.mean(run.q, run.zone([0, 0, 0.85], [1, 1, 1]))[:, 2]
     feet = run.mean(run.q, run.zone([0, 0, 0], [1, 1, 0.1]))[:, 2]
     assert ears[turned + 1] < ears[turned] and feet[turned + 1] > feet[turned]
+
+
+# ---- What touches
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_bunnies", "pile"])
+def test_bodies_that_fall_come_to_rest_on_each_other(result, name: str):
+    run = result(name)
+    assert run.contacts[-1] > 0 and run.nearest[-1] > 0
+    assert run.kinetic[-1] < 1e-2 * run.kinetic.max()
+    assert run.surface[-1, :, 2].min() > -0.6 * run.h  # the nodes of an ear meet the ground, not its surface
+    assert run.inverted(-1) == 0
+
+
+@pytest.mark.slow
+def test_the_armadillos_hands_press_each_other_and_spring_back(result):
+    run = result("armadillo_fold")
+    held = run.region(run.scene.anchor[0])
+    let_go = int(np.searchsorted(run.time, run.scene.anchor[0].stop - 1e-9))
+    assert run.contacts[let_go - 1] > 10 > run.contacts[-1]
+    assert abs(run.moved(let_go - 1, held)[0]) > 0.2 and np.linalg.norm(run.moved(-1, held)) < 0.1
+    assert run.inverted(-1) == 0

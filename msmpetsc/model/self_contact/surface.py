@@ -56,7 +56,7 @@ def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: flo
 
 def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:
     """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
-    that cut others, and the mean distance [m] of their own points from them."""
+    that cut others, and the median distance [m] of their own points from them."""
     off = 0.0
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)

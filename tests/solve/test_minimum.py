@@ -25,7 +25,7 @@ from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear import preconditioning
-from msmpetsc.solve.nonlinear.curvature import LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -139,7 +139,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     functional, curvature = stepper.functional, stepper.minimum.curvature
     functional.begin(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.jacobian.hessian.linearise(q, None)
-    found, direction = curvature.lowest(q, curvature.compression(q), False, None)
+    found, direction = curvature.lowest(q, curvature.compression(q), Alarm.NOWHERE, None)
     preconditioner = stepper.jacobian.preconditioner
     assert preconditioner.multigrid is None and (preconditioner.for_searches is not None) == multigrid
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)

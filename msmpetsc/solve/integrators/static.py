@@ -26,7 +26,7 @@ from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.support import refuse_free_bodies
-from msmpetsc.solve.nonlinear.curvature import NONE
+from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 
 SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked for first
@@ -72,7 +72,7 @@ class Static(ImplicitEuler):
         """The lowest eigenvalue of M^(-1) tau^2 (Hessian of E) of the body at rest, roughly (collective)."""
         minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
         minimum.estimate.linearise(rest)
-        return minimum.curvature.lowest(rest, NONE, False, None)[0]
+        return minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)

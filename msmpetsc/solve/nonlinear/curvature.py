@@ -10,6 +10,7 @@ other steps the mode found last is followed in a few iterations.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,14 @@ TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
 
 Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
+
+
+class Alarm(IntEnum):
+    """Where something has shown a negative curvature."""
+
+    NOWHERE = 0
+    ON_THE_WAY = 1  # at an iterate that the step has left
+    HERE = 2
 
 
 class Effort(NamedTuple):
@@ -112,18 +121,17 @@ class LowestCurvature:
         return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
 
     def lowest(
-        self, q: np.ndarray, compression: Compression, alarmed: bool, hint: PETSc.Vec | None
+        self, q: np.ndarray, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[float, np.ndarray]:
         """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
 
         q       : positions (l, 3) [m] that H was linearised at last
-        alarmed : something showed a negative curvature
         hint    : a direction that may have part in it
         """
-        if alarmed or compression.resists or self.mode is None or compression.exceeds(self.searched):
-            self.searched = NONE if alarmed else compression  # what was doubtful is so in the next step, too
+        if alarm or compression.resists or self.mode is None or compression.exceeds(self.searched):
+            self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
             with self.preconditioner.searching(q, self.functional.problem.contact):
-                values, modes = self._search_at_length(q, hint, EFFORT if alarmed else self.effort)
+                values, modes = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         else:
             its = self.effort.followed
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.solve.nonlinear.curvature import LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.rounding import Rounding
@@ -36,7 +36,7 @@ class StepError:
     residual    : |F|_(M^-1) of the last iterate
     early       : how many times the goal an error may be to be estimated
     corrected   : the last iterate's error was estimated, so that its Newton correction is known
-    alarmed     : something has shown a negative curvature
+    alarm       : where something has shown a negative curvature
     at_rounding : F is nothing but rounding
     doubts      : how often the step came to a point that is no minimum, or farther from one than it seemed
     """
@@ -47,7 +47,7 @@ class StepError:
     residual: float = np.inf
     early: float = EARLY
     corrected: bool = False
-    alarmed: bool = False
+    alarm: Alarm = Alarm.NOWHERE
     at_rounding: bool = False
     doubts: int = 0
 
@@ -80,7 +80,7 @@ class ErrorControl:
     def judge(self, iterate: Iterate) -> None:
         """Know the error of an iterate; only a bound on it while that is far too large."""
         now, functional = self.now, self.functional
-        now.corrected = False
+        now.corrected, now.alarm = False, min(now.alarm, Alarm.ON_THE_WAY)
         now.residual, distance = functional.dual_norm(iterate.f), functional.distance(iterate.q)
         now.at_rounding = self.rounding.is_all_of(iterate.f)
         now.error = self._error(iterate, distance)
@@ -104,7 +104,7 @@ class ErrorControl:
         enough = EARLY * goal * distance if goal else np.inf
         length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
         if not np.isfinite(length):
-            now.alarmed = True
+            now.alarm = Alarm.HERE
             return now.bound
         if self.estimate.missing is None:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0

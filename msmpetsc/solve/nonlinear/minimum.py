@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
-from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
@@ -51,12 +51,12 @@ class Minimum:
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
 
     def examine(
-        self, x: PETSc.Vec, corrected: bool, compression: Compression, alarmed: bool, enough: float
+        self, x: PETSc.Vec, corrected: bool, compression: Compression, alarm: Alarm, enough: float
     ) -> Examination:
         """Examine x, or rather the point that is x less its estimated error.
 
         corrected : whether estimate.correction is of x
-        alarmed   : whether something has shown a negative curvature
+        alarm     : where something has shown a negative curvature
         enough    : the length of an error that will do, |e|_M
         """
         functional, estimate = self.functional, self.estimate
@@ -72,8 +72,8 @@ class Minimum:
         nearer = functional.evaluate(self.nearer, self.f)
         estimate.linearise(nearer.q)
         bent = self._bent()
-        hint = estimate.correction if alarmed else None
-        value, direction = self.curvature.lowest(nearer.q, compression, alarmed, hint)
+        hint = estimate.correction if alarm else None
+        value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
         if value < 0:
             return Examination(np.inf, direction, value)
         value = min(value, 1.0)
@@ -81,7 +81,7 @@ class Minimum:
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
             return Examination(self.rounding.relative(first + rest, functional.distance(nearer.q)))
         if corrected and estimate.missing is not None and value <= CONVEX:
-            return self.examine(x, self._estimate_closely(x), compression, alarmed, enough)
+            return self.examine(x, self._estimate_closely(x), compression, alarm, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
             return Examination(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
         return Examination(self._second_estimate(nearer, first, rest, enough, value))

@@ -15,7 +15,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.nonlinear.curvature import LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
@@ -238,7 +238,7 @@ class Stepper:
         if compression.is_harmless:
             return True
         now, enough = control.now, control.target * functional.distance(q) if control.target else np.inf
-        examination = self.minimum.examine(self.x, now.corrected, compression, now.alarmed, enough)
+        examination = self.minimum.examine(self.x, now.corrected, compression, now.alarm, enough)
         now.error = examination.error
         if self.budget or now.error <= control.target or (now.at_rounding and not np.isinf(now.error)):
             return True
@@ -374,7 +374,8 @@ class Stepper:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
         if its > 0 or not self.has_npc:  # else known since _is_solved
             control.judge(iterate)
-        control.now.alarmed |= self.ksp.reason == INDEFINITE
+        if self.ksp.reason == INDEFINITE:
+            control.now.alarm = max(control.now.alarm, Alarm.ON_THE_WAY)
         if self.observer:
             self.observer(iterate.q)
         if not np.isfinite(control.now.residual):

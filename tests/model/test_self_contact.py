@@ -242,16 +242,16 @@ def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
     barrier, points = Barrier(collision.surface, collision.law), collision.points(q)
     barrier.leave_out_neighbours(collision.surface.points)
     candidates = barrier.candidates(points, reach)
-    clear = barrier.clear_reach(candidates, points, reach)
-    assert 1e-4 < clear < reach
-    least = barrier.least(barrier._pairs(candidates, points, 4e-3), points)
+    clear, anywhere = barrier.clear_reach(candidates, points, reach)
+    assert 1e-4 < clear < reach and anywhere == clear  # the tube has no creases
+    least = barrier._least(barrier._pairs(candidates, points, 4e-3), points)
     assert least == pytest.approx(collision.law.distance + 2 * clear)  # both parts come nearer
     for seed in range(10):
         way = np.random.default_rng(seed).normal(size=points.shape)
         moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
-        assert barrier.contacts(candidates, moved).empty()
-    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == 1e-4
-    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == 0
+        assert not barrier.pushing(barrier.contacts(candidates, moved))
+    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == (1e-4, 1e-4)
+    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == (0, 0)
 
 
 @pytest.mark.parametrize(

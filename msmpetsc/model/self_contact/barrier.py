@@ -6,20 +6,26 @@ distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begi
 pairs count, so that the energy is continuous: with fewer (Chen et al. 2025, Offset Geometric Contact) it jumps where
 one comes to count or ceases to, and line searches end there.
 
+Pairs that are near at rest for being neighbours push each other from smaller distances, each set of them from its own
+(self_contact.creases); so contacts are one set for each distance.
+
 ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.model.self_contact.creases import creases, together
 from msmpetsc.model.self_contact.neighbours import neighbours
 
 if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
+
+ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each distance that pairs push from
 
 KEPT = 0.9  # of the way to where surfaces meet
 PIECE = 2.0  # edges that points move in one piece of a way
@@ -59,33 +65,49 @@ class Barrier:
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)
         ends = surface.points[edges]
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
-        barrier = ipctk.NormalizedClampedLogBarrier()
-        self.potential = ipctk.BarrierPotential(barrier, law.distance, law.stiffness)
         self.ccd = ipctk.AdditiveCCD()
+        self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
+        self.creases: list[ipctk.Candidates] = []  # pairs of each distance after the first
+        self.folded: ipctk.Candidates = ipctk.Candidates()  # all of them
 
-    def leave_out_neighbours(self, points: np.ndarray) -> int:
-        """Let no pairs of points count that are near at rest for being neighbours on the surface, points (p, 3) [m] at
-        rest; how many these are."""
+    def _potential(self, distance: float) -> "ipctk.BarrierPotential":
+        """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
+        stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
+        return self.ipctk.BarrierPotential(self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness)
+
+    def leave_out_neighbours(self, points: np.ndarray) -> tuple[int, int]:
+        """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
+        (p, 3) [m] at rest; how many these are, and how many do not push at all."""
         pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
         if pairs:
             self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
-        return len(pairs)
+        sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
+        self.creases, self.folded = list(sets.values()), together(list(sets.values()))
+        self.distances += sets
+        self.potentials += [self._potential(distance) for distance in sets]
+        return len(self.folded), dropped
 
     def candidates(self, points: np.ndarray, reach: float) -> "ipctk.Candidates":
-        """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m]."""
+        """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m], but
+        for those in creases."""
         candidates = self.ipctk.Candidates()
         candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
-    def clear_reach(self, candidates: "ipctk.Candidates", points: np.ndarray, reach: float) -> float:
-        """Return how far [m], up to ``reach``, each point may move until a pair comes as near as dhat; 0 where one
-        is."""
-        near = self._pairs(candidates, points, self.law.distance + 2 * reach)
-        return reach if near.empty() else max(0.5 * (self.least(near, points) - self.law.distance), 0.0)
+    def clear_reach(self, candidates: "ipctk.Candidates", points: np.ndarray, reach: float) -> tuple[float, float]:
+        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
+        from, and until any pair of the surface does; 0 where one is."""
+        clear = [reach]
+        for pairs, distance in zip((candidates, *self.creases), self.distances, strict=True):
+            near = self._pairs(pairs, points, distance + 2 * reach)
+            clear.append(reach if near.empty() else max(0.5 * (self._least(near, points) - distance), 0.0))
+        return clear[1], min(clear)
 
-    def contacts(self, candidates: "ipctk.Candidates", points: np.ndarray) -> "ipctk.NormalCollisions":
-        """Return the pairs nearer than dhat."""
-        return self._pairs(candidates, points, self.law.distance)
+    def contacts(self, candidates: "ipctk.Candidates | None", points: np.ndarray) -> ContactSets:
+        """Return the pairs nearer than they push from, one set for each distance; of creases only without
+        ``candidates``."""
+        kinds = zip((candidates or self.ipctk.Candidates(), *self.creases), self.distances, strict=True)
+        return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
 
     def _pairs(self, candidates: Any, points: np.ndarray, distance: float) -> "ipctk.NormalCollisions":
         pairs = self.ipctk.NormalCollisions()
@@ -93,48 +115,66 @@ class Barrier:
         pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
         return pairs
 
-    def energy(self, contacts: "ipctk.NormalCollisions", points: np.ndarray) -> float:
-        """Return the barrier's energy [J]."""
-        return self.potential(contacts, self.mesh, np.asfortranarray(points))
+    def pushing(self, contacts: ContactSets) -> list[tuple["ipctk.BarrierPotential", "ipctk.NormalCollisions"]]:
+        """Return the sets that are not empty, each with its barrier."""
+        return [(p, pairs) for p, pairs in zip(self.potentials, contacts, strict=True) if not pairs.empty()]
 
-    def gradient(self, contacts: "ipctk.NormalCollisions", points: np.ndarray) -> np.ndarray:
+    def energy(self, contacts: ContactSets, points: np.ndarray) -> float:
+        """Return the barriers' energy [J]."""
+        points = np.asfortranarray(points)
+        return sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts))
+
+    def gradient(self, contacts: ContactSets, points: np.ndarray) -> np.ndarray:
         """Return its gradient (p, 3) [N]."""
-        return self.potential.gradient(contacts, self.mesh, np.asfortranarray(points)).reshape(-1, 3)
+        gradient, points = np.zeros(points.size), np.asfortranarray(points)
+        for potential, pairs in self.pushing(contacts):
+            gradient += potential.gradient(pairs, self.mesh, points)
+        return gradient.reshape(-1, 3)
 
-    def hessian(self, contacts: "ipctk.NormalCollisions", points: np.ndarray, projected: bool) -> "csc_matrix":
-        """Return its Hessian (3p, 3p) [N/m]; ``projected`` leaves out the negative part of each pair."""
-        kinds = self.ipctk.PSDProjectionMethod
+    def hessian(self, contacts: ContactSets, points: np.ndarray, projected: bool) -> "list[csc_matrix]":
+        """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
+        kinds, points = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
         kind = kinds.CLAMP if projected else kinds.NONE
-        return self.potential.hessian(contacts, self.mesh, np.asfortranarray(points), kind)
+        return [potential.hessian(pairs, self.mesh, points, kind) for potential, pairs in self.pushing(contacts)]
 
-    def least(self, contacts: "ipctk.NormalCollisions", points: np.ndarray) -> float:
-        """Return the least distance [m]; infinite where no pair is nearer than dhat."""
-        return float(np.sqrt(contacts.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
+    def least(self, contacts: ContactSets, points: np.ndarray) -> float:
+        """Return the least distance [m]; infinite where there are no contacts."""
+        return min((self._least(pairs, points) for _, pairs in self.pushing(contacts)), default=np.inf)
+
+    def _least(self, pairs: "ipctk.NormalCollisions", points: np.ndarray) -> float:
+        return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
     def free_share(self, start: np.ndarray, moved: np.ndarray, candidates: "ipctk.Candidates | None") -> float:
         """Return the share, up to 1, of a straight way that points go from start (p, 3) by ``moved`` (p, 3) [m]
         without any meeting.
 
-        candidates : pairs that may meet on it; None: they are looked for piece by piece
+        candidates : pairs that may meet on it, besides those in creases; None: they are looked for piece by piece
         """
         moved = moved - moved.mean(axis=0)
         if candidates is not None:
-            share = self._share(start, start + moved, candidates)
-            return share if share >= 1 else KEPT * share
+            return _kept(self._share(start, start + moved, candidates, self.folded))
         farthest = float(np.sqrt((moved**2).sum(axis=1).max()))
         whole = max(int(np.ceil(farthest / (PIECE * self.edge))), 1)
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
             swept = self.ipctk.Candidates()
             swept.build(self.mesh, *map(np.asfortranarray, (begin, end)), 0.0, self.ipctk.LBVH())
-            share = self._share(begin, end, swept)
+            share = self._share(begin, end, swept, self.folded)
             if share < 1:
                 return KEPT * (piece + share) / whole
         return 1.0 if whole <= PIECES else PIECES / whole
 
-    def _share(self, start: np.ndarray, end: np.ndarray, candidates: "ipctk.Candidates") -> float:
-        start, end = np.asfortranarray(start), np.asfortranarray(end)
-        return candidates.compute_collision_free_stepsize(self.mesh, start, end, 0.0, self.ccd)
+    def free_share_in_creases(self, start: np.ndarray, moved: np.ndarray) -> float:
+        """Return the same where no others can meet."""
+        return _kept(self._share(start, start + moved, self.folded))
+
+    def _share(self, start: np.ndarray, end: np.ndarray, *candidates: "ipctk.Candidates") -> float:
+        ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
+        return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
+
+
+def _kept(share: float) -> float:
+    return share if share >= 1 else KEPT * share
 
 
 def crossings(surface: Surface) -> np.ndarray:

@@ -15,7 +15,8 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw
+from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets
+from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
 
 if TYPE_CHECKING:
@@ -52,12 +53,14 @@ class Touch:
 class Pairs:
     """Pairs that may meet while no point moves by more than ``reach`` [m] from q (owned, 3), but for a translation.
 
-    clear              : no more than reach [m]; none of them comes near enough to count while no point moves farther
+    apart              : no more than reach [m]; none of them comes near enough to count while no point moves farther
+    clear              : no more than that [m]; nor does any pair in a crease, which is not among them
     points, candidates : S there (p, 3) [m] and the pairs, on rank 0
     """
 
     q: np.ndarray
     reach: float
+    apart: float
     clear: float
     points: np.ndarray
     candidates: "ipctk.Candidates | None"
@@ -75,7 +78,7 @@ class Moment:
     q: np.ndarray
     count: int = 0
     points: np.ndarray | None = None
-    contacts: "ipctk.NormalCollisions | None" = None
+    contacts: "ContactSets | None" = None
 
 
 class Contacts:
@@ -102,12 +105,13 @@ class Contacts:
     def _look(self, q: np.ndarray, reach: float) -> Pairs:
         """Look for pairs at q."""
         points, reach = self.points(q), min(max(reach, self.law.distance), FARTHEST * self.edge)
-        candidates, clear = None, 0.0
+        candidates, ways = None, (0.0, 0.0)
         if self.barrier:
             candidates = self.barrier.candidates(points, reach)
-            clear = self.barrier.clear_reach(candidates, points, reach)
+            ways = self.barrier.clear_reach(candidates, points, reach)
+        apart, clear = self.comm.bcast(ways)
         self._moments.clear()
-        self._pairs = Pairs(q[: self.owned].copy(), reach, self.comm.bcast(clear), points, candidates)
+        self._pairs = Pairs(q[: self.owned].copy(), reach, apart, clear, points, candidates)
         return self._pairs
 
     def _moved(self, q: np.ndarray, pairs: Pairs) -> float:
@@ -137,8 +141,9 @@ class Contacts:
         points = self.points(q)
         if bound > pairs.reach and not self._serve(pairs, points):
             pairs = self._look(q, FARTHEST * self.edge)
-        contacts = self.barrier.contacts(pairs.candidates, points) if self.barrier else None
-        count = self.comm.bcast(len(contacts) if contacts is not None else 0)
+        near = pairs.candidates if bound >= pairs.apart else None
+        contacts = self.barrier.contacts(near, points) if self.barrier else None
+        count = self.comm.bcast(sum(map(len, contacts or ())))
         self._moments = [Moment(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
@@ -186,10 +191,11 @@ class Contacts:
         farthest = max(self._moved(q, pairs), self._moved(end, pairs))
         if farthest < pairs.clear:
             return 1.0
-        within = farthest <= pairs.reach
         start, moved, share = self.points(q), self.points(end - q), 1.0
-        if self.barrier:
-            share = self.barrier.free_share(start, moved, pairs.candidates if within else None)
+        if self.barrier and farthest < pairs.apart:
+            share = self.barrier.free_share_in_creases(start, moved)
+        elif self.barrier:
+            share = self.barrier.free_share(start, moved, pairs.candidates if farthest <= pairs.reach else None)
         return self.comm.bcast(share)
 
 
@@ -204,10 +210,16 @@ def _extend(end, start, ends):
 
 def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:
     barrier = Barrier(surface, law)
-    if left_out := barrier.leave_out_neighbours(surface.points):
+    folded, dropped = barrier.leave_out_neighbours(surface.points)
+    if folded:
         log.info(
-            "self_contact: %d pairs of points in creases of the surface are nearer than self_contact.distance = %.3g m "
-            "at rest: they are left out, and may cross; a smaller distance leaves out fewer",
-            left_out, law.distance,
+            "self_contact: %d pairs of the surface's parts are in creases, nearer than self_contact.distance = %.3g m "
+            "at rest or next to such: they push each other from smaller distances, down to %.3g m",
+            folded, law.distance, barrier.distances[-1],
+        )  # fmt: skip
+    if dropped:
+        log.warning(
+            "self_contact: %d pairs of the surface's parts in creases all but touch at rest, nearer than %.3g m: they "
+            "are left out, and may cross", dropped, NEAREST * law.distance,
         )  # fmt: skip
     return barrier

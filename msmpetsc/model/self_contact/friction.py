@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msmpetsc.model.self_contact.barrier import Barrier
+from msmpetsc.model.self_contact.barrier import Barrier, ContactSets
 
 if TYPE_CHECKING:
     import ipctk
@@ -19,25 +19,32 @@ class SurfaceFriction:
     stick    : slip [m] below which it fades to nothing
     """
 
-    def __init__(self, barrier: Barrier, contacts: "ipctk.NormalCollisions", start: np.ndarray, stick: float):
-        ipctk, self.mesh, self.start = barrier.ipctk, barrier.mesh, start
-        self.contacts = ipctk.TangentialCollisions()
-        self.contacts.build(
-            self.mesh, np.asfortranarray(start), contacts, barrier.potential, barrier.law.friction
-        )  # its normals and pushes stay
-        self.potential = ipctk.FrictionPotential(stick)
+    def __init__(self, barrier: Barrier, contacts: ContactSets, start: np.ndarray, stick: float):
+        library, self.mesh, self.start = barrier.ipctk, barrier.mesh, start
+        self.contacts: list[ipctk.TangentialCollisions] = []
+        for potential, pairs in barrier.pushing(contacts):
+            self.contacts.append(library.TangentialCollisions())
+            self.contacts[-1].build(
+                self.mesh, np.asfortranarray(start), pairs, potential, barrier.law.friction
+            )  # its normals and pushes stay
+        self.potential = library.FrictionPotential(stick)
 
     def energy(self, points: np.ndarray) -> float:
         """Return the potential [J] of points that came to S (p, 3) [m]."""
-        return self.potential(self.contacts, self.mesh, self._slip(points))
+        slip = self._slip(points)
+        return sum(self.potential(pairs, self.mesh, slip) for pairs in self.contacts)
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
         """Return its gradient (p, 3) [N]."""
-        return self.potential.gradient(self.contacts, self.mesh, self._slip(points)).reshape(-1, 3)
+        slip, gradient = self._slip(points), np.zeros(points.size)
+        for pairs in self.contacts:
+            gradient += self.potential.gradient(pairs, self.mesh, slip)
+        return gradient.reshape(-1, 3)
 
-    def hessian(self, points: np.ndarray) -> "csc_matrix":
-        """Return its Hessian (3p, 3p) [N/m], which is positive semidefinite."""
-        return self.potential.hessian(self.contacts, self.mesh, self._slip(points))
+    def hessian(self, points: np.ndarray) -> "list[csc_matrix]":
+        """Return the terms (3p, 3p) [N/m] of its Hessian, which is positive semidefinite."""
+        slip = self._slip(points)
+        return [self.potential.hessian(pairs, self.mesh, slip) for pairs in self.contacts]
 
     def _slip(self, points: np.ndarray) -> np.ndarray:
         return np.asfortranarray(points - self.start)

@@ -2,7 +2,8 @@
 
 At a sharp crease, or between needle-shaped triangles, parts of the surface that share no point are nearer than dhat at
 rest. They would push each other from the start, and bend what should be at rest. A few rings of triangles apart at the
-most, they are one piece of surface, and pairs of their points are left out. Others as near at rest do push.
+most, they are one piece of surface, and pairs of their points are left out here: they push from smaller distances
+(self_contact.creases). Others as near at rest do push.
 """
 
 from collections.abc import Mapping

@@ -170,8 +170,8 @@ class SurfaceContact:
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
             return None
-        parts = [barrier.hessian(moment.contacts, moment.points, projected)] if moment.contacts is not None else []
-        parts += [self.friction.hessian(moment.points)] if self.friction else []
+        parts = barrier.hessian(moment.contacts, moment.points, projected) if moment.contacts is not None else []
+        parts += self.friction.hessian(moment.points) if self.friction else []
         whole = csr_array(sum(parts))
         touched = np.flatnonzero(np.diff(whole.indptr).reshape(-1, 3).any(axis=1))
         numbers = (3 * touched[:, None] + np.arange(3)).ravel()

@@ -1,18 +1,20 @@
 """The surface of a moment, W @ positions, computed only for frames that are written."""
 
+import numba
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.kernel import kernel
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.model.lattice import Lattice
 
 
-@kernel
-def _weighted_sums(first, count, step, points, starts, columns, weights, nodes):
-    """Multiply as SciPy's CSR matrices do, a tenth as fast for three columns."""
-    for i in range(first, count, step):
+@numba.njit(cache=True)
+def _weighted_sums(
+    points: np.ndarray, starts: np.ndarray, columns: np.ndarray, weights: np.ndarray, nodes: np.ndarray
+) -> None:
+    """Write W (in CSR form) times nodes (k, 3) into points (v, 3): as SciPy does, in three fifths of the time."""
+    for i in range(len(points)):
         x = y = z = 0.0
         for k in range(starts[i], starts[i + 1]):
             weight, node = weights[k], columns[k]
@@ -40,7 +42,7 @@ class SurfaceMotion:
         self.scatter.scatter(self.nodes, self.needed)
         nodes = np.asarray(self.needed.array_r).reshape(-1, 3)
         points = np.empty((len(self.starts) - 1, 3))
-        _weighted_sums(len(points), points, self.starts, self.columns, self.weights, nodes)
+        _weighted_sums(points, self.starts, self.columns, self.weights, nodes)
         return points
 
     def destroy(self) -> None:

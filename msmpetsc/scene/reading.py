@@ -50,7 +50,7 @@ def scene_of(
     """
     overrides, data = list(overrides), _parse(path, file_text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
-        raise InputError(f"{path} is a study, no scene: msmpetsc study {path}")
+        raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:

@@ -53,7 +53,7 @@ def test_a_study_given_to_run_is_named_as_one(tmp_path: Path, capsys):
     study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
     assert main(["run", str(study)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith(f"{study} is a study, no scene: msmpetsc study {study}")
+    assert line.endswith(f"{study}: is a study, no scene: msmpetsc study {study}")
 
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):

@@ -45,7 +45,6 @@ def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: np.ndarra
 
     bounds : (b, 2, 3) corners of the box around each body at rest [m]
     """
-
     solids = {number: obstacle.solid for number, obstacle in enumerate(obstacles)}
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
 

@@ -44,12 +44,10 @@ class Penalty:
         state = self.at(time, sides)
         if self.friction == 0:
             return state
-        inside, face = self.obstacle.depths(q, time - time_step, sides)
-        nodes = np.flatnonzero(inside > 0)
-        normal = self.obstacle.normals_at(q[nodes], time - time_step, face[nodes])
+        nodes, depth, normal = self.at(time - time_step, sides).pressed(q)
         path = self.obstacle.path
         carried = q[nodes] + like(q, path.at(time) - path.at(time - time_step))
-        limit = self.friction * self.stiffness * inside[nodes]
+        limit = self.friction * self.stiffness * depth
         return replace(state, friction=Friction(nodes, normal, carried, limit, self.stick * time_step))
 
 

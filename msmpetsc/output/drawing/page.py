@@ -27,6 +27,7 @@ from msmpetsc.output.drawing.legend import entries_of
 from msmpetsc.output.drawing.overlays import Overlays
 from msmpetsc.output.drawing.shots import Shot, Style, Survey, shots_of, survey
 from msmpetsc.output.drawing.subject import FARTHEST, Subject
+from msmpetsc.output.gaps import TINY, unit_vectors
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
@@ -209,9 +210,8 @@ def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
 def solid_facts(surface: Surface) -> dict[str, list]:
     """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
     corners = surface.points[surface.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)[:, None]
-    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=1e-300) + 1e-300)))
+    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=TINY))))
     return {
         "corners": np.round(corners, digits).ravel().tolist(),
         "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel().tolist(),

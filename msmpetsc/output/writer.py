@@ -81,6 +81,7 @@ class ResultFile:
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm, self._begin, self._gathers = comm, begin, gathers
         self._file: h5py.File | None = None  # open on rank 0 only
+        self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
         self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
@@ -160,6 +161,8 @@ class ResultFile:
             if self._file is not None:
                 self._publish(self._file)
                 self._same = os.open(self.path, os.O_RDONLY)
+                names = FRAME_FIELDS.keys() - {"time", "position", "surface"}
+                self._numbers = {name: self._file[f"frames/{name}"] for name in names}
         if self._comm.size > 1 and not self._gathers:
             self._direct = open_on_all_ranks(self._comm, self.path)
 
@@ -173,11 +176,10 @@ class ResultFile:
             self._collect(frame.surface, dtype, self._points, "frames/surface", index)
         with self._together():
             if self._file is not None:
-                frames = self._file["frames"]
-                for name in FRAME_FIELDS.keys() - {"time", "position", "surface"}:
-                    frames[name][index] = getattr(frame, name)
+                for name, numbers in self._numbers.items():
+                    numbers[index] = getattr(frame, name)
                 self._file.flush()
-                frames["time"][index] = frame.time  # from here on the frame is there
+                self._file["frames/time"][index] = frame.time  # from here on the frame is there
                 self._file.flush()
         self.finished += 1
 
@@ -304,7 +306,7 @@ class ResultFile:
             if descriptor is not None:
                 os.close(descriptor)
         self._direct = self._same = None
-        file, self._file = self._file, None
+        file, self._file, self._numbers = self._file, None, {}
         if file is None:
             return
         self._part.unlink(missing_ok=True)  # still there only if no frames were started

@@ -37,11 +37,12 @@ class Solver(Table):
 
 
 class Safety(Table):
-    """What is done about a step that fails."""
+    """What is done about a step that fails, and what is watched."""
 
     on_failure: Literal["stop", "substep", "fallback"] = Field(
         "stop", description="stop the run; take that step in shorter ones; or solve it with a slower, robust method"
     )
+    checks: bool = Field(True, description="balance the energy of every step, and count cells inside out")
 
 
 class Output(Table):

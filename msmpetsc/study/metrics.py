@@ -99,7 +99,7 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
     row: Row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
     if "energy_gained" in series:
         row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
-    if "inverted" in series:
+    if "inverted" in series and series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
     return row
 

@@ -21,7 +21,7 @@ from msmpetsc.backend.arrays import greatest, like, to_host
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 MOST = 100  # iterations of a long search
@@ -98,6 +98,7 @@ class LowestCurvature:
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
+        self.known: tuple[StepProblem | None, np.ndarray, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
         self.vectors: list[PETSc.Vec] | None = None
@@ -109,7 +110,15 @@ class LowestCurvature:
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
     def compression(self, q: np.ndarray) -> Compression:
-        """Compression at positions q (l, 3) [m]."""
+        """Compression at positions q (l, 3) [m] in the functional's problem."""
+        problem, at, known = self.known
+        same = problem is self.functional.problem and bool(np.array_equal(at, q))
+        if not self.comm.allreduce(same, MPI.LAND):
+            known = self._compression(q)
+            self.known = self.functional.problem, q, known
+        return known
+
+    def _compression(self, q: np.ndarray) -> Compression:
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity, contact = elasticity.concavity(q)[free], functional.problem.contact

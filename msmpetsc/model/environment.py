@@ -10,8 +10,8 @@ from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 from msmpetsc.model.loads import Anchor, Load, OwnForce
-from msmpetsc.model.self_contact.contacts import Contacts, Touch
-from msmpetsc.model.self_contact.term import SurfaceContact
+from msmpetsc.model.self_contact.contacts import Touch
+from msmpetsc.model.self_contact.kinds import contacts_of, term_of
 
 
 class Environment:
@@ -27,7 +27,7 @@ class Environment:
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.reflections = model.penalties, model.reflections
-        self.self_contact = Contacts(self.lattice.table.comm, model.collision) if model.collision else None
+        self.self_contact = contacts_of(self.lattice.table.comm, model.collision) if model.collision else None
         self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [r.obstacle for r in self.reflections]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
@@ -161,7 +161,7 @@ class Environment:
         states = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
         if self.self_contact:
             self.self_contact.expect(q, end)
-            surface = SurfaceContact(self.self_contact, q, time_step)
+            surface = term_of(self.self_contact, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
     def touch(self, q: np.ndarray) -> Touch:

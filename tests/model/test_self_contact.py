@@ -206,11 +206,6 @@ def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, capl
     assert count_crossings(model.surface.points, model.surface.triangles) > 0
 
 
-def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
-    with pytest.raises(InputError, match="too many to do without"):
-        build_model(COMM, load_scene(crossing_boxes(tmp_path, 0.2, 0)))
-
-
 def test_a_coarser_surface_lies_on_the_body(tmp_path):
     path = pinch_scene(tmp_path, self_contact={"surface": 400})
     model = build_model(COMM, load_scene(path))

@@ -6,14 +6,15 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
-from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import compact, simplify
 from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.barrier import BarrierLaw, crossings
+from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.contacts import CollisionSurface
+from msmpetsc.model.self_contact.overlapping import overlapping_surface
 from msmpetsc.model.self_contact.points import SurfacePoints
 from msmpetsc.scene.motion import SelfContactTable
 from msmpetsc.scene.schema import Scene
@@ -27,14 +28,25 @@ PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (model.material)
 
 
 def collision_surface(
-    comm: MPI.Comm, table: SelfContactTable, scene: Scene, bodies: Sequence[Body], cages: Cages, lattice: Lattice
-) -> CollisionSurface:
-    """Return the surface of all bodies that meets itself (collective). Raises InputError where more than a tenth of it
-    cuts itself."""
+    comm: MPI.Comm,
+    table: SelfContactTable,
+    scene: Scene,
+    bodies: Sequence[Body],
+    cages: Cages,
+    lattice: Lattice,
+    around: np.ndarray,
+) -> CollisionSurface | OverlappingSurface:
+    """Return the surface of all bodies that meets itself (collective); one that is only pushed out of the body's cells
+    where more than a tenth of it cuts itself.
+
+    around : (c, 8) local corner nodes of the cells around the nodes of this rank
+    """
     prepared = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table))
-    surfaces, off = prepared or ([], 0.0)
+    surfaces, off, overlaps = prepared or ([], 0.0, False)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
+    if comm.bcast(overlaps):
+        return overlapping_surface(comm, surfaces, bodies, SurfacePoints(comm, lattice, embedding), lattice, around)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
     distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), comm.bcast(off))
     stiffness = _stiffness(comm, lattice, distance, scene.time.step)
@@ -54,9 +66,10 @@ def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: flo
     return distance**2 * layer
 
 
-def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:
+def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float, bool]:
     """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
-    that cut others, and the median distance [m] of their own points from them."""
+    that cut others, and the median distance [m] of their own points from them; whether too many do, so that all are
+    there."""
     off = 0.0
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)
@@ -66,16 +79,20 @@ def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surf
     assert whole is not None
     cut = crossings(whole)
     if len(cut) == 0:
-        return bodies, off
+        return bodies, off, False
     at = ", ".join(f"{c:.4g}" for c in whole.points[whole.triangles[cut[0]]].mean(axis=0))
     what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at ({at}) m"
     if len(cut) > MOST_CUT * len(whole.triangles):
-        raise InputError(f'{what}: too many to do without; mesh.prepare = ["union"] or "repair" may mend the mesh')
+        log.warning(
+            "%s, too many to do without: its points are pushed out of other parts' cells instead, so it may cross by a "
+            'part of a cell, and nothing rubs; mesh.prepare = ["union"] or "repair" may mend the mesh', what
+        )  # fmt: skip
+        return bodies, off, True
     log.warning("%s: they are left out, and may be crossed", what)
     of_body = np.split(
         ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
     )
-    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off
+    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off, False
 
 
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:

@@ -180,11 +180,14 @@ class SurfaceContact:
     def bound(self, q: np.ndarray) -> np.ndarray:
         """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
         hessian = self.hessian(q, True)
-        if hessian is None:
-            return np.zeros(self.contacts.owned)
-        norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
-        return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)
+        return np.zeros(self.contacts.owned) if hessian is None else block_bound(hessian.blocks)
 
     def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
         return self.contacts.free_share(q, end)
+
+
+def block_bound(blocks: np.ndarray) -> np.ndarray:
+    """Return (n,) no less than each block (n, 9): powers of 4, which change seldom."""
+    norms = np.abs(blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
+    return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)

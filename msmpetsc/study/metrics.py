@@ -101,12 +101,15 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
         row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
     if "inverted" in series and series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
+    if "self_contacts" in series and series["self_contacts"].any():
+        row["self_contacts"] = float(series["self_contacts"].max())
+        row["self_distance"] = float(np.nanmin(series["self_distance"]))
     return row
 
 
 def _energy_left(series: dict[str, np.ndarray]) -> float | None:
     """Return the energy at the end over that at the start; None for a body on which a load acts."""
-    energy = series["kinetic"] + series["elastic"] + series["contact"]
+    energy = series["kinetic"] + series["elastic"] + series["contact"] + series.get("self_contact", 0.0)
     return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 

@@ -81,6 +81,8 @@ COLUMNS = {
     "fallbacks": _of_frames("fallbacks"),
     "inverted": _of_frames("inverted", " in the last frame"),
     "energy_gained": _of_frames("energy_gained"),
+    "self_contacts": _of_frames("self_contacts", ", the most of a frame"),
+    "self_distance": _of_frames("self_distance", ", the least of all frames"),
     "energy_left": Column(float, "1", "total energy at the end over that at the start, where no load acts"),
     "shape_error": Column(float, "1", "distance of the last frame from the rest shape, moved as a rigid body"),
     "explicit_limit": Column(float, "s", "longest stable explicit step of the lattice at rest"),

@@ -16,11 +16,15 @@ from pinch import ARM, HALF, RADIUS, pinch_scene
 import msmpetsc
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.fields import Frame
 from msmpetsc.model.self_contact.barrier import Barrier
 from msmpetsc.model.self_contact.contacts import Contacts
 from msmpetsc.model.self_contact.term import SMALL, SurfaceContact
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.linear.explicit import explicit
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation
 
 COMM = MPI.COMM_SELF
@@ -126,6 +130,24 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     bound = term.bound(q)
     assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
     assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
+
+
+def test_the_written_hessian_has_the_contacts_entries(model):
+    """Which couple nodes that no spring joins: `-ksp_view_mat` writes it."""
+    term, q = contact(model)
+    stepper = Stepper(COMM, model.lattice, T, find_preset("newton"), 1e-3, touches=True)
+    hessian, operator = stepper.jacobian.hessian, stepper.jacobian.operator
+    hessian.linearise(q, Contact([], model.lattice.owned, term))
+    x, y = operator.createVecs()
+    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
+    operator.mult(x, y)
+    found = y.duplicate()
+    matrix = explicit(operator, stepper.unknowns, hessian.coupled())
+    matrix.mult(x, found)
+    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
+    for owned in (matrix, x, y, found):
+        owned.destroy()
+    stepper.destroy()
 
 
 def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):

@@ -67,9 +67,13 @@ class Viewable:
 
     def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
         if asks_for_entries(viewer):
-            matrix = explicit(operator, self.unknowns)
+            matrix = explicit(operator, self.unknowns, self.coupled())
             matrix.view(viewer)
             matrix.destroy()
+
+    def coupled(self) -> np.ndarray | None:
+        """The free nodes (m,) bool that it couples with others than those that springs join them with; None of none."""
+        return None
 
 
 class ThreeColumns(Viewable):
@@ -120,6 +124,9 @@ class TrueHessian(Viewable):
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
             self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
+
+    def coupled(self) -> np.ndarray | None:
+        return self.surface.blocks[self.unknowns.free].any(axis=1) if self.surface else None
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"

@@ -34,7 +34,7 @@ from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.cli.running.profile import machine, versions
 from msmpetsc.model.build import Model, build_model, to_device
-from msmpetsc.model.springs import SpringGather
+from msmpetsc.model.elasticity.springs import SpringGather
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.operators import ThreeColumns

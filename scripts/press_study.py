@@ -16,7 +16,7 @@ from clone import ROOT, parser
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from msmpetsc.model.inversion import least_volumes
+from msmpetsc.model.elasticity.inversion import least_volumes
 from msmpetsc.model.loads import Motion
 from msmpetsc.output.drawing.subject import read_scene
 from msmpetsc.output.reader import Result

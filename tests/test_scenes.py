@@ -15,7 +15,7 @@ from conftest import run
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import find
-from msmpetsc.model.inversion import least_volumes
+from msmpetsc.model.elasticity.inversion import least_volumes
 from msmpetsc.model.loads import Motion
 from msmpetsc.model.region import inside
 from msmpetsc.scene.schema import SceneFile

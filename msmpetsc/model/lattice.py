@@ -39,7 +39,7 @@ class Lattice:
     rest_length : (s,) [m]
     stiffness   : (s,) [N/m]
     pinned      : (l,) bool, nodes that do not move
-    stiffening  : of the springs' law (model.springs) [-]; 0 for Hooke's
+    stiffening  : of the springs' law (elasticity.springs) [-]; 0 for Hooke's
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
                   first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
     cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
@@ -108,7 +108,7 @@ def build_lattice(
     density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
-    stiffening    : of the springs' law (model.springs) [-]
+    stiffening    : of the springs' law (elasticity.springs) [-]
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (model.region)
     topology      : that of the cages, where it is known already
     """

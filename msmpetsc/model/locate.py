@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import to_host
-from msmpetsc.model.inversion import inverted_cells
+from msmpetsc.model.elasticity.inversion import inverted_cells
 from msmpetsc.model.lattice import Lattice
 
 

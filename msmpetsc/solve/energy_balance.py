@@ -28,7 +28,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import describe_inverted, node_of_greatest

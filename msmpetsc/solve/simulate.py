@@ -13,7 +13,7 @@ from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, to_device
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
 from msmpetsc.model.self_contact.kinds import RunContacts

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.model.material import CellMaterial
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lattices import one_spring
 
-from msmpetsc.model import flops, springs
+from msmpetsc.model.elasticity import flops, springs
 
 COUNTED = "spring_pull", "spring_change", "spring_block", "block_product"
 

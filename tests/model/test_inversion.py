@@ -11,8 +11,8 @@ from lattices import block, cages_of
 from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.elasticity import ONSET, RESISTANCE, Elasticity
-from msmpetsc.model.inversion import (
+from msmpetsc.model.elasticity.energy import ONSET, RESISTANCE, Elasticity
+from msmpetsc.model.elasticity.inversion import (
     add_resistance_gradient,
     add_resistance_hessian,
     least_volumes,

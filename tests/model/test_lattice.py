@@ -8,7 +8,7 @@ from lattices import DENSITY, E, H, block, cages_of
 from mpi4py import MPI
 
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import CORNERS, Lattice, build_lattice
 from msmpetsc.model.material import EDGE, FACE_DIAGONAL, SPACE_DIAGONAL, calibrated_stiffness
 

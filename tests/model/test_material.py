@@ -8,7 +8,7 @@ import pytest
 from conftest import ROOT
 from mpi4py import MPI
 
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 
 STUDY = runpy.run_path(str(ROOT / "scripts" / "material_study.py"))
 ACROSS, slope = STUDY["ACROSS"], STUDY["slope"]

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.scene.reading import load_scene
 
 T = 1 / 64

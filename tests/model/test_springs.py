@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from msmpetsc.model.springs import (
+from msmpetsc.model.elasticity.springs import (
     add_elastic_gradient,
     add_elastic_product,
     elastic_change,

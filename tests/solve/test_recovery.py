@@ -14,8 +14,8 @@ from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.elasticity.inversion import least_volumes
 from msmpetsc.model.fields import Frame
-from msmpetsc.model.inversion import least_volumes
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene

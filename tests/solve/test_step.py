@@ -8,7 +8,7 @@ from lattices import COMM, GRAVITY, T, beam, block, cages_of, one_spring, swing,
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
 from msmpetsc.model.initial_state import at_rest

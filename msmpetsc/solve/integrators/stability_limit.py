@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import Ghosted
 

@@ -20,7 +20,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver

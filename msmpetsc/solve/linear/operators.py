@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact, Secants
-from msmpetsc.model.elasticity import Elasticity, Hessian
+from msmpetsc.model.elasticity.energy import Elasticity, Hessian
 from msmpetsc.model.self_contact.kinds import ContactHessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -116,7 +116,7 @@ class TrueHessian(Viewable):
     def linearise(
         self, q: np.ndarray, contact: Contact | None, projected: bool = False, secants: Secants | None = None
     ) -> None:
-        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (model.springs),
+        """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
         ``secants`` the true curvature of some friction (model.contact.penalty)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns

@@ -7,7 +7,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.cycle import Multigrid

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
 from msmpetsc.model.contact.penalty import Contact
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
 

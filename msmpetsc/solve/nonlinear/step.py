@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.elasticity import Elasticity
+from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature

@@ -5,8 +5,8 @@ Where J < J_0 the corner has the energy  K (1 - J / J_0)^3,  K of its cell's mat
 continuous derivatives and a finite push even where J < 0: so a cell that has been turned is turned back, though its
 neighbours may then hold it creased.
 
-All positions are local, (l, 3), and a gradient is right at the owned nodes, as in model.springs. As there, two loops
-sum the corners: ``CellScatter`` on a CPU, ``CellGather`` on a GPU, which on a CPU takes 2 to 6 times as long.
+All positions are local, (l, 3), and a gradient is right at the owned nodes, as in elasticity.springs. As there, two
+loops sum the corners: ``CellScatter`` on a CPU, ``CellGather`` on a GPU, which on a CPU takes 2 to 6 times as long.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.model.elasticity.springs import Product
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.springs import Product
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
 FRAMES = np.array(
@@ -360,7 +360,7 @@ class CellScatter:
         return partial(add_resistance_hessian, q.copy(), self.cells[few], self.resistance[few], self.volume, projected)
 
     def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add what elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
+        """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         few = self.resisting(q)
         add_resistance_bound(q, self.cells[few], self.resistance[few], self.volume, blocks)
 
@@ -418,7 +418,7 @@ class CellGather:
         return partial(_cell_product_around, self.around.shape[1], q.copy(), *self._all, projected)
 
     def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add what elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _cell_bound_around(self.around.shape[1], q, *self._all, blocks)
 
     @property

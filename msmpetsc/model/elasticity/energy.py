@@ -6,10 +6,10 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import on_host
-from msmpetsc.model.flops import Flops
-from msmpetsc.model.inversion import CellGather, CellScatter, least_volumes
+from msmpetsc.model.elasticity.flops import Flops
+from msmpetsc.model.elasticity.inversion import CellGather, CellScatter, least_volumes
+from msmpetsc.model.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.springs import Product, SpringGather, SpringScatter
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
 RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
@@ -18,8 +18,8 @@ RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lu
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of Hooke's springs (model.springs), or, where the law stiffens, of stiffening ones and of cells that
-    resist being turned inside out (model.inversion).
+    It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening ones and of cells that
+    resist being turned inside out (elasticity.inversion).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
     owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.

@@ -1,7 +1,7 @@
 """Floating point operations of the loops over springs and cells, for PETSc's log.
 
 Each +, -, x, /, square root and maximum counts as one, as PETSc counts its own. The numbers are read off the loops of
-model.springs, one spring a turn, Hooke's law first and what stiffening adds to it second. So they are those of the
+elasticity.springs, one spring a turn, Hooke's law first and what stiffening adds to it second. So they are those of the
 CPU's loops: a GPU's visit each spring twice, and work out its block again in each product.
 """
 

@@ -152,7 +152,7 @@ class SpringScatter:
         return partial(add_elastic_product, self.springs, blocks)
 
     def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add what elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
+        """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, *self._all, blocks)
 
 
@@ -391,7 +391,7 @@ class SpringGather:
         return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
 
     def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
-        """Add what elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+        """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
 
 

@@ -1,7 +1,7 @@
 """From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -49,6 +49,7 @@ class Model:
     surface   : of all bodies, one after the other
     damping   : of velocities, by the mass [1/s]
     collision : the surface that meets itself, where it does
+    obstacles : in the scene's order
     bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
     """
 
@@ -65,13 +66,18 @@ class Model:
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
-    solids: dict[int, Surface] = field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] = ()
 
     @property
     def body_of_point(self) -> np.ndarray:
         """Number (v,) of the body of each surface point, on rank 0."""
         points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
         return np.repeat(np.arange(len(points)), points)
+
+    @cached_property
+    def solids(self) -> dict[int, Surface]:
+        """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
+        return surfaces_of(self.lattice.table.comm, self.obstacles, np.array([body.bounds for body in self.bodies]))
 
 
 class Shape:
@@ -142,7 +148,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         else None,
         reaches=reaches,
         damping=scene.material.damping,
-        solids=surfaces_of(comm, obstacles, finder.bounds),
+        obstacles=tuple(obstacles),
     )
 
 

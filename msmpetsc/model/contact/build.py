@@ -45,14 +45,12 @@ def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: np.ndarra
 
     bounds : (b, 2, 3) corners of the box around each body at rest [m]
     """
-    solids = {number: obstacle.solid for number, obstacle in enumerate(obstacles)}
+    numbered = enumerate(obstacle.solid for obstacle in obstacles)
+    solids = {number: solid for number, solid in numbered if isinstance(solid, DistanceSolid)}
+    if not solids:
+        return {}
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-
-    def drawn() -> dict[int, Surface]:
-        known = ((number, solid) for number, solid in solids.items() if isinstance(solid, DistanceSolid))
-        return {number: solid.surface(low, high) for number, solid in known}
-
-    return on_root(comm, drawn) or {}
+    return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in solids.items()}) or {}
 
 
 def obstacle_surface(mesh: Mesh, key: str, folder: Path) -> Surface:

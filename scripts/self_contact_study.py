@@ -7,14 +7,20 @@ Of each scene that touches: contacts, least distance, iterations and what a fram
 a triangle that cross, over all frames, by a test that shares nothing with the contact's own, of the surface that meets
 itself; of the one that is drawn over 20. --shorter 16 takes steps, and frames, of a sixteenth.
 
-Then, where nothing touches, seconds of a step without self-contact and with it, by points of the surface that meets
-itself: bunny and brain in free fall, an armadillo whose leg is dragged, by five edges of 5,000 points a step at first.
-"-": the surface has fewer.
+Then CPU time of a step without self-contact and with it, by points of the surface that meets itself, and what its
+parts take: bunny and brain in free fall, an armadillo whose leg is dragged, by five edges of 5,000 points a step at
+first, and the lung while it is pressed on itself. A surface has no more points than its mesh.
 """
 
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from itertools import chain
 from pathlib import Path
+from time import process_time
+from typing import Any
 
 from clone import ROOT, parser
 
@@ -22,17 +28,34 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.model.build import build_model
+from msmpetsc.model.self_contact.barrier import Barrier
 from msmpetsc.model.self_contact.contacts import CollisionSurface
+from msmpetsc.model.self_contact.points import SurfacePoints
+from msmpetsc.model.self_contact.term import SurfaceHessian
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.simulate import Simulation
 
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 from crossings import count_crossings
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out" / "self_contact_study"
 TOUCHING = ("two_bunnies", "pile", "armadillo_fold", "lung_press_contact")
-PRESSES = ('obstacle.0.response="penalty"',)
-APART = {"bunny_fall": (20, PRESSES), "brain_fall": (20, PRESSES), "armadillo_leg": (10, ())}  # steps, what is changed
+FALLING = ("bunny_fall", "brain_fall")
+COSTS = {
+    "bunny_fall": (2, 32),
+    "brain_fall": (2, 32),
+    "armadillo_leg": (2, 12),
+    "lung_press": (20, 60),
+}  # steps
+PARTS: dict[str, list[tuple[Any, str]]] = {  # of self-contact
+    "points": [(SurfacePoints, "__call__")],
+    "pairs": [(Barrier, "candidates"), (Barrier, "clear_reach")],
+    "contacts": [(Barrier, "contacts"), (Barrier, "least")],
+    "ways": [(Barrier, "free_share"), (Barrier, "free_share_in_creases")],
+    "barrier": [(Barrier, "energy"), (Barrier, "gradient"), (Barrier, "hessian")],
+    "products": [(SurfaceHessian, "add_product")],
+}
 COUNTED = 20  # frames whose crossings of the surface that is drawn are counted
 
 
@@ -67,50 +90,97 @@ def touching(scene: str, cells: int | None, steps: int | None, shorter: int) -> 
     return [f"`{scene}`", *words, f"{costs[0]:.1f}", f"{costs[1]:,.0f}", f"{costs[2]:,.0f}"]
 
 
-def cost(scene: str, points: list[int], cells: int | None) -> list[str]:
-    """Row of a scene that does not: seconds of a step without, and with so many points."""
-    steps, changes = APART[scene]
-    most, seconds = np.inf, []
-    for count in (0, *points):
-        if count > 1.2 * most:
-            continue
-        more = [f"self_contact.surface={2 * count}"] if count else []
-        more += [f"cages.count={cells}"] if cells else []
-        path = run(scene, f"{scene}_{count}", [*changes, *more], "--frames", steps)
-        with Result(path) as result:
-            seconds.append(result.frames.wall_time[2:].mean())  # the first has the set-up
-            most = len(result.surface.points[:])
-    without, *others = seconds
-    words = [f"{s:.3f} ({100 * (s / without - 1):+.0f}%)" for s in others]
-    return [f"`{scene}`", f"{without:.3f}", *words, *["-"] * (len(points) - len(words))]
+@contextmanager
+def timed(seconds: dict[str, float]) -> Iterator[None]:
+    """Add the CPU time within each part's methods to ``seconds``; of one within another it counts to the outer."""
+    kept: dict[tuple[Any, str], Callable] = {}
+    depth = [0]
+
+    def wrap(part: str, method: Callable) -> Callable:
+        @wraps(method)
+        def call(*arguments: Any, **more: Any) -> Any:
+            depth[0] += 1
+            begin = process_time()
+            try:
+                return method(*arguments, **more)
+            finally:
+                depth[0] -= 1
+                if not depth[0]:
+                    seconds[part] += process_time() - begin
+
+        return call
+
+    for part, methods in PARTS.items():
+        for kind, name in methods:
+            kept[kind, name] = getattr(kind, name)
+            setattr(kind, name, wrap(part, kept[kind, name]))
+    try:
+        yield
+    finally:
+        for (kind, name), method in kept.items():
+            setattr(kind, name, method)
 
 
-def table(head: list[str], rows: list[list[str]]) -> None:
-    for row in (head, ["---"] * len(head), *rows):
+def stepped(scene: str, changes: list[str]) -> tuple[float, dict[str, float], int]:
+    """CPU seconds of a step, those of each part of self-contact in it, and the points of the surface that meets."""
+    first, last = COSTS[scene]
+    given = load_scene(SCENES / f"{scene}.toml", ["output.surface=false", *changes])
+    model = build_model(MPI.COMM_SELF, given)
+    seconds, begin = dict.fromkeys(PARTS, 0.0), 0.0
+    with timed(seconds), Simulation(MPI.COMM_SELF, given, model) as simulation:
+        for frame in simulation.frames():
+            if frame.index == first:
+                begin = process_time()
+                seconds.update(dict.fromkeys(PARTS, 0.0))
+            if frame.index == last:
+                break
+        whole = process_time() - begin
+    points = model.collision.points.total if model.collision else 0
+    return whole / (last - first), {part: value / (last - first) for part, value in seconds.items()}, points
+
+
+def cost(scene: str, points: list[int], cells: int | None) -> Iterator[list[str]]:
+    """Rows of a scene: milliseconds of a step without self-contact, and with so many points."""
+    changes = [f"cages.count={cells}"] if cells else []
+    changes += ['obstacle.0.response="penalty"'] if scene in FALLING else []
+    without = stepped(scene, changes)[0]
+    yield [f"`{scene}`", "-", f"{1e3 * without:.0f}", "", *[""] * len(PARTS)]
+    most = np.inf
+    for count in points:
+        if count > most:
+            return
+        whole, seconds, had = stepped(scene, [*changes, f"self_contact.surface={2 * count}"])
+        most = had if had < 0.9 * count else np.inf
+        parts = [f"{1e3 * seconds[part]:.1f}" for part in PARTS]
+        yield [f"`{scene}`", f"{had:,}", f"{1e3 * whole:.0f}", f"{whole / without:.2f}", *parts]
+
+
+def table(head: list[str], rows: Iterable[list[str]]) -> None:
+    for row in chain((head, ["---"] * len(head)), rows):
         print(f"| {' | '.join(row)} |", flush=True)
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join((*TOUCHING, *APART))}; all if none")
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join((*TOUCHING, *COSTS))}; all if none")
     options.add_argument("--cells", type=int, metavar="N", help="of each scene; its own if absent")
     options.add_argument("--frames", type=int, metavar="N", help="of those that touch; all if absent")
     options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps of those that touch")
     options.add_argument("--points", default="5000,20000,50000", metavar="N,N", help="of the surface (%(default)s)")
     args = options.parse_args()
-    unknown = set(args.scenes) - {*TOUCHING, *APART}
+    unknown = set(args.scenes) - {*TOUCHING, *COSTS}
     if unknown:
-        options.error(f"no scene {', '.join(sorted(unknown))}: {', '.join((*TOUCHING, *APART))}")
+        options.error(f"no scene {', '.join(sorted(unknown))}: {', '.join((*TOUCHING, *COSTS))}")
     OUT.mkdir(parents=True, exist_ok=True)
-    chosen, points = args.scenes or (*TOUCHING, *APART), [int(count) for count in args.points.split(",")]
+    chosen, points = args.scenes or (*TOUCHING, *COSTS), [int(count) for count in args.points.split(",")]
     head = ["scene", "cells", "triangles", "steps", "contacts at most", "least distance [µm]"]
     head += ["crossed", "drawn", "iterations a step", "products", "ms a frame"]
     if met := [scene for scene in TOUCHING if scene in chosen]:
-        table(head, [touching(scene, args.cells, args.frames, args.shorter) for scene in met])
+        table(head, (touching(scene, args.cells, args.frames, args.shorter) for scene in met))
         print()
-    if apart := [scene for scene in APART if scene in chosen]:
-        head = ["scene", "s a step without", *(f"{count:,} points" for count in points)]
-        table(head, [cost(scene, points, args.cells) for scene in apart])
+    if costs := [scene for scene in COSTS if scene in chosen]:
+        head = ["scene", "points", "ms a step", "times as long", *(f"{part} [ms]" for part in PARTS)]
+        table(head, (row for scene in costs for row in cost(scene, points, args.cells)))
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {  # of self-contact
     "points": [(SurfacePoints, "__call__")],
     "pairs": [(Barrier, "candidates"), (Barrier, "clear_reach")],
     "contacts": [(Barrier, "contacts"), (Barrier, "least")],
-    "ways": [(Barrier, "free_share"), (Barrier, "free_share_in_creases")],
+    "ways": [(Barrier, "free_share"), (Barrier, "sweep"), (Barrier, "free_share_in_creases")],
     "barrier": [(Barrier, "energy"), (Barrier, "gradient"), (Barrier, "hessian")],
     "products": [(SurfaceHessian, "add_product")],
 }

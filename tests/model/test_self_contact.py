@@ -162,6 +162,27 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     assert 0 < term.free_share(q, far) < 1 / 500
 
 
+def test_on_a_way_that_was_swept_contacts_are_those_looked_for_anew(model, monkeypatch):
+    """So that line searches need no pairs of their own: the arms close by many edges, and meet."""
+    assert model.collision is not None
+    start, end = model.lattice.nodes.copy(), closed(model)
+    known, looked = Contacts(COMM, model.collision), []
+    known.expect(start, start)
+    assert known.free_share(start, end) == 1.0
+    monkeypatch.setattr(known, "_look", looked.append)
+    for share in (0.0, 0.31, 0.9, 0.99, 0.999, 1.0):
+        q = start + share * (end - start)
+        moment, anew = known.at(q), Contacts(COMM, model.collision).at(q)
+        assert moment.count == anew.count
+        if moment.count:
+            energies = [known.barrier.energy(each.contacts, each.points) for each in (moment, anew)]
+            assert energies[0] == pytest.approx(energies[1], rel=1e-12)
+    assert moment.count > 0 and not looked
+    known.expect(start, start)  # of another step
+    monkeypatch.undo()
+    assert known.at(end).count == moment.count
+
+
 def positions(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Surface of each frame (T, v, 3) in full precision, its triangles, and the least distances [m]."""
     with msmpetsc.open(path) as run:

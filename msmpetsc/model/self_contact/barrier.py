@@ -48,6 +48,19 @@ class BarrierLaw:
     stick: float
 
 
+@dataclass(frozen=True)
+class Sweep:
+    """Pairs that come near on the first of so many pieces, all as long, of a straight way of the points."""
+
+    whole: int
+    pieces: "list[ipctk.Candidates]"
+
+    def at(self, share: float) -> "ipctk.Candidates | None":
+        """Return those at a share of the way; None beyond the pieces."""
+        piece = max(int(np.ceil(share * self.whole)) - 1, 0)
+        return self.pieces[piece] if piece < len(self.pieces) else None
+
+
 class Barrier:
     """Barrier of a surface (p, 3), by the positions S (p, 3) [m] of its points.
 
@@ -144,25 +157,37 @@ class Barrier:
     def _least(self, pairs: "ipctk.NormalCollisions", points: np.ndarray) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
-    def free_share(self, start: np.ndarray, moved: np.ndarray, candidates: "ipctk.Candidates | None") -> float:
+    def free_share(self, start: np.ndarray, moved: np.ndarray, candidates: "ipctk.Candidates") -> float:
         """Return the share, up to 1, of a straight way that points go from start (p, 3) by ``moved`` (p, 3) [m]
         without any meeting.
 
-        candidates : pairs that may meet on it, besides those in creases; None: they are looked for piece by piece
+        candidates : pairs that may meet on it, besides those in creases
+        """
+        end = start + moved - moved.mean(axis=0)
+        return _kept(self._share(start, end, candidates, self.folded))
+
+    def sweep(self, start: np.ndarray, moved: np.ndarray, aside: float) -> tuple[float, "Sweep"]:
+        """Return the same of any way, and the pairs that come near on it, up to where points meet.
+
+        aside : [m], as far as points may be from the way and have no other pairs
         """
         moved = moved - moved.mean(axis=0)
-        if candidates is not None:
-            return _kept(self._share(start, start + moved, candidates, self.folded))
         farthest = float(np.sqrt((moved**2).sum(axis=1).max()))
-        whole = max(int(np.ceil(farthest / (PIECE * self.edge))), 1)
+        whole, pieces = max(int(np.ceil(farthest / (PIECE * self.edge))), 1), []
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-            swept = self.ipctk.Candidates()
-            swept.build(self.mesh, *map(np.asfortranarray, (begin, end)), 0.0, self.ipctk.LBVH())
-            share = self._share(begin, end, swept, self.folded)
-            if share < 1:
-                return KEPT * (piece + share) / whole
-        return 1.0 if whole <= PIECES else PIECES / whole
+            pieces.append(self._near_way(begin, end, 0.5 * self.law.distance + aside))
+            if self._share(begin, end, pieces[-1], self.folded) < 1:  # or a tenth as far apart: pairs that pass
+                share = self._share(begin, end, self._near_way(begin, end, 0.0), self.folded)
+                if share < 1:
+                    return KEPT * (piece + share) / whole, Sweep(whole, pieces)
+        return (1.0 if whole <= PIECES else PIECES / whole), Sweep(whole, pieces)
+
+    def _near_way(self, begin: np.ndarray, end: np.ndarray, reach: float) -> "ipctk.Candidates":
+        """Return the pairs whose boxes meet on a way, each wider by ``reach`` [m]."""
+        candidates = self.ipctk.Candidates()
+        candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), reach, self.ipctk.LBVH())
+        return candidates
 
     def free_share_in_creases(self, start: np.ndarray, moved: np.ndarray) -> float:
         """Return the same where no others can meet."""

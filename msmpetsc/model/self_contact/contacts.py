@@ -15,7 +15,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets
+from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, Sweep
 from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 REMEMBERED = 3  # positions whose contacts are kept: where a line search starts, and where it tries
 FARTHEST = 0.1  # edges that a point may move before pairs are looked for anew: with 0.25 there are four times the pairs
+ASIDE = 1e-3  # of the barrier's distance: positions so near a way are on it
 AHEAD = 2.0  # times the move that is expected
 
 
@@ -67,6 +68,19 @@ class Pairs:
 
 
 @dataclass(frozen=True)
+class Way:
+    """A straight way from q by ``moved`` (owned, 3) [m] that was swept; the pairs that come near on it, on rank 0.
+
+    square : |moved|^2 of all ranks [m^2]
+    """
+
+    q: np.ndarray
+    moved: np.ndarray
+    square: float
+    sweep: Sweep | None
+
+
+@dataclass(frozen=True)
 class Moment:
     """Contacts at positions q (owned, 3) [m].
 
@@ -95,9 +109,16 @@ class Contacts:
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._pairs: Pairs | None = None
         self._moments: list[Moment] = []
+        self._ways: list[Way] = []  # of this step
 
     def expect(self, q: np.ndarray, end: np.ndarray) -> None:
-        """Make ready for a step from q to about ``end``: look for pairs anew unless the known ones serve."""
+        """Make ready for a step from q to about ``end``: look for pairs anew unless the known ones serve.
+
+        What ways of the last step have told is forgotten: a resumed run does not have it.
+        """
+        if self._ways:
+            self._ways.clear()
+            self._moments.clear()
         if self._pairs and max(self._moved(q, self._pairs), self._moved(end, self._pairs)) <= self._pairs.reach:
             return
         self._look(q, AHEAD * self._farthest(end, q))
@@ -139,13 +160,35 @@ class Contacts:
             if self._is_same(q, moment.q):
                 return moment
         points = self.points(q)
-        if bound > pairs.reach and not self._serve(pairs, points):
-            pairs = self._look(q, FARTHEST * self.edge)
-        near = pairs.candidates if bound >= pairs.apart else None
+        near = self._near(q, points, pairs, bound)
         contacts = self.barrier.contacts(near, points) if self.barrier else None
         count = self.comm.bcast(sum(map(len, contacts or ())))
         self._moments = [Moment(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
+
+    def _near(self, q: np.ndarray, points: np.ndarray, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
+        """Return the pairs that may be near at q, besides those in creases, on rank 0.
+
+        bound : no point is farther from where ``pairs`` were looked for [m]
+        """
+        if bound < pairs.apart:
+            return None
+        if bound <= pairs.reach or self._serve(pairs, points):
+            return pairs.candidates
+        for way in self._ways:
+            share = self._share_of(way, q)
+            near = way.sweep.at(share) if way.sweep and share is not None else None
+            if share is not None and self.comm.bcast(near is not None):
+                return near
+        return self._look(q, FARTHEST * self.edge).candidates
+
+    def _share_of(self, way: Way, q: np.ndarray) -> float | None:
+        """Return the share of a way that positions q are at; None where they are not on it."""
+        gone = q - way.q
+        share = self.comm.allreduce(float(np.vdot(gone, way.moved))) / way.square if way.square else 0.0
+        aside = self.points.spread * float(np.abs(gone - share * way.moved).max(initial=0.0))
+        near = self.comm.allreduce(aside, MPI.MAX) <= ASIDE * self.law.distance / np.sqrt(3)
+        return share if near and -ASIDE < share < 1 + ASIDE else None
 
     def _is_same(self, a: np.ndarray, b: np.ndarray) -> bool:
         same = bool(np.array_equal(a, b))
@@ -194,9 +237,21 @@ class Contacts:
         start, moved, share = self.points(q), self.points(end - q), 1.0
         if self.barrier and farthest < pairs.apart:
             share = self.barrier.free_share_in_creases(start, moved)
-        elif self.barrier:
-            share = self.barrier.free_share(start, moved, pairs.candidates if farthest <= pairs.reach else None)
+        elif farthest > pairs.reach:
+            share = self._swept(q, end, start, moved)
+        elif self.barrier and pairs.candidates is not None:
+            share = self.barrier.free_share(start, moved, pairs.candidates)
         return self.comm.bcast(share)
+
+    def _swept(self, q: np.ndarray, end: np.ndarray, start: np.ndarray, moved: np.ndarray) -> float:
+        """Return the free share of a way that no known pairs serve for; those on it are kept."""
+        share, sweep = 1.0, None
+        if self.barrier:
+            share, sweep = self.barrier.sweep(start, moved, ASIDE * self.law.distance)
+        way = end - q
+        square = self.comm.allreduce(float(np.vdot(way, way)))
+        self._ways = [Way(q.copy(), way, square, sweep), *self._ways[: REMEMBERED - 1]]
+        return share
 
 
 @numba.njit(cache=True)

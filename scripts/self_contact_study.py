@@ -145,12 +145,11 @@ def cost(scene: str, points: list[int], cells: int | None) -> Iterator[list[str]
     changes += ['obstacle.0.response="penalty"'] if scene in FALLING else []
     without = stepped(scene, changes)[0]
     yield [f"`{scene}`", "-", f"{1e3 * without:.0f}", "", *[""] * len(PARTS)]
-    most = np.inf
+    had = 0
     for count in points:
-        if count > most:
+        before, (whole, seconds, had) = had, stepped(scene, [*changes, f"self_contact.surface={2 * count}"])
+        if had == before:
             return
-        whole, seconds, had = stepped(scene, [*changes, f"self_contact.surface={2 * count}"])
-        most = had if had < 0.9 * count else np.inf
         parts = [f"{1e3 * seconds[part]:.1f}" for part in PARTS]
         yield [f"`{scene}`", f"{had:,}", f"{1e3 * whole:.0f}", f"{whole / without:.2f}", *parts]
 

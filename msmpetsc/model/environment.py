@@ -154,11 +154,22 @@ class Environment:
         )
 
     def contact(
-        self, q: np.ndarray, end: np.ndarray, time: float, time_step: float, sides: np.ndarray
+        self,
+        q: np.ndarray,
+        end: np.ndarray,
+        time: float,
+        time_step: float,
+        sides: np.ndarray,
+        before: np.ndarray | None = None,
     ) -> Contact | None:
-        """Return what presses in the step from q to about ``end``, friction included; None if nothing does."""
+        """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
+
+        before : (l, 3) [m] positions one step before q, of a step that looks back to them
+        """
         owned, surface = self.lattice.owned, None
-        states = [p.during(q[:owned], time, time_step, side[:owned]) for p, side in self._pressing(time, sides)]
+        last = None if before is None else before[:owned]
+        pressing = self._pressing(time, sides)
+        states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
             self.self_contact.expect(q, end)
             surface = term_of(self.self_contact, q, time_step)

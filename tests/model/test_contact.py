@@ -218,6 +218,22 @@ def test_a_node_that_was_not_in_contact_has_no_friction_yet():
     np.testing.assert_allclose(gradient(contact, np.array([[0.3, 0, -0.1]])), [[0, 0, -10]])
 
 
+def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_ends_with():
+    """0.1 and 0.15 deep, a node will be 0.2 deep; one from outside no more than 0.3; one on its way out from 0.4 not at
+    all. The plane goes (0.05, 0.02) a step."""
+    moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
+    before = np.array([[0.0, 0, -0.1], [0, 0, 0.9], [0, 0, -0.4]])
+    start = np.array([[0.03, 0, -0.15], [0.03, 0, -0.15], [0.03, 0, -0.15]])
+    stick, end = 0.6, np.array([0.1, 0.0, -0.2])
+    friction = Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T, None, before).friction
+    assert friction is not None
+    np.testing.assert_allclose(friction.limit, 0.3 * 100 * np.array([0.2, 0.3, 0.0]), atol=1e-12)
+    u, _ = friction.slip(np.array([end, end, end]))
+    velocity = (3 * end - 4 * start[0] + before[0]) / (2 * T) - [0.5, 0.2, 0]
+    np.testing.assert_allclose(u[0], 2 / 3 * T * velocity * [1, 1, 0], atol=1e-12)
+    assert friction.stick == pytest.approx(2 / 3 * T * stick)
+
+
 # ---- a block on the ground
 
 GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
@@ -301,6 +317,33 @@ def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path):
 def test_a_block_slides_down_a_steep_slope_as_coulomb_says(tmp_path: Path):
     v = slide(tmp_path, 1.0, 0.5)[:, 0]
     assert (v[-1] - v[20]) / (0.01 * (len(v) - 1 - 20)) == pytest.approx(G * (1 - 0.5) / np.sqrt(2), rel=0.01)
+
+
+PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}  # [s], [N]
+
+
+def error_of_a_slide(folder: Path, t: float) -> float:
+    """How far [m] X + mu Z is off, X and Z how far the mass centre went, of a block that slides at 2 m/s under a force.
+
+    M (x'' + mu z'') = mu (-N + N - F) = -mu F, whatever N is from moment to moment: X + mu Z = v T - mu / M iint F.
+    The ground is soft enough for steps to follow how the block sinks in.
+    """
+    mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
+    ground = GROUND | {"friction": mu, "stiffness": 2e3}
+    force = [{"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}]
+    scene = block_scene(folder, time=time, force=force, obstacle=[ground], start={"velocity": [2.0, 0.0, 0.0]})
+    model, frames = play(scene)
+    assert min(frame.momentum[0] for frame in frames) > MASS, "it never comes to rest"
+    X, _, Z = model.lattice.mass @ (frames[-1].position - model.lattice.nodes) / MASS
+    fine = np.linspace(0, 0.2, 20001)
+    pressed = np.interp(fine, PRESSING["times"], -np.array(PRESSING["values"])[:, 2])
+    return X + mu * Z - 0.2 * 2.0 + mu / MASS * float(((0.2 - fine) * pressed).mean() * 0.2)
+
+
+def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_path: Path):
+    errors = [abs(error_of_a_slide(tmp_path, t)) for t in (0.01, 0.005, 0.0025)]
+    assert errors[0] < 3e-4  # by the push of the start 3e-3, and slopes of 0.9
+    assert np.log2(errors[0] / errors[1]) > 1.6 and np.log2(errors[1] / errors[2]) > 1.6
 
 
 def test_without_friction_it_slides_freely(tmp_path: Path):

@@ -39,16 +39,42 @@ class Penalty:
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
-    def during(self, q: np.ndarray, time: float, time_step: float, sides: np.ndarray | None = None) -> "ContactState":
-        """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m]."""
+    def during(
+        self,
+        q: np.ndarray,
+        time: float,
+        time_step: float,
+        sides: np.ndarray | None = None,
+        before: np.ndarray | None = None,
+    ) -> "ContactState":
+        """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
+
+        before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
+            that it ends with, under the push that is to be expected then
+        """
         state = self.at(time, sides)
         if self.friction == 0:
             return state
-        nodes, depth, normal = self.at(time - time_step, sides).pressed(q)
-        path = self.obstacle.path
-        carried = q[nodes] + like(q, path.at(time) - path.at(time - time_step))
-        limit = self.friction * self.stiffness * depth
-        return replace(state, friction=Friction(nodes, normal, carried, limit, self.stick * time_step))
+        start, path = time - time_step, self.obstacle.path
+        nodes, depth, normal = self.at(start, sides).pressed(q)
+        way, stick = like(q, path.at(time) - path.at(start)), self.stick * time_step
+        carried = q[nodes] + way
+        if before is not None:
+            carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
+            stick *= 2 / 3
+            depth = self._depth_to_come(2 * q - before, time, sides, nodes, depth)
+        return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
+
+    def _depth_to_come(
+        self, q: np.ndarray, time: float, sides: np.ndarray | None, nodes: np.ndarray, depth: np.ndarray
+    ) -> np.ndarray:
+        """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
+
+        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just come in the way there
+        says nothing of how far it goes.
+        """
+        coming, _ = self.obstacle.depths(q, time, sides)
+        return np.clip(coming[nodes], 0, 2 * depth)
 
 
 @dataclass(frozen=True)

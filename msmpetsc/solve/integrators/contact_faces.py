@@ -20,6 +20,7 @@ class ContactFaces:
     q, y       : (l, 3) [m], as a StepProblem has them
     time       : of the step's end [s]
     before     : (o, l) faces when it began (model.environment); None: the nearest
+    q_before   : (l, 3) [m] one step before q, of a step that looks so far back
     fixed      : (l,) bool, nodes that are no unknowns
     sides      : (o, l) faces of the problem to solve; once settled, those of the step
     is_settled : the problem solved last was the right one
@@ -36,9 +37,11 @@ class ContactFaces:
         time_step: float,
         before: np.ndarray | None,
         fixed: np.ndarray,
+        q_before: np.ndarray | None = None,
     ):
         self.comm, self.environment, self.q, self.y = comm, environment, q, y
         self.time, self.time_step, self.before, self.fixed = time, time_step, before, fixed
+        self.q_before = q_before
         self.solves, self.is_settled = 0, False
         self.sides = self._crossed(y)
 
@@ -50,7 +53,7 @@ class ContactFaces:
     def problem(self) -> StepProblem:
         """The step with the faces as they are known now."""
         environment, time = self.environment, self.time
-        contact = environment.contact(self.q, self.y, time, self.time_step, self.sides)
+        contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
     def compare(self, x: np.ndarray) -> None:

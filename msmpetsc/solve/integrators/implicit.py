@@ -92,19 +92,30 @@ class ImplicitEuler:
         y = 2 * q - state.q_previous
         if self.damping:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
-        result, sides = self._solve(q, y, time, time_step, state.sides)
+        result, sides = self._solve(state, y, time, time_step)
         after, before, work = self.environment.reflect(
             result.position, result.previous, time, time_step, self.stepper.lattice.pinned, sides
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
     def _solve(
-        self, q: np.ndarray, y: np.ndarray, time: float, time_step: float, before: np.ndarray | None
+        self, state: State, y: np.ndarray, time: float, time_step: float, q_before: np.ndarray | None = None
     ) -> tuple[StepResult, np.ndarray]:
-        """The x that belongs to y, as it will be at ``time``, and the contact faces that it has."""
+        """The x that belongs to y, as it will be at ``time``, and the contact faces that it has.
+
+        q_before : (l, 3) [m] one step before the state, of a step that looks so far back
+        """
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(
-            self.comm, self.environment, q, y, time=time, time_step=time_step, before=before, fixed=fixed
+            self.comm,
+            self.environment,
+            state.q,
+            y,
+            time=time,
+            time_step=time_step,
+            before=state.sides,
+            fixed=fixed,
+            q_before=q_before,
         )
         iterations = ksp_its = products = 0
         while not faces.is_settled:
@@ -186,7 +197,7 @@ class Bdf2(ImplicitEuler):
         q_(n+1) = (4 q_n - q_(n-1)) / 3 + tau v_(n+1),    v_(n+1) = (4 v_n - v_(n-1)) / 3 + tau a_(n+1),    tau = 2/3 t
 
     (Hairer and Wanner, Solving Ordinary Differential Equations II, III.1), so that
-    y = (4 q_n - q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3.
+    y = (4 q_n - q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3. Friction, too, is of what the last two states lead to.
     """
 
     SHARE = 2 / 3
@@ -203,10 +214,10 @@ class Bdf2(ImplicitEuler):
         self.environment.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
-            history, its, products = self._history(q, v, time, state.sides)
+            history, its, products = self._history(state, time)
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
-        result, sides = self._solve(q, y, time, self.time_step, state.sides)
+        result, sides = self._solve(state, y, time, self.time_step, q_0)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
@@ -221,12 +232,10 @@ class Bdf2(ImplicitEuler):
             q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
-    def _history(
-        self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None
-    ) -> tuple[tuple[np.ndarray, np.ndarray], int, int]:
+    def _history(self, state: State, time: float) -> tuple[tuple[np.ndarray, np.ndarray], int, int]:
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
         which is the true one but for a part of first order; the KSP iterations and products that this takes."""
-        t, tau = self.time_step, self.tau
-        result, _ = self._solve(q, q + self._carried(tau) * v, time - t + tau, tau, sides)
+        t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
+        result, _ = self._solve(state, q + self._carried(tau) * v, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau
         return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its, result.products

@@ -81,6 +81,7 @@ CASES = {
     "bdf2": by("bdf2", swing(solver=LOOSE)),
     "static": by("static", swing(solver=LOOSE, anchor=[LED[0] | {"stop": 0.05}, *PUSHED])),
     "bdf2, reflected": by("bdf2", fall(solver=LOOSE, obstacle=[GROUND])),
+    "bdf2, pressed": by("bdf2", fall(solver=LOOSE, obstacle=PRESSING)),
     "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
     "bdf2, a thin plate": by("bdf2", fall(solver=LOOSE, obstacle=[THIN | {"restitution": 0.5}])),
     "verlet, a thin plate": by("verlet", fall(obstacle=[THIN | {"response": "penalty"}])),
@@ -108,6 +109,7 @@ CASES = {
         ),
     ),
     "by error, pressed": by_error(0.3, fall(solver=LOOSE, obstacle=PRESSING)),
+    "by error, bdf2, pressed": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))),
 }
 
 

@@ -59,15 +59,17 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
     assert of(frames, "energy_gained").sum() <= (1e-9 if integrator == "implicit-euler" else 0.2) * worked
 
 
-def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path):
+@pytest.mark.parametrize("integrator, share", [("implicit-euler", 1e-6), ("bdf2", 0.01)])
+def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
     """What anchors and moving obstacles put in is work: a plate of much friction that is pressed in and pulled away."""
+    time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
     floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8}
     floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
     lead = {"region": CLAMPED[0]["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
     for more in ({"obstacle": [floor], "gravity": GRAVITY}, {"anchor": [lead]}):
-        _, frames = play(block_scene(tmp_path, time=TIME, **more))
+        _, frames = play(block_scene(tmp_path, time=time, **more))
         assert of(frames, "elastic").max() > 1e-4
-        assert of(frames, "energy_gained").sum() <= 1e-6 * of(frames, "elastic").max()
+        assert of(frames, "energy_gained").sum() <= share * of(frames, "elastic").max()
 
 
 class Overshooting:

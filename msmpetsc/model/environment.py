@@ -270,6 +270,27 @@ class Environment:
                     work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 
+    def change_of_push(
+        self,
+        before: tuple[np.ndarray, np.ndarray | None],
+        after: tuple[np.ndarray, np.ndarray | None],
+        time: float,
+        time_step: float,
+    ) -> np.ndarray:
+        """Return by how much the push of penalties on this rank's nodes changes in a step, (owned,) [N].
+
+        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
+        """
+        change = np.zeros(self.lattice.owned, like=self.lattice.mass)
+        for row, p in enumerate(self.penalties):
+            depths = []
+            for (q, sides), when in ((before, time - time_step), (after, time)):
+                side = (self.no_sides if sides is None else sides)[row, : len(q)]
+                acts = p.obstacle.acts_at(when)
+                depths.append(np.maximum(p.at(when, side).depths(q)[0], 0) if acts else np.zeros_like(change))
+            change += p.stiffness * np.abs(depths[1] - depths[0])
+        return change
+
     def _pressing(self, time: float, sides: np.ndarray | None) -> list[tuple[Penalty, np.ndarray]]:
         sides = (self.no_sides if sides is None else sides)[self.pressing]
         return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]

@@ -2,7 +2,9 @@
 
 What a step adds to the error of the trajectory is its local error (local_error), and of nodes that bounce off in it,
 which do so at its end and not when they touch, a step times the velocity that they changed by, as the mean by mass:
-they push the rest of the body late. step_control adds both up and chooses the next step.
+they push the rest of the body late. A penalty whose push on a node changes in a step may have done so early or late in
+it: that is counted just so, as a step times the change over the mass times a step. step_control adds all up and chooses
+the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
 that BDF2 needs where the length changes. All methods are collective.
@@ -230,7 +232,11 @@ class Adaptive:
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
-        sums += [mass @ (coming**2).sum(axis=1), t * (free @ np.sqrt((struck**2).sum(axis=1)))]
+        late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
+        if self.environment.penalties:
+            ends = (before.q[owned], before.sides), (x, after.sides)
+            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, self._end(level), t))
+        sums += [mass @ (coming**2).sum(axis=1), late]
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 

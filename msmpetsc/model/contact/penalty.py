@@ -6,6 +6,9 @@ step, with mu N once |u| passes a small e; N is the push on the node at the step
 potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020,
 Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
 
+With the push of the start friction is of first order in the step's length. A step of BDF2 takes what the two last
+states lead to, N_(n+1) = 2 N_n - N_(n-1), and u = tau v_(n+1), the velocity that it ends with: of second order.
+
 A node that came into a box by one of its faces has that for its ``side``, and its depth is the way back through it,
 also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.
 """

@@ -4,6 +4,7 @@ Both runs carry the same points of the same mesh, so that nothing is projected o
 area around it, a third of its triangles'.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.compare import (
     LEAST_STRAIN,
     SAME_POINT,
+    SAME_TIME,
     Comparison,
     FieldError,
     common_times,
@@ -50,8 +52,10 @@ class SurfaceDistance:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
-def surface_distance(run: Result, reference: Result) -> SurfaceDistance:
+def surface_distance(run: Result, reference: Result, until: float = math.inf) -> SurfaceDistance:
     """Return the distance of a run's surface from that of a reference run, at the times that both have.
+
+    until : times after it do not count [s]
 
     Raises InputError where a file has no surface, the meshes differ or no time is common.
     """
@@ -59,6 +63,7 @@ def surface_distance(run: Result, reference: Result) -> SurfaceDistance:
     rest, area = reference["surface/points"][:], point_areas(reference)
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
+    pairs = pairs[times[pairs[:, 0]] <= until * (1 + SAME_TIME)]
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
     rms, greatest, worst, moved = np.empty(len(pairs)), np.empty(len(pairs)), np.empty(len(pairs), int), 0.0

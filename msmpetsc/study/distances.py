@@ -1,5 +1,6 @@
 """Distances of motions: the shape error, from the rest shape; trajectory and surface error, from the true motion."""
 
+import math
 import warnings
 from pathlib import Path
 
@@ -72,17 +73,19 @@ def trajectory_error(result: Path, reference: Path) -> float:
     return float(np.sqrt(off / moved))
 
 
-def surface_error(result: Path, reference: Path) -> float:
+def surface_error(result: Path, reference: Path, until: float = math.inf) -> float:
     """Return the distance of a run's surface from that of a reference run, of any lattice of the same mesh [-].
 
         sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
+
+    until : times after it do not count [s]
 
     The reference stands for the body itself: this is the error of cells, time step and unfinished steps together.
 
     Raises InputError if the meshes differ, a surface was not stored, there is no common time, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
-        distance = surface_distance(run, true)
+        distance = surface_distance(run, true, until)
     if distance.moved == 0:
         raise InputError(f"{reference}: nothing moves in it")
     return distance.overall / distance.moved

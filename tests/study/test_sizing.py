@@ -126,14 +126,19 @@ def test_cost_grows_with_cells_as_measured():
 
 
 class Bodies:
-    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution."""
+    """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution.
+
+    share_until : of a distance, up to a time [s]
+    inverted    : cells inside out at the end, by cells
+    """
 
     def __init__(
         self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
-        fails=lambda *_: False,
+        fails=lambda *_: False, share_until=lambda time: 1.0, inverted=lambda cells: 0.0,
     ):  # fmt: skip
         self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
         self.most = most  # error of cells, out of step
+        self.share_until, self.inverted = share_until, inverted
         self.errors: dict[Path, float] = {}  # by the result
 
     def result_of(self, case: Case) -> Path:
@@ -159,13 +164,16 @@ class Bodies:
         substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
         cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
         row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost, "iterations": substeps - 0.3}
+        row["inverted"] = self.inverted(cells)
         return CaseResult(row, None, 1.0)
 
 
 def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
     (tmp_path / "scene.toml").write_text(SCENE)
     bench, said = Bodies(**bodies), []
-    monkeypatch.setattr(trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b]))
+    monkeypatch.setattr(
+        trials, "surface_error", lambda a, b, until: bench.share_until(until) * abs(bench.errors[a] - bench.errors[b])
+    )
     sizer = Sizer(
         tmp_path / "scene.toml", bench, target=target, presets=["newton"], frames=10, cells=6400, ranks=1,
         report=said.append,
@@ -189,6 +197,27 @@ def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch,
     assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
     assert target / 3 < bench.error_of(case_of(method), cells) <= 1.01 * target  # what is measured is off by a little
     assert plan.choice.budget.total <= target and len(plan.tried) >= 6
+
+
+def test_a_choice_is_measured_from_a_lattice_that_steps_alike(tmp_path: Path, monkeypatch):
+    """The lattices are run by BDF2, whose steps have an error of their own; the choice is verlet."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.1)
+    tried = {(each.method, each.cells) for each in plan.tried}
+    assert {("bdf2", 100), ("bdf2", 800), ("bdf2", 6400)} <= tried and ("verlet", 100) not in tried
+    assert plan.choice.method.integrator == "verlet" and ("verlet", 6400) in tried
+
+
+@pytest.mark.parametrize(("cell_error", "measured"), [(1.5, True), (3.7, False), (5.2, True)])
+def test_a_choice_like_the_finest_lattice_is_not_measured(
+    tmp_path: Path, monkeypatch, cell_error: float, measured: bool
+):
+    """Of half to four times the cells; beyond, the distance tells the error, which is a formula."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.04, cell_error=cell_error, explicit=False)
+    assert plan.met and (0.5 < plan.choice.cells / 6400 < 4) != measured
+    if measured:
+        assert plan.check == pytest.approx(bench.error_of(case_of(plan.choice.method), plan.choice.cells), rel=0.2)
+    else:
+        assert plan.check is None
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
@@ -228,6 +257,35 @@ def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch)
     assert not plan.met and plan.choice.cells == 8 * 6400
     (said,) = (bound for bound in plan.bounds if bound.startswith("the mesh's cells"))
     assert f"{4 * (8 * 6400) ** -0.5:.1e} is left with 51200 cells" in said
+
+
+def test_a_plan_says_until_when_the_error_would_be_within_reach(tmp_path: Path, monkeypatch):
+    """The lattices part after 0.06 s: before, a quarter of 1.8e-2 is left. What is within reach has no such line."""
+    parts = {"cell_error": 4.0, "share_until": lambda time: 0.25 if time < 0.065 else 1.0}
+    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, **parts)
+    (said,) = (bound for bound in plan.bounds if bound.startswith("the motion"))
+    assert "if it ended at 0.06 s: fewer --frames" in said
+    left = plan.choice.budget.total - 0.75 * plan.choice.budget.cells
+    assert f"{left:.1e} would be left" in said and left <= 1e-2
+    assert sized(tmp_path, monkeypatch, 0.1, **parts)[0].bounds == []
+
+
+def test_nothing_is_said_of_times_at_which_nothing_moves(tmp_path: Path, monkeypatch):
+    def share(time: float) -> float:
+        if math.isfinite(time):
+            raise InputError("nothing moves in it")
+        return 1.0
+
+    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, cell_error=4.0, share_until=share)
+    assert not plan.met and not any(bound.startswith("the motion") for bound in plan.bounds)
+
+
+def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
+    """On the finest lattice that was tried; coarser ones are not what the motion converges to."""
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0)
+    (said,) = plan.bounds
+    assert said.startswith("the motion: of 6400 cells 7 end inside out")
+    assert sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0)[0].bounds == []
 
 
 def test_a_plan_says_when_impacts_bound_the_error(tmp_path: Path, monkeypatch):

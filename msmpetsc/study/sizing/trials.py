@@ -15,6 +15,7 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
+from msmpetsc.study.sizing.bounds import inverted_bound, size_bounds, time_bound
 from msmpetsc.study.sizing.choice import Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, error_law
 
@@ -25,7 +26,7 @@ FINEST = 2  # times finer than the scene's: the finest cells that are chosen
 IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
-APART = 2  # times the cells, or else the distance of a choice from the finest lattice tells nothing
+COARSE, FINE = 1 / 2, 4  # times the cells: between them a choice's distance from the finest lattice tells nothing
 PART = 8  # the error of the finest step must be so small a part of the error asked for
 FAR = 0.15  # surfaces so far apart move out of step: that is no small error any more, and shrinks with no order
 USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
@@ -42,6 +43,7 @@ class SizeTrial:
     asked, cells : valid cells asked for, and had
     cost         : computing seconds a simulated second
     substeps     : of a step, for verlet; else iterations; their mean
+    inverted     : cells that end inside out
     result       : its file
     """
 
@@ -50,6 +52,7 @@ class SizeTrial:
     cells: float
     cost: float
     substeps: float
+    inverted: float
     result: Path
 
     @property
@@ -130,7 +133,7 @@ class Sizer:
             lattices = [*lattices[-2:], finer]  # where no order was seen, the finest that are known say most
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices[-1])
-        return replace(plan, bounds=self._bounds(plan, model), tried=self._tried(model))
+        return replace(plan, bounds=self._bounds(plan, model, lattices), tried=self._tried(model))
 
     # Time
 
@@ -296,13 +299,20 @@ class Sizer:
         self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
         return replace(model, steppings=kept or model.steppings)
 
+    def _alike(self, method: Candidate, finest: SizeTrial) -> SizeTrial:
+        """Return the finest lattice stepped by a method, so that only the cells differ; as it was, if that fails."""
+        as_tried = replace(method, step_error=self.solved if method.step_error else None)
+        return finest if as_tried == finest.method else self._run(as_tried, finest.asked) or finest
+
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> float | None:
         """Return the error of a run of the choice from its distance to the finest lattice.
 
-        None where their cells are so alike that it tells nothing.
+        None where their cells are so alike that it tells nothing: of two lattices with nearly the same error, what they
+        are apart is chance.
         """
-        if 1 / APART < run.cells / finest.cells < APART:
+        if COARSE < run.cells / finest.cells < FINE:
             return None
+        finest = self._alike(choice.method, finest)
         apart = _apart(run, finest)
         if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
             share = (run.edge / finest.edge) ** model.law.order
@@ -311,18 +321,14 @@ class Sizer:
 
     # What is said
 
-    def _bounds(self, plan: SizePlan, model: Model) -> list[str]:
-        """Return what bounds the error, in words."""
-        bounds, best = [*self.bounds, *filter(None, [self.cell_bound])], model.best().budget
+    def _bounds(self, plan: SizePlan, model: Model, lattices: list[SizeTrial]) -> list[str]:
+        """Return what bounds the error, in words; of the lattices that tell the cells' error."""
+        finest = max(self.trials, key=lambda each: each.cells)
+        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted_bound(finest.inverted, finest.cells)]
         if not plan.met:
-            wanted = model.cells_for(self.target / 2)
-            if best.time > self.target / 2 and not self.bounds:
-                bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
-            if best.cells > self.target / 2:
-                bounds.append(
-                    f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; half the error asked for "
-                    f"would take {wanted:.2g}"
-                )
+            times = [self.step * frame for frame in range(1, round(self.duration / self.step))]
+            bounds += size_bounds(model, self.target, bool(self.bounds))
+            bounds += time_bound(model, self.target, times, lambda until: _apart(lattices[-2], lattices[-1], until))
         return bounds
 
     def _tried(self, model: Model) -> list[Tried]:
@@ -347,19 +353,21 @@ class Sizer:
         done = next((each for each in self.trials if (each.method, each.asked) == (method, cells)), None)
         if done is not None:
             return done
-        case = self._case(method, cells)
+        case = self.case(method, cells)
         row = self.bench.measure(case, keep=True).row
         if row["status"] != "ok" or not row.get("time_second"):
             self.report(f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}")
             return None
         trial = SizeTrial(
-            method, cells, row["cells"], row["time_second"], row["iterations"], self.bench.result_of(case)
-        )
+            method, cells, row["cells"], row["time_second"], row["iterations"], row.get("inverted") or 0.0,
+            self.bench.result_of(case),
+        )  # fmt: skip
         self.trials.append(trial)
         self.report(trial)
         return trial
 
-    def _case(self, method: Candidate, cells: int) -> Case:
+    def case(self, method: Candidate, cells: int) -> Case:
+        """Return the run of a method on so many cells, with the surface at the scene's own frames."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         scene = StudyScene(
             name=self.scene.stem, file=self.scene.name, duration=self.duration, set=(f"cages={inline(cages)}",)
@@ -374,5 +382,5 @@ class Sizer:
         return case.changed(SURFACE, f"output.every={max(1, round(self.step / method.time_step))}")
 
 
-def _apart(run: SizeTrial, reference: SizeTrial) -> float:
-    return surface_error(run.result, reference.result)
+def _apart(run: SizeTrial, reference: SizeTrial, until: float = math.inf) -> float:
+    return surface_error(run.result, reference.result, until)

@@ -56,9 +56,9 @@ STUDIES = {
     "lung_press": Setting("lung_press.toml", (10, 10, 10), (1000, 2000, 4000)),
     "bunny_fall": Setting("bunny_fall.toml", (130, 130, 130), (1000, 2000, 4000)),
     "brain_fall": Setting("brain_fall.toml", (120, 120, 120), (1000, 2000, 4000)),
-    "beam_soft": Setting("studies/beam_soft.toml", (20, 20, 20), (1000, 2000, 4000)),
+    "beam_soft": Setting("studies/beam_soft.toml", (20, 20, 20), (1000, 2000, 2000)),
     "beam_stiff": Setting("studies/beam_stiff.toml", (10, 10, 10), (2000, 2000, 8000)),
-    "press": Setting("studies/atlas/press.toml", (20, 20, 20), (512, 2000, 4000)),
+    "press": Setting("studies/atlas/press.toml", (6, 6, 6), (512, 2000, 4000)),
 }
 
 

@@ -128,17 +128,18 @@ def test_cost_grows_with_cells_as_measured():
 class Bodies:
     """A bench whose runs are formulas: the error is one of cells, of order 1.5, of steps, and of their solution.
 
+    slow        : whether explicit substeps take too long
     share_until : of a distance, up to a time [s]
     inverted    : cells inside out at the end, by cells
     """
 
     def __init__(
         self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0, most=math.inf,
-        fails=lambda *_: False, share_until=lambda time: 1.0, inverted=lambda cells: 0.0,
+        fails=lambda *_: False, slow=lambda substep: False, share_until=lambda time: 1.0, inverted=lambda cells: 0.0,
     ):  # fmt: skip
         self.explicit, self.impacts, self.cell_error, self.fails = explicit, impacts, cell_error, fails
         self.most = most  # error of cells, out of step
-        self.share_until, self.inverted = share_until, inverted
+        self.slow, self.share_until, self.inverted = slow, share_until, inverted
         self.errors: dict[Path, float] = {}  # by the result
 
     def result_of(self, case: Case) -> Path:
@@ -155,7 +156,7 @@ class Bodies:
         explicit = case.integrator == "verlet"
         steps = max(0.01 / case.time_step, case.time_step / 0.01)
         assert steps == pytest.approx(round(steps))  # so that frames come at the same times
-        if explicit and not self.explicit:
+        if explicit and (not self.explicit or self.slow(case.time_step)):
             return CaseResult({"status": "timeout", "reason": "took longer than 1 s"}, None, 0.0)
         (cells,) = (int(text.partition("count = ")[2].strip(" }")) for text in case.set if text.startswith("cages="))
         if self.fails(case.integrator, cells):
@@ -234,6 +235,13 @@ def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, 
     """As where a pin holds no node: the order is seen all the same."""
     plan, *_ = sized(tmp_path, monkeypatch, 0.1, fails=lambda _, cells: cells == 100)
     assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {200, 800, 6400}
+
+
+def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: Path, monkeypatch):
+    """The first ends, that with half its substeps does not: BDF2 stands for the true motion."""
+    plan, _, said = sized(tmp_path, monkeypatch, 0.03, slow=lambda step: step < 1e-2)
+    assert "verlet" in {each.method.integrator for each in said if not isinstance(each, str)}
+    assert plan.met and {each.method for each in plan.tried} == {"bdf2", "implicit-euler"}
 
 
 def test_lattices_out_of_step_tell_no_order(tmp_path: Path, monkeypatch):

@@ -301,7 +301,7 @@ class Sizer:
 
     def _alike(self, method: Candidate, finest: SizeTrial) -> SizeTrial:
         """Return the finest lattice stepped by a method, so that only the cells differ; as it was, if that fails."""
-        as_tried = replace(method, step_error=self.solved if method.step_error else None)
+        as_tried = self._as_tried(method)
         return finest if as_tried == finest.method else self._run(as_tried, finest.asked) or finest
 
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> float | None:
@@ -332,17 +332,22 @@ class Sizer:
         return bounds
 
     def _tried(self, model: Model) -> list[Tried]:
-        """Return cost and expected error of each trial."""
+        """Return cost and expected error of each trial, where the error of its step is known."""
         solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
         tried = []
         for each in self.trials:
             method = each.method
-            as_tried = replace(method, step_error=self.solved if method.step_error else None)
-            error = self.step_errors[as_tried] + solved[method.step_error] + model.law.error(each.edge)
-            tried.append(Tried(method.integrator, each.cells, each.cost, error))
+            time_error = self.step_errors.get(self._as_tried(method))
+            if time_error is not None:  # as it is not of explicit trials the next of which took too long
+                error = time_error + solved[method.step_error] + model.law.error(each.edge)
+                tried.append(Tried(method.integrator, each.cells, each.cost, error))
         return tried
 
     # Runs
+
+    def _as_tried(self, method: Candidate) -> Candidate:
+        """Return a method with its steps solved as those of the trials are."""
+        return replace(method, step_error=self.solved if method.step_error else None)
 
     def _method(self, integrator: Integrator, step: float) -> Candidate:
         solves = integrator != "verlet"

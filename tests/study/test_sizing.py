@@ -48,6 +48,18 @@ def test_an_order_that_cannot_be_is_not_believed():
     assert not two.seen and two.error(1) == pytest.approx(0.05)
 
 
+def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
+    """Errors go as the size, but for 0.02 of chance, which the last two sizes alone would make much of."""
+    sizes, errors = (4, 1.4, 1), (0.4, 0.16, 0.08)
+    near = error_law(sizes, [0.24, 0.08], CELL_ORDERS)
+    wide = error_law(sizes, [0.24, 0.08], CELL_ORDERS, across=errors[0] - errors[2])
+    assert not near.seen and near.error(1) == pytest.approx(0.2)
+    assert not wide.seen and wide.error(1) == pytest.approx(0.32 / 3)
+    assert error_law((4, 2, 1), [0.05, 0.05], CELL_ORDERS, across=0.1).error(1) == pytest.approx(0.05)
+    seen = [0.03 * (4**1.5 - 1.4**1.5), 0.03 * (1.4**1.5 - 1)]
+    assert error_law(sizes, seen, CELL_ORDERS, across=1.0).error(1) == pytest.approx(0.03)
+
+
 def stepping(integrator: str, step: float, error: float, cost: float) -> Stepping:
     return Stepping(Candidate(integrator, step, "newton", "", 1e-3), error, cost)
 

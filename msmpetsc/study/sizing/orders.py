@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 CELL_ORDERS = (1.0, 2.2)  # what is taken seriously: of a boundary seen by the share of its cells, of linear cells
 STEP_ORDERS = (1.0, 2.2)
+ALIKE = 1.9  # times: sizes nearer than that differ by chance as much as by their order
 UNSEEN = 0.05  # a measured order may lie so far below the range before it counts as not seen
 
 
@@ -34,19 +35,24 @@ class ErrorLaw:
         return (error / self.factor) ** (1 / self.order)
 
 
-def error_law(sizes: Sequence[float], distances: Sequence[float], orders: tuple[float, float]) -> ErrorLaw:
+def error_law(
+    sizes: Sequence[float], distances: Sequence[float], orders: tuple[float, float], across: float | None = None
+) -> ErrorLaw:
     """Return the law of the error from runs of descending sizes and the distances of neighbours.
 
     sizes     : two or three of them
     distances : one fewer; of the last two runs the last
     orders    : the least and the greatest that are believed; of two sizes the least is taken
+    across    : distance of the first and the last run, which is taken where no order is seen and the last two are alike
     """
     low, high = orders
     order, seen = low, False
     if len(sizes) > 2 and distances[-1] > 0:
         order, seen = _order(sizes, distances[-2] / distances[-1], low, high)
-    a, b = sizes[-2:]
-    return ErrorLaw(distances[-1] / (a**order - b**order), order, seen)
+    (a, b), apart = sizes[-2:], distances[-1]
+    if not seen and across is not None and a < ALIKE * b:
+        a, apart = sizes[0], across
+    return ErrorLaw(apart / (a**order - b**order), order, seen)
 
 
 def _order(sizes: Sequence[float], ratio: float, low: float, high: float) -> tuple[float, bool]:

@@ -259,7 +259,9 @@ class Sizer:
         apart = [_apart(*pair) for pair in pairwise(runs)]
         least, greatest = CELL_ORDERS
         far = len(runs) > 2 and apart[0] > FAR
-        law = error_law([each.edge for each in runs], apart, (USUAL if far else least, greatest))
+        orders = (USUAL if far else least, greatest)
+        across = None if far else _apart(runs[0], runs[-1])
+        law = error_law([each.edge for each in runs], apart, orders, across)
         self.cell_bound = ""
         if not law.seen:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"

@@ -255,17 +255,21 @@ class Sizer:
         return runs
 
     def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
-        """Return the error of the cells from runs of two lattices or three."""
+        """Return the error of the cells from runs of two lattices or three.
+
+        What turns inside out is as fine as the cells are, and shrinks no faster, whatever the distances say.
+        """
         apart = [_apart(*pair) for pair in pairwise(runs)]
         least, greatest = CELL_ORDERS
-        far = len(runs) > 2 and apart[0] > FAR
-        orders = (USUAL if far else least, greatest)
+        far, inverted = len(runs) > 2 and apart[0] > FAR, runs[-1].inverted > 0
+        orders = (least, least) if inverted else (USUAL if far else least, greatest)
         across = None if far else _apart(runs[0], runs[-1])
         law = error_law([each.edge for each in runs], apart, orders, across)
-        self.cell_bound = ""
+        law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
             why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell" if far else why
+            why = "cells end inside out" if inverted else why
             self.cell_bound = f"the cells: no order was seen ({why}); order {law.order:g} is taken"
         return law
 

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Runs scenes whose surface meets itself, and prints Markdown tables: does it cross, what it costs. Needs the meshes.
 
-    scripts/self_contact_study.py [SCENE...] [--cells N] [--frames N] [--shorter N] [--points 5000,20000,50000]
+    scripts/self_contact_study.py [SCENE...] [--cells N] [--frames N] [--shorter N] [--set KEY=VALUE]
+                                  [--points 5000,20000,50000]
 
 Of each scene that touches: contacts, least distance, iterations and what a frame costs. crossings: pairs of an edge and
 a triangle that cross, over all frames, by a test that shares nothing with the contact's own, of the surface that meets
@@ -68,9 +69,9 @@ def run(scene: str, name: str, options: list[str], *more: object) -> Path:
     return path
 
 
-def touching(scene: str, cells: int | None, steps: int | None, shorter: int) -> list[str]:
+def touching(scene: str, changes: list[str], cells: int | None, steps: int | None, shorter: int) -> list[str]:
     """Row of a scene that touches itself."""
-    options = [f"cages.count={cells}"] if cells else []
+    options = [*changes, *([f"cages.count={cells}"] if cells else [])]
     if shorter > 1:
         step = load_scene(SCENES / f"{scene}.toml").time.step
         options.append(f"time.step={step / shorter!r}")
@@ -165,6 +166,7 @@ def main() -> None:
     options.add_argument("--cells", type=int, metavar="N", help="of each scene; its own if absent")
     options.add_argument("--frames", type=int, metavar="N", help="of those that touch; all if absent")
     options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps of those that touch")
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of those that touch")
     options.add_argument("--points", default="5000,20000,50000", metavar="N,N", help="of the surface (%(default)s)")
     args = options.parse_args()
     unknown = set(args.scenes) - {*TOUCHING, *COSTS}
@@ -175,7 +177,7 @@ def main() -> None:
     head = ["scene", "cells", "triangles", "steps", "contacts at most", "least distance [µm]"]
     head += ["crossed", "drawn", "iterations a step", "products", "ms a frame"]
     if met := [scene for scene in TOUCHING if scene in chosen]:
-        table(head, (touching(scene, args.cells, args.frames, args.shorter) for scene in met))
+        table(head, (touching(scene, args.set, args.cells, args.frames, args.shorter) for scene in met))
         print()
     if costs := [scene for scene in COSTS if scene in chosen]:
         head = ["scene", "points", "ms a step", "times as long", *(f"{part} [ms]" for part in PARTS)]

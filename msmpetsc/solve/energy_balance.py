@@ -25,7 +25,6 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import to_host
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity.energy import Elasticity
@@ -142,7 +141,7 @@ class EnergyBalance:
             self.elasticity.energy(q),
             contact.energy(at) if contact else 0.0,
             -np.vdot(environment.given_load(time), at),
-            *to_host(lattice.mass @ v),
+            *(lattice.mass @ v),
         )
         return Energies(
             **dict(zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)),

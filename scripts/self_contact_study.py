@@ -10,7 +10,7 @@ itself; of the one that is drawn over 20. --shorter 16 takes steps, and frames, 
 
 Then CPU time of a step without self-contact and with it, by points of the surface that meets itself, and what its
 parts take: bunny and brain in free fall, an armadillo whose leg is dragged, by five edges of 5,000 points a step at
-first, and the lung while it is pressed on itself. A surface has no more points than its mesh.
+first, and the lung while it is pressed. A surface has no more points than its mesh.
 """
 
 import subprocess

@@ -128,8 +128,8 @@ class Simulation:
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
         make = partial(make_integrator, comm, model, self.environment)
         swings = scene.time.integrator != "implicit-euler"
-        self.checks = scene.safety.checks
-        self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings, self.checks)
+        checks = scene.safety.checks
+        self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings, checks)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
             self.adaptive = Adaptive(comm, model.lattice, self.environment, scene, make, self.balance)
@@ -249,8 +249,8 @@ class Simulation:
             potential=energies.potential,
             contact=energies.contact,
             momentum=energies.momentum,
-            inverted=self.monitors.inverted(index, time, q) if self.checks else -1,
-            energy_gained=max(gained, 0.0) if self.checks else np.nan,
+            inverted=self.monitors.inverted(index, time, q) if self.balance.checks else -1,
+            energy_gained=max(gained, 0.0) if self.balance.checks else np.nan,
             self_contacts=energies.touch.contacts,
             self_distance=energies.touch.distance,
             self_contact=energies.touch.energy,

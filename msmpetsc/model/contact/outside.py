@@ -12,7 +12,7 @@ import numpy as np
 from msmpetsc.comm import Route
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
-from msmpetsc.geometry.surface import is_inside
+from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.model.lattice import Lattice
 
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
@@ -29,18 +29,18 @@ def distance_outside(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> 
     distance = np.zeros(len(points))
     for number in np.unique(of_point):
         own = of_point == number
-        distance[own] = _distance_outside(bodies[number], points[own])
+        surface = bodies[number].surface
+        assert surface is not None  # here
+        distance[own] = np.maximum(-depth_below(surface, points[own]), 0.0)
     outside = np.zeros(owned)
     outside[rows] = to_root.answer(distance)
     ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
     return np.concatenate([outside, lattice.table.rows_of(ghosts, outside)])
 
 
-def _distance_outside(body: Body, points: np.ndarray) -> np.ndarray:
-    """Return how far points (n, 3) lie outside the surface, which is here (n,) [m]."""
+def depth_below(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Return how deep points (n, 3) lie below a surface (n,) [m], negative outside."""
     import igl  # for scenes with obstacles
 
-    surface = body.surface
-    assert surface is not None
-    squares = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0]
-    return np.where(is_inside(surface, points), 0.0, np.sqrt(squares))
+    distance = np.sqrt(igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0])
+    return np.where(is_inside(surface, points), distance, -distance)

@@ -85,13 +85,13 @@ class CellContacts:
 
 
 class CellContact:
-    """Contact in one step. All methods but ``concavity`` and ``rows`` are collective; positions are (l, 3) [m].
+    """Contact in one step. All methods but ``concavity`` and ``free_share`` are collective; positions are (l, 3) [m].
 
     start   : where points were looked for
     found   : those in cells around this rank's nodes; ``owns`` (a,) those in cells that belong to it
     corners : (a, 8) local nodes of their cells; ``stiffness`` (a,) [N/m]
     touched : (k,) numbers of the points of all ranks, ascending; ``rows`` (a,) which of those each is
-    carried : those, as this rank's nodes carry them; ``at_start`` (k, 3) where they were [m]
+    carried : those, as this rank's nodes carry them
     """
 
     def __init__(self, comm: MPI.Comm, collision: OverlappingSurface, start: np.ndarray, found: Intrusions):

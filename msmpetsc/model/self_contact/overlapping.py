@@ -6,7 +6,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.geometry.cages import Body
-from msmpetsc.geometry.surface import Surface, is_inside, joined
+from msmpetsc.geometry.surface import Surface, joined
+from msmpetsc.model.contact.outside import depth_below
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.cells import Cells, Places
@@ -51,14 +52,9 @@ def _areas(surface: Surface) -> np.ndarray:
 
 def _depths(comm: MPI.Comm, bodies: Sequence[Body], lattice: Lattice) -> np.ndarray:
     """Return how deep each node (l,) is below its body's surface at rest [m], negative outside (collective)."""
-    import igl
-
     depths, of_node = np.zeros(len(lattice.nodes)), lattice.body
     for number, body in enumerate(bodies):
         surface, rows = comm.bcast(body.surface), np.flatnonzero(of_node == number)
-        if not len(rows):
-            continue
-        nodes = lattice.nodes[rows]
-        distance = np.sqrt(igl.point_mesh_squared_distance(nodes, surface.points, surface.triangles)[0])
-        depths[rows] = np.where(is_inside(surface, nodes), distance, -distance)
+        if len(rows):
+            depths[rows] = depth_below(surface, lattice.nodes[rows])
     return depths

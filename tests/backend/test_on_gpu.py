@@ -6,11 +6,12 @@ import json
 import operator
 import re
 import shutil
+import struct
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -252,8 +253,6 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
     in registers; it needs no GPU."""
     for package in ("numba_cuda", "cupy"):
         pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
-    from numba import cuda
-
     given = {}
 
     def launcher(body):
@@ -269,20 +268,33 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
     assert set(given) == set(bodies())
     from msmpetsc.backend import launcher
 
-    h200 = SimpleNamespace(compute_capability=(9, 0))
-    with patch("numba.cuda.dispatcher.get_current_device", lambda: h200):
-        for body, arguments in given.items():
-            types = numba.types.Tuple([numba.typeof(pretend_gpu.bare(one)) for one in arguments])
-            ptx, _ = cuda.compile_ptx(launcher.kernel_of(body).py_func, (numba.int64, types), cc=(9, 0))
-            assert ".target sm_90" in ptx and "threads" in ptx
-            with warnings.catch_warnings(action="error"):  # a grid of one block is no one's concern
-                launcher.kernel_of(body)[1, launcher.THREADS]
-            if shutil.which("ptxas"):
-                (tmp_path / "kernel.ptx").write_text(ptx)
-                command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]
-                said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-                print(body.__name__, said)
-                assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
+    h100 = SimpleNamespace(compute_capability=(9, 0))
+
+    def as_launched(argument):
+        array = pretend_gpu.bare(argument)
+        if not isinstance(array, np.ndarray):
+            return launcher.as_argument(array)
+        return launcher.described(array.ctypes.data, array.shape, array.strides, array.dtype.str)
+
+    def writable(kind):
+        return kind.copy(readonly=False) if isinstance(kind, numba.types.Array) else kind
+
+    for body, arguments in given.items():
+        kinds, words = zip(*map(as_launched, arguments), strict=True)
+        types = tuple(map(launcher.type_of, kinds))
+        assert types == tuple(writable(numba.typeof(pretend_gpu.bare(one))) for one in arguments)
+        with patch("numba.cuda.dispatcher.get_current_device", lambda: h100):
+            ptx = launcher.ptx_of(body, kinds, (9, 0))
+        assert ".target sm_90" in ptx
+        words = (0, *chain.from_iterable(words))  # the count first
+        assert len(words) == len(re.findall(r"^\s*\.param ", ptx, re.M)), body.__name__
+        struct.pack("q" + "".join(map(launcher.format_of, kinds)), *words)
+        if shutil.which("ptxas"):
+            (tmp_path / "kernel.ptx").write_text(ptx)
+            command = ["ptxas", "-arch=sm_90", "-v", "-o", tmp_path / "kernel.cubin", tmp_path / "kernel.ptx"]
+            said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+            print(body.__name__, said)
+            assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
 
 
 def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():

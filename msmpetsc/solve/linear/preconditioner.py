@@ -36,7 +36,7 @@ class Preconditioner:
 
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
-        return self.contact is not None and self.contact.follow(self.matrix.comm.tompi4py(), contact, q)
+        return self.contact is not None and self.contact.follow(contact, q)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step depends on."""
@@ -94,11 +94,11 @@ class ContactDiagonal:
         self.own = unknowns.memory.read(self.vector).copy()
         self.added = np.zeros_like(self.own)
 
-    def follow(self, comm: MPI.Comm, contact: Contact | None, q: np.ndarray) -> bool:
+    def follow(self, contact: Contact | None, q: np.ndarray) -> bool:
         """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
-        owned = self.unknowns.lattice.owned
-        bound = self._columns(contact.bound(q) if contact else np.zeros(owned, like=q))
-        changed = comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
+        lattice = self.unknowns.lattice
+        bound = self._columns(contact.bound(q) if contact else np.zeros(lattice.owned, like=q))
+        changed = lattice.table.comm.allreduce(not bool(np.array_equal(bound, self.added)), MPI.LOR)
         if changed:
             self._add(bound)
         return changed

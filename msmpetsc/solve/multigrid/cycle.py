@@ -110,7 +110,7 @@ class Multigrid:
         several = finer.matrix.comm.size > 1 and "matptap_via" not in PETSc.Options().getAll()
         # PETSc's default adds what other ranks send as it comes in, so that no two runs are alike
         with replaced_option("matptap_via", "allatonce") if is_new and several else nullcontext():
-            finer.matrix.PtAP(level.interpolation, level.matrix)
+            finer.matrix.ptap(level.interpolation, level.matrix)
         if is_new:
             set_block_size(level.matrix)
             level.matrix.setOption(PETSc.Mat.Option.SPD, True)

@@ -9,11 +9,12 @@ from msmpetsc.model.locate import describe_inverted, node_of_greatest
 from msmpetsc.solve.nonlinear.error_control import StepError
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
+NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
-    -4: "not finite",  # DIVERGED_FNORM_NAN; from PETSc 3.25 on DIVERGED_FUNCTION_NANORINF
-    -14: "not finite",  # there too: DIVERGED_OBJECTIVE_NANORINF
+    NOT_FINITE: "not finite",
+    -14: "not finite",  # from PETSc 3.25 on: DIVERGED_OBJECTIVE_NANORINF
 }
 REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
 KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}

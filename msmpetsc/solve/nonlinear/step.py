@@ -18,7 +18,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.failure import no_minimum, not_converged, where_worst
+from msmpetsc.solve.nonlinear.failure import NOT_FINITE, no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
@@ -379,7 +379,7 @@ class Stepper:
         if self.observer:
             self.observer(iterate.q)
         if not np.isfinite(control.now.residual):
-            return reasons.DIVERGED_FNORM_NAN
+            return NOT_FINITE
         if control.is_enough:
             if control.now.at_rounding:
                 return reasons.CONVERGED_FNORM_ABS

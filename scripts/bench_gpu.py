@@ -1,6 +1,5 @@
 #!/usr/bin/env python3
-"""A GPU beside the CPU of the same machine: prints Markdown and leaves out/bench_gpu/figures.json. It has not run on a
-GPU yet.
+"""A GPU beside the CPU of the same machine: prints Markdown and leaves out/bench_gpu/figures.json.
 
     scripts/bench_gpu.py [--cells N ...] [--scenes NAME ...] [--frames N] [--error E]
 

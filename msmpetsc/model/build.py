@@ -19,7 +19,7 @@ from msmpetsc.model.contact.build import build_obstacles, surfaces_of
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside
 from msmpetsc.model.contact.penalty import Penalty
-from msmpetsc.model.contact.reflection import Reflection
+from msmpetsc.model.contact.reflection import Exchange
 from msmpetsc.model.initial_state import InitialState, initial_state
 from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
@@ -58,7 +58,7 @@ class Model:
     embedding: Embedding | None
     loads: list[Load]
     anchors: list[Anchor]
-    reflections: list[Reflection]
+    exchanges: list[Exchange]
     penalties: list[Penalty]
     start: InitialState
     collision: CollisionSurface | OverlappingSurface | None = None
@@ -139,7 +139,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         loads=_loads(comm, scene, lattice, masks),
         own_forces=_own_forces(scene, lattice, masks),
         anchors=anchors,
-        reflections=_reflections(scene, obstacles),
+        exchanges=_exchanges(scene, obstacles),
         penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
@@ -170,7 +170,7 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
         ),
         loads=[replace(load, force=send(load.force)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
-        reflections=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.reflections],
+        exchanges=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges],
         penalties=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties],
         start=(send(positions), send(velocities)),
     )
@@ -295,19 +295,29 @@ def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForc
     return tuple(forces)
 
 
-def _reflections(scene: Scene, obstacles: list[Obstacle]) -> list[Reflection]:
+def _exchanges(scene: Scene, obstacles: list[Obstacle]) -> list[Exchange]:
+    pairs = zip(obstacles, scene.obstacle, strict=True)
     return [
-        Reflection(obstacle, 1.0 if table.restitution is None else table.restitution)
-        for obstacle, table in zip(obstacles, scene.obstacle, strict=True)
-        if table.response == "reflect"
+        Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
+        for obstacle, table in pairs
+        if table.response == "exchange"
     ]
 
 
 def _penalties(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray, obstacles: list[Obstacle]
 ) -> list[Penalty]:
-    pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response == "penalty"]
+    pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response != "exchange"]
     if not pressing:
         return []
     usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
-    return [Penalty(obstacle, o.stiffness or usual, o.friction or 0.0, stick) for obstacle, o in pressing]
+    return [
+        Penalty(
+            obstacle,
+            o.stiffness or usual,
+            o.friction or 0.0,
+            stick,
+            None if o.restitution == 1 else o.restitution,
+        )
+        for obstacle, o in pressing
+    ]

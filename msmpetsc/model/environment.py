@@ -9,6 +9,7 @@ from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.build import Model
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
+from msmpetsc.model.contact.reflection import Step, slowed
 from msmpetsc.model.loads import Anchor, Load, OwnForce
 from msmpetsc.model.self_contact.contacts import Touch
 from msmpetsc.model.self_contact.kinds import contacts_of, term_of
@@ -19,19 +20,20 @@ class Environment:
 
     Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
     its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (faces.side_of): the
-    penalties' first, then the reflections'.
+    penalties' first, then the exchanges'.
     """
 
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
-        self.penalties, self.reflections = model.penalties, model.reflections
+        self.penalties, self.exchanges = model.penalties, model.exchanges
         self.self_contact = contacts_of(self.lattice.table.comm, model.collision) if model.collision else None
         self.touches = bool(self.penalties or self.self_contact)
-        self.obstacles = [p.obstacle for p in self.penalties] + [r.obstacle for r in self.reflections]
+        self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
-        self.pressing, self.reflecting = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
+        self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
+        self.strikes = bool(self.exchanges) or any(p.restitution is not None for p in self.penalties)
         nodes = self.lattice.nodes
         self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
         self._states_of_loads: list[bool | tuple[float, ...]] = []
@@ -295,52 +297,32 @@ class Environment:
         sides = (self.no_sides if sides is None else sides)[self.pressing]
         return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
 
-    def reflect(
-        self,
-        q: np.ndarray,
-        q_previous: np.ndarray,
-        time: float,
-        time_step: float,
-        held: np.ndarray,
-        sides: np.ndarray,
+    def strike(
+        self, q: np.ndarray, q_previous: np.ndarray, step: tuple[float, float, np.ndarray], held: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
 
-        The arrays are the very same if nothing is touched.
+        The arrays are the very same if nothing is struck.
 
+        step : the time [s] that it ended at, its length [s], and the sides (o, l)
         held : (l,) bool, the nodes that do not give way
         """
+        time, time_step, sides = step
         free, work = ~held[:, None], 0.0
-        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
-            after, before = reflection.reflect(q, q_previous, time, time_step, side)
+        for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):
+            after, before = exchange.exchanged(q, q_previous, Step(time, time_step, side))
             if after is not q:
                 after, before = np.where(free, after, q), np.where(free, before, q_previous)
-                work += self._impulse_work(reflection.obstacle, (after - before) - (q - q_previous), time, time_step)
+                work += self._impulse_work(exchange.obstacle, (after - before) - (q - q_previous), time, time_step)
                 q, q_previous = after, before
+        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
+            if p.restitution is not None:
+                before = slowed(p.obstacle, p.restitution, q, q_previous, Step(time, time_step, side))
+                if before is not q_previous:
+                    before = np.where(free, before, q_previous)
+                    work += self._impulse_work(p.obstacle, q_previous - before, time, time_step)
+                    q_previous = before
         return q, q_previous, work
-
-    def turn(
-        self,
-        q: np.ndarray,
-        q_previous: np.ndarray,
-        a: np.ndarray,
-        time: float,
-        time_step: float,
-        held: np.ndarray,
-        sides: np.ndarray,
-    ) -> tuple[np.ndarray, float]:
-        """Return q_(n-1) and the work [J], as ``reflect`` does, for an integrator that leaves nodes where they are.
-
-        a : (l, 3) [m] acceleration times t^2
-        """
-        free, work = ~held[:, None], 0.0
-        for reflection, side in zip(self.reflections, sides[self.reflecting], strict=True):
-            before = reflection.turn(q, q_previous, a, time, time_step, side)
-            if before is not q_previous:
-                before = np.where(free, before, q_previous)
-                work += self._impulse_work(reflection.obstacle, q_previous - before, time, time_step)
-                q_previous = before
-        return q_previous, work
 
     def _impulse_work(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
         """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""

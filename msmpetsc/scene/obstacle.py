@@ -36,9 +36,11 @@ class ObstacleTable(Table):
     path: Path3 = Field((), description=f"how it moves: {PATH} [s, m]")
     start: NotNegative = Field(0.0, description="is there from this time [s]")
     stop: Positive | None = Field(None, description="is there until this time [s]; to the end if absent")
-    response: Literal["reflect", "penalty"] = Field("reflect", description="what happens on touching")
+    response: Literal["reflect", "penalty", "exchange"] = Field(
+        "reflect", description="what happens on touching; exchange is the paper's"
+    )
     restitution: float | None = Field(
-        None, ge=0, le=1, description='of "reflect": normal speed after over before the impact; 1 if absent [-]'
+        None, ge=0, le=1, description="of nodes that strike: normal speed after over before; 1 if absent [-]"
     )
     stiffness: Positive | None = Field(
         None, description='of "penalty": push on a node per depth [N/m]; from the stiffest spring if absent'
@@ -52,9 +54,9 @@ class ObstacleTable(Table):
         missing = [name for name in NEEDED[self.shape] if getattr(self, name) is None]
         if missing:
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
-        uses = {name: shape for shape, names in NEEDED.items() for name in names}
-        uses |= {"restitution": "reflect", "stiffness": "penalty", "friction": "penalty"}
+        uses = {name: (shape,) for shape, names in NEEDED.items() for name in names}
+        uses |= {"restitution": ("reflect", "exchange"), "stiffness": ("penalty",), "friction": ("penalty",)}
         for name, use in uses.items():
-            if getattr(self, name) is not None and use not in (self.shape, self.response):
-                raise rule(f"has {name}, which is for {use!r} only")
+            if getattr(self, name) is not None and not {self.shape, self.response} & set(use):
+                raise rule(f"has {name}, which is for {' or '.join(map(repr, use))} only")
         return self

@@ -10,7 +10,7 @@ INTEGRATORS = ("implicit-euler", "bdf2")
 
 
 def only_implicit(cls: Any, table: Any, info: ValidationInfo) -> Any:
-    """Refuse integrators that take other steps than implicit ones, and obstacles that reflect (a validator of
+    """Refuse integrators that take other steps than implicit ones, and obstacles that set nodes back (a validator of
     ``self_contact``)."""
     if table is None:
         return table
@@ -18,10 +18,10 @@ def only_implicit(cls: Any, table: Any, info: ValidationInfo) -> Any:
     if integrator not in INTEGRATORS:
         raise rule(f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"', "time")
     for number, obstacle in enumerate(info.data.get("obstacle", ())):
-        if obstacle.response == "reflect":
+        if obstacle.response == "exchange":
             raise rule(
-                f"may not go with obstacles that reflect, as obstacle.{number} does: they move nodes past each other; "
-                'response = "penalty" presses',
+                f'may not go with response = "exchange", as obstacle.{number} has it: that moves nodes past each '
+                'other; "reflect" and "penalty" press',
                 "obstacle",
             )
     return table

@@ -40,13 +40,26 @@ def refuse_motion(start: Any, info: ValidationInfo, whose: str = "") -> None:
         raise rule(words, "time")
 
 
+def only_of_one_step(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
+    """Refuse the paper's exchange where a step looks further back (a validator of ``obstacle``)."""
+    if getattr(info.data.get("time"), "integrator", None) == "bdf2":
+        for number, obstacle in enumerate(obstacles):
+            if obstacle.response == "exchange":
+                raise rule(
+                    f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: that sets nodes back by '
+                    'one step; "reflect" and "penalty" go',
+                    "time",
+                )
+    return obstacles
+
+
 def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
-    """Refuse obstacles that reflect or rub (a validator of ``obstacle``)."""
+    """Refuse obstacles that anything bounces off, or that rub (a validator of ``obstacle``)."""
     for number, obstacle in enumerate(obstacles if _is_static(info) else ()):
-        if obstacle.response == "reflect":
+        if obstacle.response != "penalty":
             raise rule(
-                f'may not reflect where time.integrator = "{STATIC}", as obstacle.{number} does: nothing strikes it; '
-                'response = "penalty" presses',
+                f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: nothing '
+                'strikes it; response = "penalty" presses',
                 "time",
             )
         if obstacle.friction:

@@ -172,8 +172,8 @@ class EnergyBalance:
             raise StepFailed(
                 f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
                 f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
-                "try a smaller solver.error (or more iterations), a smaller time.step, or "
-                'safety.on_failure = "fallback"',
+                f"try {self.remedy(result.explicit)}"
+                + ("" if self.environment.exchanges else ', or safety.on_failure = "fallback"'),
                 "energy",
             )
         self.known, self.ledger = (after.q, ended.elastic), ledger
@@ -189,11 +189,20 @@ class EnergyBalance:
         ledger = self.ledger
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
-        put_in = max(ledger.put_in, start - pushed - max(ledger.gained, 0.0) + max(work, 0.0), self.floor)
+        by_right = start - max(ledger.bounced, 0.0) - pushed - max(ledger.gained, 0.0)  # an exchange puts nothing in
+        put_in = max(ledger.put_in, by_right + max(work, 0.0), self.floor)
         put_in = max(put_in, solved.inner - max(ledger.gained + gained, 0.0))
         least = -self.credit * put_in
         steady = max(least, ledger.steady + gained - swing)
         return Ledger(put_in, max(least, ledger.gained + gained), steady, gained, bounced)
+
+    def remedy(self, explicit: bool) -> str:
+        """Return what was seen to keep energy from coming from nowhere, in words."""
+        if self.environment.exchanges:
+            return 'response = "reflect" in place of "exchange", which moves nodes against their springs'
+        if explicit or self.credit:
+            return "a smaller time.substep" if explicit else "a smaller time.step"
+        return "a smaller time.step or a smaller solver.error"
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the ledger."""
@@ -207,7 +216,7 @@ class EnergyBalance:
 
     def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""
-        if not self.environment.reflections:
+        if not self.environment.strikes:
             return False
         own = after.q is not result.position or after.q_previous is not result.previous
         return self.comm.allreduce(own, MPI.LOR)

@@ -61,18 +61,17 @@ class Monitors:
             overlapping = describe_overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)
             if overlapping:
                 log.warning(
-                    "frame %d (t = %.6g s): %s; what reflects leaves nodes inside, a penalty pushes them out at once",
+                    'frame %d (t = %.6g s): %s; "exchange" leaves nodes inside, other responses push them out',
                     index, time, overlapping,
                 )  # fmt: skip
 
-    def gain(self, index: int, time: float, ledger: Ledger) -> None:
-        """Take note of what the body has from nowhere after a step."""
+    def gain(self, index: int, time: float, ledger: Ledger, remedy: str) -> None:
+        """Take note of what the body has from nowhere after a step, and of what mends that."""
         if not ledger.share <= MUCH:
             if not self.gaining:
                 log.warning(
-                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; a smaller "
-                    "time.step or a smaller solver.error mends that",
-                    index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in,
+                    "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; try %s",
+                    index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in, remedy,
                 )  # fmt: skip
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)

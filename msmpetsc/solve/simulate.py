@@ -186,7 +186,7 @@ class Simulation:
             errors, trace = self.integrator.true_errors(index, result)
             self.cost.measure(errors)
             self.trace = trace or self.trace
-        self.monitors.gain(index, time, self.balance.ledger)
+        self.monitors.gain(index, time, self.balance.ledger, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.reflection import Reflection
+from msmpetsc.model.contact.reflection import Exchange, Step
 from msmpetsc.model.contact.solids import Faces
 from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import Load, Motion, spread_by_mass
@@ -106,16 +106,16 @@ FLOOR = np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 STILL = Motion.through(())
 
 
-def reflect(q, q_previous, point, normal, e):
+def exchanged(q, q_previous, point, normal, e):
     """At a plane at rest."""
-    return Reflection(Obstacle(Faces(point[None], normal[None]), STILL), e).reflect(q, q_previous, 1.0, 0.1)
+    return Exchange(Obstacle(Faces(point[None], normal[None]), STILL), e).exchanged(q, q_previous, Step(1.0, 0.1))
 
 
-def test_reflect_reverses_only_what_goes_into_the_plane():
+def test_an_exchange_reverses_only_what_goes_into_the_plane():
     q_previous = np.array([[0, 0, 0.5], [0, 0, -2], [0, 0, 2.0], [1, 1, 0.2]])
     q = np.array([[1, 2, -0.5], [1, 2, -1], [1, 2, 1.0], [1, 1, 0.0]])
     # the first goes in; the second is behind but leaves; the third is still above; the fourth just arrives
-    after, before = reflect(q, q_previous, *FLOOR, 1.0)
+    after, before = exchanged(q, q_previous, *FLOOR, 1.0)
     assert np.array_equal(after, [[1, 2, 0.5], [1, 2, -1], [1, 2, 1], [1, 1, 0.2]])
     assert np.array_equal(before, [[0, 0, -0.5], [0, 0, -2], [0, 0, 2], [1, 1, 0]])
 
@@ -126,7 +126,7 @@ coordinates = arrays(float, (6, 3), elements=st.integers(-64, 64).map(lambda x: 
 @given(coordinates, coordinates, st.sampled_from([0.0, 0.25, 1.0]), st.sampled_from([0, 1, 2]), st.integers(-2, 2))
 def test_normal_velocity_becomes_minus_e_times_itself(q, q_previous, e, axis, height):
     normal = np.eye(3)[axis] * (-1 if height < 0 else 1)
-    after, before = reflect(q, q_previous, height * normal, normal, e)
+    after, before = exchanged(q, q_previous, height * normal, normal, e)
     v, v_after = q - q_previous, after - before
     hit = ((q @ normal) <= height) & (v @ normal < 0)
     assert np.array_equal(v_after @ normal, np.where(hit, -e * (v @ normal), v @ normal))
@@ -139,7 +139,7 @@ def test_normal_velocity_becomes_minus_e_times_itself(q, q_previous, e, axis, he
 def test_an_oblique_plane_keeps_the_sliding_part():
     normal = np.array([0.0, 0.6, 0.8])
     q, q_previous = np.array([[1.0, -0.5, -0.1]]), np.array([[0.0, 0.4, 0.3]])
-    after, before = reflect(q, q_previous, np.zeros(3), normal, 1.0)
+    after, before = exchanged(q, q_previous, np.zeros(3), normal, 1.0)
     v = (q - q_previous)[0]
     assert (after - before)[0] == pytest.approx(v - 2 * (v @ normal) * normal)
 
@@ -151,7 +151,7 @@ def bounce(e: float, steps: int, t: float = 1 / 64) -> np.ndarray:
     heights = []
     for _ in range(steps):
         q, q_previous = 2 * q - q_previous + t**2 * gravity, q
-        q, q_previous = reflect(q, q_previous, *FLOOR, e)
+        q, q_previous = exchanged(q, q_previous, *FLOOR, e)
         heights.append(q[0, 2])
     return np.array(heights)
 

@@ -225,4 +225,4 @@ def test_planes_need_neither_package(tmp_path: Path):
     """Where no obstacle is a mesh, igl's tree is not built: the solid is of faces."""
     box = {"shape": "box", "box": [[-1, -1, -2], [1, 1, -1]]}
     model = build_model(MPI.COMM_SELF, load_scene(block_scene(tmp_path, obstacle=[box], **FALLING)))
-    assert isinstance(model.reflections[0].obstacle.solid, Faces) and model.solids == {}
+    assert isinstance(model.penalties[0].obstacle.solid, Faces) and model.solids == {}

@@ -1,5 +1,6 @@
 """Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and the energy of both."""
 
+import re
 from pathlib import Path
 
 import h5py
@@ -16,7 +17,7 @@ from obstacles import box
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.model.contact.penalty import Contact, Penalty
-from msmpetsc.model.contact.reflection import Reflection
+from msmpetsc.model.contact.reflection import Exchange, Step
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.loads import Motion
 from msmpetsc.scene.motion import Keyframe
@@ -105,7 +106,7 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
 
 def test_a_node_that_jumps_over_a_thin_plate_is_reflected_to_where_it_came_from():
     q, before = np.array([[0.1, 0, -0.4], [6.0, 0, -0.4]]), np.array([[0.0, 0, 0.1], [6.0, 0, 0.1]])
-    after, after_before = Reflection(THIN, 0.5).reflect(q, before, 1.0, 0.1)
+    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, Step(1.0, 0.1))
     np.testing.assert_allclose(after, [[0.1, 0, 0.1], [6, 0, -0.4]])
     np.testing.assert_allclose(after - after_before, [[0.1, 0, 0.25], [0, 0, -0.5]])
 
@@ -250,7 +251,7 @@ def totals(frames) -> np.ndarray:
 @pytest.mark.parametrize("restitution", [1.0, 0.5, 0.0])
 @pytest.mark.parametrize("thin", [False, True])
 def test_bdf2_gains_nothing_where_it_reflects(tmp_path: Path, restitution: float, thin: bool):
-    """A ball thrown down at 10 m/s, which kept 4% at the time of writing and used to gain 20% of its energy."""
+    """A ball thrown down at 10 m/s, of which BDF2 loses 7% in so short an impact: it used to gain 20%."""
     floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1]}
     if thin:
         floor = {"shape": "box", "box": [[-9, -9, -0.602], [9, 9, -0.6]]}
@@ -268,7 +269,7 @@ def test_bdf2_gains_nothing_where_it_reflects(tmp_path: Path, restitution: float
     assert total.max() <= total[0] * (1 + 1e-6)
     assert frames[-1].momentum[2] / model.lattice.mass.sum() > (6.5 if restitution == 1 else 3)
     if restitution == 1:
-        assert total[-1] > 0.95 * total[0]
+        assert total[-1] > 0.93 * total[0]
 
 
 def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
@@ -291,8 +292,7 @@ def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: st
     total = totals(frames)
     assert total[-1] > 100 * speed**2
     gained = sum(frame.energy_gained for frame in frames)
-    # implicit Euler sets back against its springs what it reflects: a seventh of so small an impact
-    assert gained < (0.15 if integrator == "implicit-euler" and response == "reflect" else 0.02) * total.max()
+    assert gained < 0.02 * total.max()
 
 
 def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
@@ -300,11 +300,14 @@ def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
 
 
 def test_energy_from_nowhere_is_told_once_with_its_frame(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """Implicit Euler sets what it reflects back against its springs: 4% of a ball's energy at steps of 1 ms."""
-    floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1]}
+    """The paper's exchange sets nodes back against their springs: 4% of a ball's energy at steps of 1 ms. What is told
+    is a share of what the body had, not of what the exchange put in."""
+    floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1], "response": "exchange"}
     scene = {"start": {"velocity": [0, 0, -10.0]}, "obstacle": [floor], "cages": {"count": 100, "boundary": "whole"}}
-    play(ball(tmp_path, time={"step": 0.001, "duration": 0.03}, **scene))
+    _, frames = play(ball(tmp_path, time={"step": 0.001, "duration": 0.03}, **scene))
     first, last = told(caplog, "nowhere")
+    had = frames[0].kinetic
+    assert float(re.search(r"of ([\d.e+]+) J", first)[1]) == pytest.approx(had, rel=0.05)
     assert "% of all energy" in first and first.startswith("frame 2") and "frames there was energy from nowhere" in last
     caplog.clear()
     play(ball(tmp_path, time={"step": 0.0001, "duration": 0.03}, **scene))
@@ -329,7 +332,7 @@ def test_a_share_is_of_what_was_put_in():
 
 def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not count."""
-    ground = {"shape": "plane", "point": [0, 0, 0.2], "normal": [0, 0, 1]}
+    ground = {"shape": "plane", "point": [0, 0, 0.2], "normal": [0, 0, 1], "response": "exchange"}
     high = {"shape": "box", "box": [[-1, -1, 9], [1, 1, 10]], "response": "penalty"}
     late = {"shape": "box", "box": [[-1, -1, -1], [0.1, 1, 1]], "response": "penalty", "start": 0.02}
     pin = [{"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}]

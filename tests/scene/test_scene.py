@@ -231,7 +231,11 @@ MISTAKES = [
     ('shape = "plane"', 'shape = "box"', 'obstacle.0: needs box for shape = "box"'),
     ("normal = [0, 3, 4]", "", 'obstacle.0: needs normal for shape = "plane"'),
     ('"reflect"', '"reflect"\nfriction = 0.3', "obstacle.0: has friction, which is for 'penalty' only"),
-    ('"reflect"', '"penalty"\nrestitution = 0.3', "obstacle.0: has restitution, which is for 'reflect' only"),
+    (
+        '"reflect"',
+        '"penalty"\nrestitution = 0.3',
+        "obstacle.0: has restitution, which is for 'reflect' or 'exchange' only",
+    ),
     ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop: must be > start = 2, got 1.0 (line 29)"),
     (
         '"reflect"',

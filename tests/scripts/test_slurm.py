@@ -53,7 +53,8 @@ def test_shellcheck_finds_nothing():
 def test_the_gpu_script_says_what_it_asks_and_what_was_not_tried():
     (script,) = (path for path in SCRIPTS if path.stem == "gpu")
     text = script.read_text()
-    for words in ("options=(-mat_type aijcusparse)", "--gpus-per-task=1", "--gpu-bind=single:1", "NOT TRIED UNDER SLURM"):
+    gpu = "options=(-mat_type aijcusparse)", "--gpus-per-task=1", "--gpu-bind=single:1"
+    for words in (*gpu, "NOT TRIED UNDER SLURM"):
         assert words in text
 
 

@@ -31,12 +31,16 @@ Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any,
 
 @dataclass(frozen=True)
 class Penalty:
-    """stiffness [N/m] on each node; friction mu; below the slip speed ``stick`` [m/s] friction fades to nothing."""
+    """stiffness [N/m] on each node; friction mu; below the slip speed ``stick`` [m/s] friction fades to nothing.
+
+    restitution : of nodes that strike, normal speed after over before; None for 1: what the push makes of it
+    """
 
     obstacle: Obstacle
     stiffness: float
     friction: float
     stick: float
+    restitution: float | None = None
 
     def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""

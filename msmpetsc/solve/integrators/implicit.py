@@ -93,8 +93,8 @@ class ImplicitEuler:
         if self.damping:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
         result, sides = self._solve(state, y, time, time_step)
-        after, before, work = self.environment.reflect(
-            result.position, result.previous, time, time_step, self.stepper.lattice.pinned, sides
+        after, before, work = self.environment.strike(
+            result.position, result.previous, (time, time_step, sides), self.stepper.lattice.pinned
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
@@ -205,9 +205,8 @@ class Bdf2(ImplicitEuler):
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take a step as implicit Euler does, but a node that bounces off stays where it is, and its history becomes
-        what leads there with its new velocity and the acceleration that it has: set back against its springs, as the
-        paper has it, or without that acceleration, which its neighbours feel the other end of, a ball gained a fifth
-        of its energy.
+        what leads there with its new velocity and the acceleration that it has: without that, which its neighbours feel
+        the other end of, a ball gained a fifth of its energy.
         """
         self._let_go(time)
         q, v, its, products = state.q, state.velocity(self.time_step), 0, 0
@@ -221,8 +220,8 @@ class Bdf2(ImplicitEuler):
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
-        before, work = self.environment.turn(
-            result.position, previous, a, time, self.time_step, self.stepper.lattice.pinned, sides
+        _, before, work = self.environment.strike(
+            result.position, previous, (time, self.time_step, sides), self.stepper.lattice.pinned
         )
         its, products = its + result.ksp_its, products + result.products
         result = replace(result, previous=previous, ksp_its=its, products=products, work=work)

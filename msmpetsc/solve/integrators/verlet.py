@@ -221,7 +221,7 @@ class Verlet:
         drift(len(self.free), self.free, self.v, end - begin, self.q)
         if self.anchors:
             self._lead(begin, end)
-        if self.environment.reflections or self.environment.has_sides:
+        if self.environment.strikes or self.environment.has_sides:
             self._strike(begin, end)
         self.position.update()
 
@@ -233,15 +233,15 @@ class Verlet:
             self.q[anchored] = prescribed[anchored]
 
     def _strike(self, begin: float, end: float) -> None:
-        """Know the faces that nodes come into contact by. One that bounces off is set back, and its velocity is what
-        then led it there."""
+        """Know the faces that nodes come into contact by. The velocity of one that bounces off is what then led
+        it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
-        after, before, work = self.environment.reflect(self.q, self.before, end, end - begin, self.fixed, self.sides)
+        after, before, work = self.environment.strike(self.q, self.before, (end, end - begin, self.sides), self.fixed)
         self.work += work
-        if after is not self.q:
-            struck = np.flatnonzero((after != self.q).any(axis=1))
+        if before is not self.before:
+            struck = np.flatnonzero((before != self.before).any(axis=1))
             self.v[struck] = (after[struck] - before[struck]) / (end - begin)
             self.q[struck] = after[struck]
 

@@ -107,7 +107,7 @@ def _falling(body: Shape) -> list[str]:
         line('shape = "plane"', "the ground: the body is no beam that lies, so it falls rather than hangs"),
         line("point = [0, 0, 0]", "[m]"),
         line("normal = [0, 0, 1]", "towards the free side"),
-        line('response = "penalty"', 'or "reflect", from which it leaps'),
+        line('response = "penalty"', 'or "reflect", with a restitution'),
         line("friction = 0.5", "Coulomb's coefficient"),
     ]
     material = _material(young, f"its own weight presses it together by about {100 / SINKING:g}%")

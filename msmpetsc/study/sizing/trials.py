@@ -161,8 +161,8 @@ class Sizer:
     def _contact_law(self) -> str:
         """Return what contact has to do with it, in words; "" for nothing."""
         responses = {obstacle.response for obstacle in self.as_given.obstacle}
-        if "reflect" in responses:
-            return '; a rebound of response = "reflect" depends on the step, that of "penalty" has a limit'
+        if "exchange" in responses:
+            return '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
         return "; contact is stiff" if responses else ""
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:

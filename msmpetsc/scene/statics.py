@@ -46,7 +46,7 @@ def only_of_one_step(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
         for number, obstacle in enumerate(obstacles):
             if obstacle.response == "exchange":
                 raise rule(
-                    f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: that sets nodes back by '
+                    f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
                     'one step; "reflect" and "penalty" go',
                     "time",
                 )

@@ -12,7 +12,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.output.drawing.camera import camera_facing, turned
-from msmpetsc.output.drawing.film import paced
+from msmpetsc.output.drawing.pace import paced, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]

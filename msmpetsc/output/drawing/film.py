@@ -25,7 +25,7 @@ from msmpetsc.output.drawing.subject import Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
-LONGEST, SHORTEST = 960, 480  # [px]: sides of a film, where nothing is said
+LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 TURN = 6.0  # [s] that the eye takes to go around a body that stands still
 QUALITY = 8.0  # of 10, as imageio-ffmpeg counts
@@ -54,8 +54,8 @@ def write_film(
 def _fitting(shots: list[Shot], seen: Survey, style: Style) -> tuple[int, int]:
     """Return width and height [px], both even, of a film that what is seen fills."""
     low, high, _ = room_of(shots, seen, LABELS if style.axes else MARGIN)
-    width, height = (high - low) * LONGEST / (high - low).max()
-    return 2 * round(max(width, SHORTEST) / 2), 2 * round((min(max(height, SHORTEST), LONGEST) + CAPTION) / 2)
+    width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
+    return 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
 
 
 def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, words: str) -> Iterator[np.ndarray]:
@@ -68,7 +68,7 @@ def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, w
     bar = [Entry("length", "")] if style.scale_bar else []
     stage_height = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
     scale = min(width / (high - low)[0], stage_height / (high - low)[1])  # [px/m]
-    if scale <= 0:
+    if stage_height < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     bar = [scale_bar(scale / letters, width / letters / 5)] if style.scale_bar else []
     legend = legend_picture([*entries, *bar], width, letters)

@@ -52,5 +52,9 @@ def rounded(low: float, high: float) -> tuple[str, str]:
     """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
     span = max(high - low, abs(high) * 1e-12, 1e-300)
     digits = 2 - int(np.floor(np.log10(span)))
-    return tuple(f"{round(end, digits) + 0.0:.{max(digits, 0)}f}".rstrip("0").rstrip(".") if digits > 0
-                 else f"{round(end, digits) + 0.0:.0f}" for end in (low, high))  # fmt: skip
+    first, last = (f"{round(end, digits) + 0.0:.{max(digits, 0)}f}" for end in (low, high))
+    return (_bare(first), _bare(last)) if digits > 0 else (first, last)
+
+
+def _bare(number: str) -> str:
+    return number.rstrip("0").rstrip(".")

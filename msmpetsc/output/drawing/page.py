@@ -146,7 +146,7 @@ def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
 
 
 def fixed_states(subject: Subject, frames: Iterable[int]) -> tuple[bytes, list[int]]:
-    """Return which points are pinned or led (255, or 0), each different state once, deflated, and that of each frame."""
+    """Return which points are pinned or led (255, or 0), each state once, deflated, and that of each frame."""
     states: dict[bytes, int] = {}
     masks = (np.where(subject.fixed(index) > HELD, 255, 0).astype(np.uint8).tobytes() for index in frames)
     numbers = [states.setdefault(mask, len(states)) for mask in masks]

@@ -30,7 +30,7 @@ PANEL, NARROWEST = (400, 870), 240  # [px]: at most, and the least that a captio
 ROW = 2000  # [px]: wider ones are broken into several
 HIGHEST = 32767  # [px]: where 16 bits end, and with them what many programs show
 LONGEST_BAR = 0.4  # of a panel's width: a scale bar
-LABELS = np.array([0.45, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
+LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
 
 
 @dataclass(frozen=True)

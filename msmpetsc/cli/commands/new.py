@@ -5,13 +5,14 @@ import json
 from pathlib import Path
 
 from msmpetsc.cli.arguments import SCENE_NAMES, refuse_other_format, refuse_ranks
+from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.shipped import shipped_text, shipped_titles
-from msmpetsc.study.drafting.draft import draft
+from msmpetsc.study.drafting.draft import draft, upwards
 from msmpetsc.study.drafting.measures import measured
 
 
@@ -45,7 +46,9 @@ def drafted(mesh: Path, scene: Path) -> str:
     source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), Path(mesh.name.removesuffix(".gz")).suffix)
     surface = load(source, scene.parent)
     check_encloses(surface, examine(surface))
-    return draft(source, scene.stem, measured(surface, suffix))
+    measures = measured(surface, suffix)
+    log.info("%s", upwards(measures))
+    return draft(source, scene.stem, measures)
 
 
 def beside(mesh: Path, scene: Path) -> str:

@@ -120,7 +120,8 @@ def _draw_motion(
     if path.suffix.lower() in PAGE_NAMES:
         write_page(subject, path, frames, style, reference)
         return
-    from msmpetsc.output.drawing.film import TURN, Pace, paced, write_film
+    from msmpetsc.output.drawing.film import TURN, write_film
+    from msmpetsc.output.drawing.pace import Pace, paced
 
     if args.turntable and len(frames) == 1:
         if args.speed is not None:

@@ -10,14 +10,13 @@ from scipy.spatial import KDTree
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.output.compare import common_times
-from msmpetsc.output.drawing.colours import of_classes, on_scale
+from msmpetsc.output.drawing.colours import CLASSES, of_classes, on_scale
 from msmpetsc.output.drawing.subject import Subject
 from msmpetsc.output.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.output.reader import Result
 from msmpetsc.output.surfaces import refuse_different_meshes
 
 NEAR = 0.01  # of the longest side of a body: gaps up to this are told apart
-ROUNDING = 1e-6  # of the pale end: a least gap below it is 0
 PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
 
@@ -29,8 +28,8 @@ class Colouring:
     unit    : "m", "%"; "" where the numbers are those of classes
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
-    classes : names, where the field is a number of a class
-    below   : what is shown is so much less the values, and no more than that; None: the values themselves
+    classes : names, where the field is a number of a class; those without a name are not in the legend
+    below   : what is shown is so much less the values, from 0 to that; None: the values themselves
     """
 
     title: str
@@ -53,14 +52,12 @@ class Colouring:
         """Both ends of the scale, in the unit that the title names: ("0", "displacement [mm]", "12.5")."""
         if self.unit == "%":
             return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
-        largest = max(self.high, self.below or 0.0)
+        largest = self.below or self.high
         size = next((size for size in PREFIXES if largest >= size), 1.0)
         title = f"{self.title} [{PREFIXES[size]}{self.unit}]"
         if self.below is None:
             return "0", title, f"{self.high / size:.3g}"
-        least = self.below - self.high
-        least = 0.0 if abs(least) < ROUNDING * self.below else least
-        return f"{self.below / size:.3g} or more", title, f"{least / size:.3g}"
+        return f"{self.below / size:.3g} or more", title, "0"
 
 
 def colouring_of(subject: Subject, name: str, reference: Result | None = None) -> Colouring:
@@ -121,7 +118,9 @@ def _error(subject: Subject, reference: Result | None) -> Colouring:
     def values(index: int) -> np.ndarray:
         if index not in match:
             raise InputError(f"{reference.path} has no frame of {subject.times[index]:.6g} s, as frame {index}")
-        return np.linalg.norm(subject.surface(index) - reference.frames.surface[match[index]], axis=1)
+        true = reference.frames.surface[match[index]]
+        apart = np.linalg.norm(subject.surface(index)[: len(true)] - true, axis=1)  # of the file's points, the first
+        return apart if subject.carry is None else subject.carry @ apart
 
     return Colouring("distance from the reference", "m", values)
 
@@ -152,9 +151,15 @@ def _contact(subject: Subject, _: Result | None) -> Colouring:
         gaps = gaps_to_obstacles(scene.obstacle, subject.solids, points, float(subject.times[index]))
         if surface is not None:
             gaps = np.minimum(gaps, surface.at(points))
-        return reach - np.minimum(gaps, reach)
+        return reach - np.clip(gaps, 0, reach)
 
     return Colouring(f"gap to {' and '.join(touched)}", "m", values, below=reach)
+
+
+def plain_colouring(subject: Subject) -> Colouring | None:
+    """Return the colours of bodies that no field colours: each its own; None where there is but one."""
+    number = subject.rest.body_of_point % len(CLASSES)
+    return Colouring("body", "", lambda _: number, 1.0, ("",) * len(CLASSES)) if number.any() else None
 
 
 COLOURINGS: dict[str, Callable[[Subject, Result | None], Colouring]] = {
@@ -180,4 +185,6 @@ def opened_reference(path: Path | None, run: Result) -> Iterator[Result | None]:
 
 def scaled(colouring: Colouring, frames: Iterable[int]) -> Colouring:
     """Return the colouring with a scale that ends at the greatest value of these frames."""
-    return replace(colouring, high=max(float(colouring.values(index).max(initial=0)) for index in frames))
+    return replace(
+        colouring, high=colouring.below or max(float(colouring.values(index).max(initial=0)) for index in frames)
+    )

@@ -3,12 +3,23 @@
 import numpy as np
 
 BODY, FIXED, ARROW, INK = "#8fabc6", "#46566b", "#cf5a3c", "#333a42"
-GROUND, GROUND_EDGE, SHADOW = "#efece6", "#b9b3a6", "#cdc7bb"
+GROUND, SHADOW = "#efece6", "#cdc7bb"
 GLASS, GLASS_EDGE, BOX = "#a3b6c4", "#667e90", "#8a929b"
 BOUNDARY_CELL, INTERIOR_CELL, SPRING = "#c8372d", "#2f5fb3", "#5b6570"  # Figure 2 of the paper: red and blue
 # ColorBrewer's YlGnBu without its palest: the least is light, for dark is what is pinned
 SCALE = ("#edf8b1", "#c7e9b4", "#7fcdbb", "#41b6c4", "#1d91c0", "#225ea8", "#253494", "#081d58")
-CLASSES = (BODY, "#e0a13a", "#5aa469", "#b56aa8", "#c9625a", "#6f7fc4", "#9c8b5e")  # a body's parts, over and over
+CLASSES = (
+    BODY,
+    "#e0a13a",
+    "#5aa469",
+    "#b56aa8",
+    "#c9625a",
+    "#6f7fc4",
+    "#9c8b5e",
+    "#4fa3a5",
+    "#d98cb3",
+    "#7d6b5d",
+)  # a body's parts, over and over
 
 
 def rgb(colour: str) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Films: the frames of a result one after the other, in real time or slower, or one body turned around."""
+"""Films: the frames of a result one after the other, for 3 to 8 s, or one body turned around."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,59 +14,21 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, one_line
 from msmpetsc.output.drawing.fabric import Fabric, cut_open
 from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
+from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
 from msmpetsc.output.drawing.overlays import MARGIN
-from msmpetsc.output.drawing.sheet import CAPTION, LABELS
+from msmpetsc.output.drawing.pace import Pace
+from msmpetsc.output.drawing.sheet import LABELS
 from msmpetsc.output.drawing.shots import Shot, Style, Survey, room_of, shots_of, survey
+from msmpetsc.output.drawing.skin import drawn
 from msmpetsc.output.drawing.stage import Panel, Stage
 from msmpetsc.output.drawing.subject import Subject
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
-SIZE = (960, 720)  # [px]
-SMALLEST = 0.5  # of the usual size: captions and legend of small films
-FASTEST = 30.0  # pictures a second, where nothing is said
+LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
+USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 TURN = 6.0  # [s] that the eye takes to go around a body that stands still
-SHORT = 1.0  # [s]: who makes a film shorter than this is told how to make it longer
 QUALITY = 8.0  # of 10, as imageio-ffmpeg counts
-
-
-@dataclass(frozen=True)
-class Pace:
-    """How fast a film goes.
-
-    numbers : which of the frames each picture shows
-    fps     : pictures a second
-    speed   : simulated seconds a second; 0 where time stands still
-    """
-
-    numbers: np.ndarray
-    fps: float
-    speed: float
-
-    @property
-    def seconds(self) -> float:
-        """Length of the film [s]."""
-        return len(self.numbers) / self.fps
-
-
-def paced(times: np.ndarray, fps: float | None = None, speed: float | None = None) -> Pace:
-    """Return the pace of frames at these times (k,) [s].
-
-    In real time unless fps or speed says otherwise. With fps alone every frame is one picture; with both, or speed,
-    each picture shows the frame nearest to its time. Raises InputError where time does not go on.
-    """
-    count = np.arange(len(times))
-    steps = np.diff(times)
-    if len(times) == 1 or not (steps > 0).all():
-        if speed is not None:
-            raise InputError("--speed needs frames in order of time, more than one")
-        return Pace(count, fps or FASTEST / 3, 0.0)
-    if fps is not None and speed is None:
-        return Pace(count, fps, float(steps.mean() * fps))
-    speed = speed or 1.0
-    fps = fps or max(1.0, min(FASTEST, speed / float(np.median(steps))))
-    shown = times[0] + np.arange(0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps)
-    return Pace(abs(shown[:, None] - times).argmin(axis=1), fps, speed)
 
 
 def write_film(
@@ -77,58 +39,64 @@ def write_film(
 
     Raises InputError where it cannot be drawn or written.
     """
+    subject = drawn(subject)
     played = [frames[number] for number in pace.numbers]
     seen = survey(subject, played, style, reference)
     shots = shots_of(subject, played, seen, turns)
-    if 0 < pace.seconds < SHORT and pace.speed:
-        slower = pace.speed * pace.seconds / 5
-        log.info("this film takes %.2g s: --speed %.1g makes it 5 s long", pace.seconds, slower)
-    with written(path, style.size or SIZE, pace.fps) as add:
-        for picture in _pictures(subject, shots, seen, style, pace.speed):
+    if pace.speed:
+        log.info("the film lasts %.2g s, %s", pace.seconds, pace.words or "in real time")
+    size = style.size or _fitting(shots, seen, style)
+    with written(path, size, pace.fps) as add:
+        for picture in _pictures(subject, shots, seen, replace(style, size=size), pace.words):
             add(picture)
 
 
-def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, speed: float) -> Iterator[np.ndarray]:
+def _fitting(shots: list[Shot], seen: Survey, style: Style) -> tuple[int, int]:
+    """Return width and height [px], both even, of a film that what is seen fills."""
+    low, high, _ = room_of(shots, seen, LABELS if style.axes else MARGIN)
+    width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
+    return 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
+
+
+def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, words: str) -> Iterator[np.ndarray]:
     """Yield the picture (height, width, 3) of each shot; of equal ones in a row the first is drawn only."""
-    width, height = style.size or SIZE
+    assert style.size
+    width, height = style.size
     low, high, depth = room_of(shots, seen, LABELS if style.axes else MARGIN)
     entries = entries_of(subject.scene, seen.fixed, [shot.overlays for shot in shots], seen.colouring, style.shown)
-    letters = min(1.0, max(height / SIZE[1], SMALLEST))
+    letters = min(1.0, max(height / USUAL, SMALLEST))
     bar = [Entry("length", "")] if style.scale_bar else []
-    stage_height = height - len(legend_picture([*entries, *bar], width, letters))
-    caption = letters * CAPTION
-    scale = min(width / (high - low)[0], (stage_height - caption) / (high - low)[1])  # [px/m]
-    if scale <= 0:
+    stage_height = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
+    scale = min(width / (high - low)[0], stage_height / (high - low)[1])  # [px/m]
+    if stage_height < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     bar = [scale_bar(scale / letters, width / letters / 5)] if style.scale_bar else []
     legend = legend_picture([*entries, *bar], width, letters)
-    across, upward = (low + high) / 2 - [0, caption / 2 / scale]
+    across, upward = (low + high) / 2
     middle = seen.box.mean(axis=0)
     cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
     before: Shot | None = None
     picture = np.empty(0)
-    with Stage(width, stage_height, subject.triangles, letters) as stage:
+    with Stage(width, stage_height, subject.triangles) as stage:
         for shot in counted(shots, "pictures"):
             if before is None or shot.index != before.index or shot.camera is not before.camera:
                 camera = shot.camera
                 centre = across * camera.right + upward * camera.upward + middle @ camera.to_eye * camera.to_eye
                 stage.face(camera, centre, stage_height / scale, depth)
                 fabric = cut.fabric(subject.nodes(shot.index)) if cut else ()
-                picture = np.concatenate([stage.picture(_panel(subject, shot, seen, style, fabric, speed)), legend])
+                panel = _panel(subject, shot, seen, style, fabric, words)
+                picture = np.concatenate([stage.picture(panel), caption_picture(panel.caption, width, letters), legend])
             before = shot
             yield picture
 
 
-def _panel(subject: Subject, shot: Shot, seen: Survey, style: Style, fabric: tuple[Fabric, ...], speed: float) -> Panel:
-    """Return the panel of a shot, with its time and how much slower or faster than real it goes."""
-    pace = (
-        "" if speed in (0.0, 1.0) else f"{speed:.3g} times real time" if speed > 1 else f"{1 / speed:.3g} times slower"
-    )
+def _panel(subject: Subject, shot: Shot, seen: Survey, style: Style, fabric: tuple[Fabric, ...], words: str) -> Panel:
+    """Return the panel of a shot, with its time and how much slower or faster than real it goes, in words."""
     return Panel(
         points=subject.surface(shot.index),
         fixed=subject.fixed(shot.index),
         overlays=shot.overlays,
-        caption=(f"t = {subject.times[shot.index]:.3f} s", pace),
+        caption=(f"t = {subject.times[shot.index]:.3f} s", words),
         colours=seen.colouring.rgb(shot.index) if seen.colouring else None,
         fabric=fabric,
         axes=seen.box if style.axes else None,

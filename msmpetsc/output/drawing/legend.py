@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
 from msmpetsc.output.drawing.fabric import KINDS
+from msmpetsc.output.drawing.lettering import font as letters_of
 from msmpetsc.output.drawing.overlays import Overlays
 from msmpetsc.scene.schema import SceneFile
 
@@ -46,7 +46,7 @@ def entries_of(
     entries: list[Entry] = []
     if colouring is not None and colouring.classes:
         pairs = enumerate(colouring.classes)
-        entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs]
+        entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
     elif colouring is not None:
         low, title, high = colouring.ends
         entries.append(Entry("bar", title, width=BAR, low=low, high=high))
@@ -80,11 +80,10 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
     letters : their size, 1 in a sheet
     """
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     room_of_line = round(width / letters)
-    font = ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), FINE * LETTERS)
+    font = letters_of(FINE * LETTERS)
     lines: list[list[Entry]] = []
     room = 0.0
     for entry in entries:

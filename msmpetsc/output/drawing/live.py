@@ -15,8 +15,10 @@ from msmpetsc.comm import log
 from msmpetsc.errors import one_line
 from msmpetsc.model.fields import Frame
 from msmpetsc.output.drawing.camera import camera_facing
+from msmpetsc.output.drawing.colouring import plain_colouring
 from msmpetsc.output.drawing.page import fixed_states, packed_frames, page_facts, page_text, write_whole
 from msmpetsc.output.drawing.shots import Style, Survey, shots_of
+from msmpetsc.output.drawing.skin import drawn
 from msmpetsc.output.drawing.subject import subject_of_surface
 from msmpetsc.output.progress import duration
 
@@ -95,12 +97,14 @@ class LivePage:
         if self._subject is None or points is None:
             return page_text(title, about, {})
         rest = self._subject.rest.points
-        subject = replace(self._subject, times=np.array([frame.time]), nodes=lambda _: points, surface=lambda _: points)
+        subject = drawn(
+            replace(self._subject, times=np.array([frame.time]), nodes=lambda _: points, surface=lambda _: points)
+        )
         every = np.concatenate([self._box, points, rest] if not len(self._box) else [self._box, points])
         self._box = np.array([every.min(axis=0), every.max(axis=0)])
         corners = np.array([[self._box[i, 0], self._box[j, 1], self._box[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
         fixed = bool(subject.fixed(0).any())
-        seen = Survey(corners, camera_facing(rest, subject.gravity, subject.eye), None, fixed)
+        seen = Survey(corners, camera_facing(rest, subject.gravity, subject.eye), plain_colouring(subject), fixed)
         streams = packed_frames(subject, [0], seen)
         streams["fixed"], numbers = fixed_states(subject, [0])
         facts = page_facts(subject, shots_of(subject, [0], seen), seen, Style())

@@ -19,16 +19,21 @@ from msmpetsc.scene.schema import SceneFile
 ARROW = 0.2  # length of an arrow, of the body's longest side
 NEAR = 0.5  # an obstacle farther than this from all bodies is left out, of their longest extent
 CUT = 1.3  # a longer box is cut to this, of the bodies' extent
-MARGIN = 0.08  # around the bodies, of their longest extent: so much larger a plane is drawn
+MARGIN = 0.08  # around the bodies, of their longest extent
+GROUND = 1.6  # of the bodies' longest extent: as far from their middle a ground is drawn
 THICKNESS = 0.02  # of a plate of glass, of the bodies' longest extent
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A plane that the body stands on or lies against: corners (4, 3) of the part drawn, unit normal (3,)."""
+    """A plane that the body stands on or lies against: corners (4, 3) around the disk drawn, unit normal (3,)."""
 
     corners: np.ndarray
     normal: np.ndarray
+
+    def below(self, points: np.ndarray) -> np.ndarray:
+        """Return the points of the plane that points (n, 3) are above."""
+        return points - np.outer((points - self.corners[0]) @ self.normal, self.normal)
 
 
 @dataclass(frozen=True)
@@ -196,9 +201,9 @@ def _obstacles(
         if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
             continue
         if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:
-            grounds.append(_patch(point, normal, bodies, np.array([camera.right, camera.away])))
+            grounds.append(_ground(point, normal, bodies))
         else:
-            glass.append(_plate(_patch(point, normal, bodies, np.eye(3)), THICKNESS * _reach(bodies)))
+            glass.append(_plate(_patch(point, normal, bodies), THICKNESS * _reach(bodies)))
     return grounds, glass, balls
 
 
@@ -217,11 +222,24 @@ def _reach(bodies: np.ndarray) -> float:
     return np.ptp(bodies, axis=0).max()
 
 
-def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, axes: np.ndarray) -> Ground:
-    """Return the rectangle of a plane that the bodies stand before, with a margin; a side along an axis if it can."""
-    across = min(axes, key=lambda axis: abs(axis @ normal))
+def _sides(normal: np.ndarray) -> np.ndarray:
+    """Return two unit vectors (2, 3) of a plane, the first along an axis of the scene if it can."""
+    across = min(np.eye(3), key=lambda axis: abs(axis @ normal))
     first = unit(across - (across @ normal) * normal)
-    sides = np.array([first, np.cross(normal, first)])
+    return np.array([first, np.cross(normal, first)])
+
+
+def _ground(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray) -> Ground:
+    """Return what is drawn of a plane below bodies: wherever the eye is, the same."""
+    middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
+    middle = middle - ((middle - point) @ normal) * normal
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ _sides(normal)
+    return Ground(middle + GROUND * _reach(bodies) * corners, normal)
+
+
+def _patch(point: np.ndarray, normal: np.ndarray, bodies: np.ndarray) -> Ground:
+    """Return the rectangle of a plane that the bodies stand before, with a margin."""
+    sides = _sides(normal)
     reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
     (left, low), (right, high) = reached.min(axis=0) - margin, reached.max(axis=0) + margin
     corners = np.array([(left, low), (right, low), (right, high), (left, high)]) @ sides

@@ -25,7 +25,9 @@ from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.fabric import KINDS, SHRUNK, THROUGH, Cut, cut_open
 from msmpetsc.output.drawing.legend import entries_of
 from msmpetsc.output.drawing.overlays import Overlays
+from msmpetsc.output.drawing.pace import usual_speed
 from msmpetsc.output.drawing.shots import Shot, Style, Survey, shots_of, survey
+from msmpetsc.output.drawing.skin import HELD, drawn
 from msmpetsc.output.drawing.subject import FARTHEST, Subject
 from msmpetsc.output.gaps import TINY, unit_vectors
 from msmpetsc.output.progress import counted
@@ -44,6 +46,7 @@ def write_page(
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
+    subject = drawn(subject)
     seen = survey(subject, frames, style, reference)
     cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
     chosen, about_lattice = list(frames), None
@@ -143,9 +146,9 @@ def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
 
 
 def fixed_states(subject: Subject, frames: Iterable[int]) -> tuple[bytes, list[int]]:
-    """Return how far points are pinned or led, each different state once, deflated, and each frame's number of one."""
+    """Return which points are pinned or led (255, or 0), each state once, deflated, and that of each frame."""
     states: dict[bytes, int] = {}
-    masks = (np.round(255 * subject.fixed(index)).astype(np.uint8).tobytes() for index in frames)
+    masks = (np.where(subject.fixed(index) > HELD, 255, 0).astype(np.uint8).tobytes() for index in frames)
     numbers = [states.setdefault(mask, len(states)) for mask in masks]
     return zlib.compress(b"".join(states)), numbers
 
@@ -167,6 +170,7 @@ def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Sty
         "box": seen.box.tolist(),
         "times": [float(subject.times[shot.index]) for shot in shots],
         "frames": [shot.index for shot in shots],
+        "speed": usual_speed(float(np.ptp(subject.times[[shots[0].index, shots[-1].index]]))),
         "camera": {
             "right": camera.right.tolist(),
             "away": camera.away.tolist(),

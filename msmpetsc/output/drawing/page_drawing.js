@@ -9,18 +9,19 @@ float light(vec3 n) {
 const LIT = [`#version 300 es
 in vec3 position; in vec3 normal; in float number; in float fixing;
 uniform mat4 camera; uniform mat3 turning; uniform vec3 low; uniform vec3 size; uniform sampler2D scale;
-uniform vec3 fixedColour;
-out vec3 facing; out vec3 paint;
+out vec3 facing; out vec3 paint; out float held;
 void main() {
   facing = turning * normal;
-  paint = mix(texture(scale, vec2((number + 0.5) / 256.0, 0.5)).rgb, fixedColour, fixing);
+  paint = texture(scale, vec2((number + 0.5) / 256.0, 0.5)).rgb;
+  held = fixing;
   gl_Position = camera * vec4(low + size * position, 1.0);
 }`, `#version 300 es
 precision mediump float;
-in vec3 facing; in vec3 paint; uniform float opacity; out vec4 pixel;
+in vec3 facing; in vec3 paint; in float held; uniform float opacity; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
-  pixel = vec4(paint * light(normalize(facing)), 1.0) * opacity;
+  vec3 colour = held > 0.99 ? fixedColour : paint; // a face is held whose corners all are
+  pixel = vec4(colour * light(normalize(facing)), 1.0) * opacity;
 }`];
 const FLAT = [`#version 300 es
 in vec3 position; uniform mat4 camera; uniform vec3 low; uniform vec3 size; uniform vec4 plane; uniform float lift;
@@ -119,8 +120,8 @@ function axesOfEye() {
 }
 
 function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
-  const beside = data.overlays.states.flatMap(
-    ({ grounds, glass, balls, shapes }) => [...grounds.map((ground) => ground.corners), ...glass, ...[...balls, ...shapes].map((round) => round.seen)]);
+  const beside = data.overlays.states.flatMap(({ grounds, glass, balls, shapes }) => [
+    ...grounds.map((ground) => CORNERS.map((corner) => below(ground, corner))), ...glass, ...[...balls, ...shapes].map((round) => round.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
 }
@@ -161,11 +162,25 @@ function bodyElements() {
   gl.drawElements(gl.TRIANGLES, triangles.length, triangles.BYTES_PER_ELEMENT === 2 ? gl.UNSIGNED_SHORT : gl.UNSIGNED_INT, 0);
 }
 
-function drawGround(camera, ground, eye) {
-  const night = dark.matches;
-  drawFlat(camera, ground.corners, gl.LINE_LOOP, [...colour(night ? "#59616b" : "#b9b3a6"), 1]);
-  if (dot(ground.normal, eye.toEye) <= 0) return; // seen from below, it would hide the body
-  drawFlat(camera, ground.corners, gl.TRIANGLE_FAN, [...colour(night ? "#2b3037" : "#efece6"), 1]);
+const below = ({ corners, normal }, point) => sum(point, normal, dot(normal, sum(corners[0], point, -1)));
+
+const RINGS = 16, SOLID = 0.55; // of a ground, that fades from a share of its radius on to its rim
+
+function drawGround(camera, ground, eye) { // a disk within its corners, ring over ring
+  const night = dark.matches, [a, b, , d] = ground.corners, seenFromAbove = dot(ground.normal, eye.toEye) > 0;
+  const halves = [b, d].map((corner) => scaled(sum(corner, a, -1), 0.5)), centre = sum(sum(a, halves[0]), halves[1]);
+  const ring = (r) => TURNS.map((turn) => sum(sum(centre, halves[0], r * Math.cos(turn)), halves[1], r * Math.sin(turn)));
+  if (!seenFromAbove) { // it would hide the body
+    drawFlat(camera, ring(SOLID), gl.LINE_LOOP, [...colour(night ? "#59616b" : "#b9b3a6"), 1]);
+    return;
+  }
+  const paint = colour(night ? "#2b3037" : "#efece6");
+  gl.disable(gl.DEPTH_TEST); // it is drawn first, and all in one plane
+  gl.enable(gl.BLEND);
+  for (let k = 0; k < RINGS; k++) drawFlat(camera, ring(1 - (1 - SOLID) * k / RINGS), gl.TRIANGLE_FAN, [...paint, 3 / RINGS]);
+  gl.disable(gl.BLEND);
+  drawFlat(camera, ring(SOLID), gl.TRIANGLE_FAN, [...paint, 1]);
+  gl.enable(gl.DEPTH_TEST);
   use(flat, camera, box[0], size);
   gl.uniform4f(flat.uniforms.plane, ...ground.normal, dot(ground.normal, ground.corners[0]));
   gl.uniform1f(flat.uniforms.lift, 2e-3 * reach);
@@ -250,7 +265,8 @@ function drawAxes(camera, rows, shift) {
     const ends = [0, 1, 2, 3].map((k) => EDGES.slice(8 * number + 2 * k, 8 * number + 2 * k + 2));
     const ways = ends.map(([a, b]) => sum(seen(scaled(sum(CORNERS[a], CORNERS[b]), 0.5)), centre, -1));
     const way = ways.reduce((a, b) => Math.hypot(...b) > Math.hypot(...a) + 1e-6 ? b : a);
-    const [low, high] = box.map((end) => Math.abs(end[axis]) < 1e-6 * reach ? 0 : +end[axis].toPrecision(3));
+    const span = Math.max(box[1][axis] - box[0][axis], 1e-12 * Math.abs(box[1][axis]), 1e-300);
+    const [low, high] = box.map((end) => +end[axis].toFixed(Math.min(100, Math.max(0, 2 - Math.floor(Math.log10(span))))) + 0);
     const label = document.createElement("span"), [x, y] = sum(sum(centre, way), unit(way), 14);
     label.textContent = `${"xyz"[axis]}: ${low} to ${high} m`;
     label.style.left = `${canvas.clientWidth / 2 + x}px`;

@@ -40,12 +40,11 @@ function makeLegend() {
 function makePlayer() {
   slider.max = frames - 1;
   for (const id of ["player", "playing"]) byId(id).hidden = frames < 2;
-  const spacing = (data.times[frames - 1] - data.times[0]) / 4; // a play of about four seconds
-  const rates = [4, 2, 1, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01, 0.005, 0.001];
-  const nearest = spacing >= 0.5 ? 1 : rates.reduce((a, b) => Math.abs(Math.log(b / spacing)) < Math.abs(Math.log(a / spacing)) ? b : a);
+  const factors = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+  const rates = [...new Set([...factors, ...factors.map((factor) => 1 / factor), data.speed])].sort((a, b) => b - a);
   for (const rate of rates) {
     const option = new Option(rate === 1 ? "real time" : rate > 1 ? `${rate} × faster` : `${Math.round(1 / rate)} × slower`, rate);
-    option.selected = rate === nearest;
+    option.selected = rate === data.speed;
     speedChoice.append(option);
   }
 }

@@ -1,4 +1,4 @@
-"""A contact sheet: some moments of a result side by side in one picture; or one of a scene or a mesh.
+"""A contact sheet: some moments of a result in rows of one picture; or one of a scene or a mesh.
 
 All panels are seen by one camera without perspective, drawn one by one and pasted: so scale and height can be compared
 between them. Beside each body stand the obstacles and forces of its own time.
@@ -13,22 +13,24 @@ from PIL import Image
 
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.camera import Camera, camera_facing
-from msmpetsc.output.drawing.colouring import colouring_of, opened_reference, scaled
+from msmpetsc.output.drawing.colouring import colouring_of, opened_reference, plain_colouring, scaled
 from msmpetsc.output.drawing.fabric import cut_open
 from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
+from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
 from msmpetsc.output.drawing.moments import COUNT, Frames, choose_moments, frames_of, moments_at
 from msmpetsc.output.drawing.overlays import MARGIN
 from msmpetsc.output.drawing.shots import Style
+from msmpetsc.output.drawing.skin import drawn
 from msmpetsc.output.drawing.stage import Panel, Stage
 from msmpetsc.output.drawing.subject import FARTHEST, Subject, subject_of_result
 from msmpetsc.output.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
 
-PANEL, NARROWEST = (460, 1000), 240  # [px]: at most, and the least that a caption needs
-CAPTION = 94  # [px]
-WIDEST = 32767  # [px]: where 16 bits end, and with them what many programs show
+PANEL, NARROWEST = (400, 870), 240  # [px]: at most, and the least that a caption needs
+ROW = 2000  # [px]: wider ones are broken into several
+HIGHEST = 32767  # [px]: where 16 bits end, and with them what many programs show
 LONGEST_BAR = 0.4  # of a panel's width: a scale bar
-LABELS = 0.25  # of the bodies' longest extent: around them, where axes are labelled
+LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,15 @@ def draw_moments(
     subject: Subject, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
 ) -> None:
     """Draw a subject at some moments, side by side."""
+    subject = drawn(subject)
     bodies = {moment.index: subject.surface(moment.index) for moment in moments}
     everywhere = np.concatenate(list(bodies.values()))
     if not (np.abs(everywhere) < FARTHEST).all() or np.ptp(everywhere, axis=0).max() == 0:
         raise InputError(f"{subject.name}: the surface at these moments has no extent, or none that can be drawn")
     camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
-    colouring = scaled(colouring_of(subject, style.colour, reference), bodies) if style.colour else None
+    colouring = plain_colouring(subject)
+    if style.colour:
+        colouring = scaled(colouring_of(subject, style.colour, reference), bodies)
     axes = np.array([everywhere.min(axis=0), everywhere.max(axis=0)]) if style.axes else None
     panels = []
     for moment in moments:
@@ -96,11 +101,11 @@ def _moments(run: Result, subject: Subject, frames: Frames | None, count: int | 
     assert isinstance(subject.scene, SceneFile)
     if frames:
         moments = dict.fromkeys(frames_of(subject.name, frames, total), "")
-        refuse_wide(len(moments))  # before the surfaces of all are read
+        refuse_high(len(moments))  # before the surfaces of all are read
         return moments
     if count is None and subject.scene.picture.times:
         return moments_at(run, subject.scene.picture.times)
-    refuse_wide(min(count or 0, total))
+    refuse_high(min(count or 0, total))
     return choose_moments(run, count or COUNT)
 
 
@@ -112,7 +117,7 @@ def draw(
     style: Style | None = None,
     entries: Sequence[Entry] = (),
 ) -> None:
-    """Render the panels one by one, each with its caption, paste them from left to right, and put the legend below.
+    """Render the panels one by one, each with its caption, paste them in rows, and put the legend below.
 
     A graphics library's own pictures end at some width, and beyond it they are black.
     """
@@ -121,28 +126,35 @@ def draw(
     most = style.size or PANEL
     scale = min(most[0] / (high - low)[0], most[1] / (high - low)[1])  # [px/m]
     width, height = np.maximum([NARROWEST, 1], np.round(scale * (high - low))).astype(int)  # [px]
-    refuse_wide(len(panels), int(width))
-    across, upward = (low + high) / 2 - [0, CAPTION / 2 / scale]
+    rows = refuse_high(len(panels), (int(width), int(height) + CAPTION))
+    columns = -(-len(panels) // rows)
+    across, upward = (low + high) / 2
     shown = np.concatenate([points for panel in panels for points in (panel.points, panel.overlays.corners)])
     depth = float(np.linalg.norm(np.ptp(shown, axis=0)))  # nothing reaches farther towards the eye
     middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
-    sheet = np.empty((height + CAPTION, width * len(panels), 3), np.uint8)
-    with Stage(int(width), int(height) + CAPTION, triangles) as stage:
-        stage.face(camera, middle, (height + CAPTION) / scale, depth)
+    sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
+    with Stage(int(width), int(height), triangles) as stage:
+        stage.face(camera, middle, height / scale, depth)
         for number, panel in enumerate(panels):
-            sheet[:, number * width : (number + 1) * width] = stage.picture(panel)
+            captioned = [stage.picture(panel), caption_picture(panel.caption, int(width))]
+            sheet[number // columns, :, number % columns] = np.concatenate(captioned)
+    sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     if style.scale_bar:
         entries = (*entries, scale_bar(scale, LONGEST_BAR * width))
     _save(np.concatenate([sheet, legend_picture(entries, sheet.shape[1])]), path)
 
 
-def refuse_wide(panels: int, width: int = NARROWEST) -> None:
-    """Raise InputError for a picture of so many panels of this width [px], or more, that few programs would show."""
-    if panels * width > WIDEST:
+def refuse_high(panels: int, size: tuple[int, int] = (NARROWEST, CAPTION)) -> int:
+    """Return the rows in which panels of this size [px] stand. Raises InputError for more than programs would show."""
+    width, height = size
+    in_row = max(1, ROW // width)
+    rows = -(-panels // in_row)
+    if rows * height > HIGHEST:
         raise InputError(
-            f"{panels} moments are too many for one picture: of panels {width} pixels wide "
-            f"at most {WIDEST // width} fit into {WIDEST}"
+            f"{panels} moments are too many for one picture: of panels of {width} by {height} pixels "
+            f"at most {HIGHEST // height * in_row} fit into {in_row * width} by {HIGHEST}"
         )
+    return rows
 
 
 def _save(picture: np.ndarray, path: Path) -> None:
@@ -158,7 +170,6 @@ def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]
     bodies = np.concatenate([panel.points for panel in panels])
     margin = (LABELS if panels[0].axes is not None else MARGIN) * np.ptp(bodies, axis=0).max()
     sharp = [points for panel in panels for points in panel.overlays.sharp]
-    inner = camera.flat(np.concatenate([bodies, *sharp]))
-    grounds = [camera.flat(ground.corners) for panel in panels for ground in panel.overlays.grounds]
-    rows = np.concatenate([inner - margin, inner + margin, *grounds])
-    return rows.min(axis=0), rows.max(axis=0)
+    below = [ground.below(panel.points) for panel in panels for ground in panel.overlays.grounds]
+    inner = camera.flat(np.concatenate([bodies, *below, *sharp]))
+    return inner.min(axis=0) - margin, inner.max(axis=0) + margin

@@ -7,7 +7,7 @@ import numpy as np
 
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.camera import Camera, camera_facing, turned
-from msmpetsc.output.drawing.colouring import Colouring, colouring_of
+from msmpetsc.output.drawing.colouring import Colouring, colouring_of, plain_colouring
 from msmpetsc.output.drawing.overlays import MARGIN, Overlays
 from msmpetsc.output.drawing.subject import FARTHEST, Subject
 from msmpetsc.output.progress import counted
@@ -59,7 +59,7 @@ class Survey:
 
 def survey(subject: Subject, frames: Sequence[int], style: Style, reference: Result | None = None) -> Survey:
     """Read the surfaces of the frames once, one at a time. Raises InputError where they cannot be drawn."""
-    colouring = colouring_of(subject, style.colour, reference) if style.colour else None
+    colouring = colouring_of(subject, style.colour, reference) if style.colour else plain_colouring(subject)
     directions = _directions()
     extremes, high = [], 0.0
     distinct = sorted(set(frames))
@@ -68,14 +68,14 @@ def survey(subject: Subject, frames: Sequence[int], style: Style, reference: Res
         if not (np.abs(points) < FARTHEST).all():
             raise InputError(f"{subject.name}: frame {index} has points that cannot be drawn")
         extremes.append(points[np.unique((points @ directions.T).argmax(axis=0))])
-        if colouring is not None:
+        if style.colour and colouring is not None:
             high = max(high, float(colouring.values(index).max(initial=0)))
     everywhere = np.concatenate(extremes)
     if np.ptp(everywhere, axis=0).max() == 0:
         raise InputError(f"{subject.name}: the surface at these frames has no extent")
     camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
     fixed = any(subject.fixed(index).any() for index in (distinct[0], distinct[-1]))
-    return Survey(everywhere, camera, colouring and replace(colouring, high=high), fixed)
+    return Survey(everywhere, camera, colouring and replace(colouring, high=colouring.below or high), fixed)
 
 
 def _directions() -> np.ndarray:
@@ -109,18 +109,19 @@ def shots_of(subject: Subject, frames: Sequence[int], seen: Survey, turns: float
     return shots
 
 
-def room_of(shots: Iterable[Shot], seen: Survey, margin: float = MARGIN) -> tuple[np.ndarray, np.ndarray, float]:
+def room_of(
+    shots: Iterable[Shot], seen: Survey, margin: float | np.ndarray = MARGIN
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return lower left (2,) and upper right (2,) of all shots in their pictures' planes, and how deep they reach [m].
 
-    margin : around the bodies, of their longest extent
+    Of a ground it is what lies below the bodies, their shadows. margin : around the bodies, of their longest extent
     """
     rows, reach = [], np.ptp(seen.box, axis=0).max()
     corners = [seen.extremes]
     for shot in shots:
-        flat = shot.camera.flat(np.concatenate([seen.extremes, *shot.overlays.sharp]))
-        grounds = [shot.camera.flat(ground.corners) for ground in shot.overlays.grounds]
-        every = np.concatenate([flat - margin * reach, flat + margin * reach, *grounds])
-        rows += [every.min(axis=0), every.max(axis=0)]
+        below = [ground.below(seen.extremes) for ground in shot.overlays.grounds]
+        flat = shot.camera.flat(np.concatenate([seen.extremes, *below, *shot.overlays.sharp]))
+        rows += [flat.min(axis=0) - margin * reach, flat.max(axis=0) + margin * reach]
         corners.append(shot.overlays.corners)
     depth = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
     return np.min(rows, axis=0), np.max(rows, axis=0), depth

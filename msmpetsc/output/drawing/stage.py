@@ -1,7 +1,7 @@
 """Bodies and what stands beside them, drawn by VTK: one window off screen, one camera without perspective."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,18 +20,19 @@ from msmpetsc.output.drawing.colours import (
     GLASS,
     GLASS_EDGE,
     GROUND,
-    GROUND_EDGE,
-    INK,
     SHADOW,
     rgb,
 )
 from msmpetsc.output.drawing.fabric import THROUGH, Fabric
+from msmpetsc.output.drawing.lettering import labelled, rounded
 from msmpetsc.output.drawing.overlays import Ground, Overlays
+from msmpetsc.output.drawing.skin import HELD
 
 GLASS_OPACITY = 0.22
+FADING, AROUND = np.append(0, np.linspace(0.55, 1, 10)), 72  # radii of the rings of a ground, of the last; corners
 # of a box: four along z, y and x each, between corners 4i + 2j + k
 EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)])
-LABEL_GAP, HALF_LETTER = 14, 4.2  # [px] between an edge and what is written at it; of a letter of that
+LABEL_GAP = 8  # [px] between an edge and what is written at it
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,10 @@ class Stage:
     Used as a context, which closes it.
     """
 
-    def __init__(self, width: int, height: int, triangles: np.ndarray, letters: float = 1.0):
-        """Open a window of so many pixels for a surface of triangles (f, 3); letters: their size, 1 in a sheet."""
+    def __init__(self, width: int, height: int, triangles: np.ndarray):
+        """Open a window of so many pixels for a surface of triangles (f, 3)."""
         self._size, self._triangles = np.array([width, height]), triangles
-        self._front, self._letters = np.zeros(3), letters
+        self._front = np.zeros(3)
         with quiet_opengl():
             self._plotter = pv.Plotter(off_screen=True, window_size=[width, height], lighting="none")
             self._plotter.background_color = pv.Color("white")
@@ -84,7 +85,9 @@ class Stage:
         view.parallel_scale = height / 2
         view.clipping_range = (far / 100, 2 * far)
         self._front = 2 * depth * camera.to_eye  # out of what could hide anything
-        self._to_pixels = lambda points: (camera.flat(points - middle) * self._size[1] / height) + self._size / 2
+        self._to_pixels = lambda points: (
+            camera.flat(points - middle) * [1, -1] * self._size[1] / height + self._size / 2
+        )
 
     def picture(self, panel: Panel) -> np.ndarray:
         """Return the picture (height, width, 3) of a panel. Raises InputError if the graphics library gives none."""
@@ -93,14 +96,30 @@ class Stage:
             self._plotter.clear_actors()
             _draw_panel(self._plotter, panel, self._triangles, self._front)
             if panel.axes is not None:
-                _draw_axes(self._plotter, panel.axes, self._to_pixels)
-            _write_caption(self._plotter, panel.caption, self._size[0] / 2, self._letters)
+                _draw_box(self._plotter, panel.axes)
             self._plotter.suppress_rendering = False
             self._plotter.render()
             picture = self._plotter.screenshot(return_img=True)
         if picture is None or not picture.any():
             raise InputError("nothing can be drawn: the graphics library gives a black picture")
-        return picture
+        return picture if panel.axes is None else labelled(picture, self._labels(panel.axes))
+
+    def _labels(self, box: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """Return what is written at three edges of a box (2, 3): its extent along each, with place and way out."""
+        labels = []
+        middles = self._to_pixels(corners_of(box)[EDGES].mean(axis=1)).reshape(3, 4, 2)  # of those along z, y and x
+        outward = middles - self._to_pixels(box.mean(axis=0)[None])
+        for axis, ways, ends in zip((2, 1, 0), outward, middles, strict=True):
+            farthest = int(np.argmax(np.linalg.norm(ways, axis=1)))
+            way = ways[farthest] / np.linalg.norm(ways[farthest])
+            low, high = rounded(*box[:, axis])
+            labels.append((f"{'xyz'[axis]}: {low} to {high} m", ends[farthest] + LABEL_GAP * way, way))
+        return labels
+
+
+def corners_of(box: np.ndarray) -> np.ndarray:
+    """Return the corners (8, 3) of a box (2, 3), numbered 4i + 2j + k."""
+    return np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front: np.ndarray) -> None:
@@ -128,13 +147,16 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
 
 
 def _draw_body(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray) -> None:
-    body = pv.PolyData.from_regular_faces(panel.points, triangles)
-    plain = rgb(BODY) if panel.colours is None else panel.colours
-    colours = (1 - panel.fixed[:, None]) * plain + panel.fixed[:, None] * rgb(FIXED)
+    fixed = (panel.fixed > HELD)[triangles].all(axis=1)
     shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
     if panel.fabric:
         shading |= dict(opacity=THROUGH)
-    plotter.add_mesh(body, scalars=colours.astype(np.uint8), rgb=True, **shading)
+    free: dict[str, Any] = dict(color=BODY)
+    if panel.colours is not None:
+        free = dict(scalars=panel.colours.astype(np.uint8), rgb=True)
+    for faces, look in ((triangles[~fixed], free), (triangles[fixed], dict(color=FIXED))):
+        if len(faces):
+            plotter.add_mesh(pv.PolyData.from_regular_faces(panel.points, faces), **look, **shading)
 
 
 def _draw_fabric(plotter: pv.Plotter, fabric: Fabric) -> None:
@@ -146,40 +168,34 @@ def _draw_fabric(plotter: pv.Plotter, fabric: Fabric) -> None:
         plotter.add_mesh(faces, color=fabric.colour, ambient=0.5, diffuse=0.55)
 
 
-def _draw_axes(plotter: pv.Plotter, box: np.ndarray, to_pixels: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Draw the edges of a box (2, 3), and along three of them from where to where it reaches.
-
-    Lines and three texts: VTK's own axes take a second to draw.
-    """
-    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    lines = np.insert(EDGES, 0, 2, axis=1).ravel()
-    plotter.add_mesh(pv.PolyData(corners, lines=lines), color=BOX, line_width=1, lighting=False)
-    middles = to_pixels(corners[EDGES].mean(axis=1)).reshape(3, 4, 2)  # of the edges along z, y and x
-    outward = middles - to_pixels(box.mean(axis=0)[None])
-    for axis, ways, ends in zip((2, 1, 0), outward, middles, strict=True):
-        farthest = int(np.argmax(np.linalg.norm(ways, axis=1)))
-        way = ways[farthest] / np.linalg.norm(ways[farthest])
-        low, high = (f"{number:.3g}" for number in rounded(box)[:, axis])
-        text = f"{'xyz'[axis]}: {low} to {high} m"
-        half = HALF_LETTER * len(text)
-        across, upward = ends[farthest] + (LABEL_GAP + half * np.array([1, 0])) * way
-        at = np.clip([across, upward], [half, 0], np.array(plotter.window_size) - [half, 2 * LABEL_GAP])
-        plotter.add_text(text, position=tuple(at), font_size=8, color=INK).prop.justification_horizontal = "center"
-
-
-def rounded(box: np.ndarray) -> np.ndarray:
-    """Return the corners (2, 3) of a box without what is rounding: 0 in place of 1e-20."""
-    return np.where(abs(box) < 1e-6 * np.ptp(box, axis=0).max(), 0.0, box)
+def _draw_box(plotter: pv.Plotter, box: np.ndarray) -> None:
+    """Draw the edges of a box (2, 3): VTK's own axes take a second to draw."""
+    lines = pv.PolyData(corners_of(box), lines=np.insert(EDGES, 0, 2, axis=1).ravel())
+    plotter.add_mesh(lines, color=BOX, line_width=1, lighting=False)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, points: np.ndarray, triangles: np.ndarray) -> None:
     """Draw a plane and the body's shadow on it, which shows where the body is above the ground, and how high."""
-    patch = pv.PolyData.from_regular_faces(ground.corners, [[0, 1, 2, 3]])
-    plotter.add_mesh(patch, color=GROUND, lighting=False, show_edges=True, edge_color=GROUND_EDGE, line_width=2)
-    above = (points - ground.corners[0]) @ ground.normal
+    plotter.add_mesh(_disk(ground), scalars="look", rgb=True, lighting=False)
     lift = 2e-3 * np.ptp(points, axis=0).max()  # or the two surfaces would flicker into each other
-    shadow = points - np.outer(above - lift, ground.normal)
+    shadow = ground.below(points) + lift * ground.normal
     plotter.add_mesh(pv.PolyData.from_regular_faces(shadow, triangles), color=SHADOW, lighting=False)
+
+
+def _disk(ground: Ground) -> pv.PolyData:
+    """Return the disk within a ground's corners, that fades towards its rim: colours and opacity as "look"."""
+    middle, angles = ground.corners.mean(axis=0), 2 * np.pi * np.arange(AROUND) / AROUND
+    halves = (ground.corners[[1, 3]] - ground.corners[0]) / 2
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ halves
+    disk = pv.PolyData.from_regular_faces(
+        (middle + FADING[:, None, None] * around).reshape(-1, 3),
+        [[AROUND * ring + k, AROUND * ring + n, AROUND * (ring + 1) + n, AROUND * (ring + 1) + k]
+         for ring in range(len(FADING) - 1) for k in range(AROUND) for n in [(k + 1) % AROUND]],
+    )  # fmt: skip
+    share = np.clip((1 - FADING) / (1 - FADING[1]), 0, 1)
+    opacity = np.repeat(255 * share**2 * (3 - 2 * share), AROUND)
+    disk["look"] = np.column_stack([np.tile(rgb(GROUND), (disk.n_points, 1)), opacity]).astype(np.uint8)
+    return disk
 
 
 def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:
@@ -189,15 +205,6 @@ def _draw_glass(plotter: pv.Plotter, corners: np.ndarray) -> None:
     plotter.add_mesh(solid, color=GLASS, opacity=GLASS_OPACITY, lighting=False)
     edges = solid.extract_feature_edges(feature_angle=1)
     plotter.add_mesh(edges, color=GLASS_EDGE, line_width=2, lighting=False)
-
-
-def _write_caption(plotter: pv.Plotter, caption: tuple[str, str], middle: float, letters: float) -> None:
-    """Write time and reason below a panel whose middle is `middle` [px]; letters: their size, 1 in a sheet."""
-    for text, size, height in zip(caption, (15, 11), (42, 16), strict=True):
-        if text:
-            position = middle, letters * height
-            actor = plotter.add_text(text, position=position, font_size=round(letters * size), color=INK)
-            actor.prop.justification_horizontal = "center"
 
 
 @contextmanager

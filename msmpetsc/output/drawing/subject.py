@@ -40,6 +40,7 @@ class Subject:
     embedding : W (v, n); None where the surface points are the nodes
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
+    carry     : (v, w) numbers at the file's own points -> numbers at the surface points; None: they are the same
     """
 
     name: str
@@ -52,6 +53,7 @@ class Subject:
     embedding: "csr_array | None"
     array: Callable[[str], np.ndarray]
     solids: Mapping[int, Surface]
+    carry: "csr_array | None" = None
 
     @property
     def title(self) -> str:

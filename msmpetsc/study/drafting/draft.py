@@ -24,6 +24,7 @@ STEPS_A_PERIOD, PERIODS = 40, 3
 DEBRIS = 0.01  # of the area: all parts but the largest together
 COLUMN = 39  # where comments begin
 MOST_PLAIN = 10_000  # larger numbers have an exponent
+TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z upwards
 GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
@@ -71,10 +72,12 @@ def _mesh(source: str, mesh: MeshMeasures, body: Shape) -> list[str]:
         steps.append('"orient"')
         reasons.append("faces are wound inwards, or against each other")
     if mesh.y_up:
-        steps.append("{ rotate = { axis = [1, 0, 0], degrees = 90 } }")
-        reasons.append("y seems to point upwards in the file, and z does here")
+        steps.append(TURN)
+        reasons.append("y seems to point upwards in the file, and z does here: without rotate z is upwards")
     if steps:
         lines += [*(f"# {reason}" for reason in reasons), f"prepare = [{', '.join(steps)}]"]
+    if not mesh.y_up:
+        lines.append(f"# z is taken for upwards; if y is in the file, prepare wants {TURN}")
     if not report.closed:
         lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
@@ -146,6 +149,13 @@ def _time(duration: float, period: float) -> list[str]:
         line(f"step = {step:g}", f"[s]; the slowest motion takes about {period:.2g} s"),
         line(f"duration = {step * math.ceil(duration / step):.6g}", "[s]"),
     ]
+
+
+def upwards(mesh: MeshMeasures) -> str:
+    """Return which axis is taken for upwards, and how to change that."""
+    if mesh.y_up:
+        return "y is taken for upwards and turned to z: if z is, take rotate out of mesh.prepare"
+    return f"z is taken for upwards: if y is, put {TURN} into mesh.prepare"
 
 
 def line(setting: str, comment: str) -> str:

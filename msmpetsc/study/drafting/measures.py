@@ -11,7 +11,8 @@ from msmpetsc.model.build import USUAL
 
 MILLIMETRE = 1e-3  # [m]
 SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground
-LEAST, SURER = 0.1, 2.0  # of the ground plan, and times what z has: only a y that stands so well is upwards
+FEET = 0.5  # share of the sole that counts less where it is flat, as a table's top is: feet are likelier below
+SURER = 0.1  # by so much y must stand better than z to be upwards
 Y_BY_DEFINITION = (".glb", ".gltf")
 
 
@@ -42,7 +43,6 @@ class MeshMeasures:
 def measured(surface: Surface, suffix: str = "") -> MeshMeasures:
     """Measure a surface as its file has it; ``suffix`` of the file: the axes of glTF are defined."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
-    standing = stands(surface, 1)
     areas = np.bincount(part_labels(surface), triangle_areas(surface))
     return MeshMeasures(
         sides=sides,
@@ -50,7 +50,7 @@ def measured(surface: Surface, suffix: str = "") -> MeshMeasures:
         report=examine(surface),
         parts=np.sort(areas / areas.sum())[::-1],
         unit=unit_of(float(sides.max())),
-        y_up=suffix.lower() in Y_BY_DEFINITION or standing > max(LEAST, SURER * stands(surface, 2)),
+        y_up=suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER,
     )
 
 
@@ -60,13 +60,22 @@ def unit_of(side: float) -> float | None:
     return next(usual, None)
 
 
-def stands(surface: Surface, axis: int) -> float:
-    """Return how well a body stands with this axis upwards: the share of its ground plan that it stands on.
+def uprightness(surface: Surface, axis: int) -> float:
+    """Return how much likelier a body stands with this axis upwards than downwards, in [-1, 1].
+
+    A chair stands well on its feet and badly on its head; lying on its back it does both, a little.
+    """
+    return stands(surface, axis, 1) - stands(surface, axis, -1)
+
+
+def stands(surface: Surface, axis: int, way: int) -> float:
+    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of its ground plan
+    that it stands on, less where it stands on a face rather than on feet.
 
     That is the convex hull of its lowest points; nothing where its centre is not above it.
     """
     points, plan = surface.points[np.unique(surface.triangles)], [a for a in range(3) if a != axis]
-    height = points[:, axis] - points[:, axis].min()
+    height = way * points[:, axis] - (way * points[:, axis]).min()
     sole = points[height <= SOLE * height.max()][:, plan]
     try:
         hull, ground = ConvexHull(sole), ConvexHull(points[:, plan])
@@ -75,7 +84,16 @@ def stands(surface: Surface, axis: int) -> float:
     areas = triangle_areas(surface)
     centre = areas @ surface.points[surface.triangles].mean(axis=1)[:, plan] / areas.sum()
     above = (hull.equations[:, :2] @ centre + hull.equations[:, 2] <= 0).all()
-    return float(hull.volume / ground.volume) if above else 0.0  # in two dimensions the volume is an area
+    if not above:
+        return 0.0
+    top = height.max()
+    lowest = ((way * surface.points[:, axis] - (way * points[:, axis]).min())[surface.triangles] <= SOLE * top).all(
+        axis=1
+    )
+    a, b, c = surface.points[surface.triangles[lowest]][:, :, plan].swapaxes(0, 1)
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    face = np.abs(ux * vy - uy * vx).sum() / 2 / hull.volume  # in two dimensions the volume is an area
+    return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
 
 
 def triangle_areas(surface: Surface) -> np.ndarray:

@@ -92,7 +92,7 @@ def test_contact_is_the_gap_to_the_ground_where_that_is_small(subject):
     assert not contact.values(0).any() and contact.shares(3).max() == pytest.approx(1, abs=1e-3)
 
 
-def test_contact_counts_bodies_that_face_each_other_and_says_how_deep_an_obstacle_is_entered(subject):
+def test_contact_counts_bodies_that_face_each_other_and_is_dark_wherever_it_touches(subject):
     """The ground is 1 mm too high. Of two balls that rest on it the second is half a millimetre from the first."""
     points, triangles, count = subject.rest.points, subject.triangles, len(subject.rest.points)
     body = np.repeat([0, 1], count)
@@ -110,7 +110,8 @@ def test_contact_counts_bodies_that_face_each_other_and_says_how_deep_an_obstacl
         scene=SceneFile.model_validate(scene),
     )
     contact = scaled(colouring_of(two, "contact"), [3])
-    assert contact.ends == ("2 or more", "gap to obstacles and the surface itself [mm]", "-1")
+    assert contact.ends == ("2 or more", "gap to obstacles and the surface itself [mm]", "0")
+    assert contact.shares(3).max() == 1, "what touches is dark, however deep an obstacle is entered elsewhere"
     gaps = 0.002 - contact.values(3)
     assert gaps[np.argmax(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)
     assert gaps[count + np.argmin(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)

@@ -12,7 +12,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.output.drawing.camera import camera_facing, turned
-from msmpetsc.output.drawing.film import paced
+from msmpetsc.output.drawing.pace import paced, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
@@ -45,14 +45,42 @@ def middle_of_body(picture: np.ndarray) -> float:
 
 
 def test_pace_in_real_time_shows_each_frame_at_its_time():
-    pace = paced(TIMES)  # ten frames a second are fewer than a film has at the most
-    assert pace.numbers.tolist() == list(range(11)) and pace.fps == pytest.approx(10) and pace.speed == 1
+    pace = paced(4 * TIMES)  # ten frames in four seconds are fewer than a film has at the most
+    assert pace.numbers.tolist() == list(range(11)) and pace.fps == pytest.approx(2.5) and pace.speed == 1
+    assert pace.words == ""
 
 
 def test_pace_leaves_frames_out_where_they_come_faster_than_pictures():
-    pace = paced(np.arange(1001) / 1000)  # a second of a thousand frames
-    assert pace.fps == 30 and len(pace.numbers) == 31
-    assert pace.numbers[[0, 3, -1]].tolist() == [0, 100, 1000]
+    pace = paced(np.arange(4001) / 1000)  # four seconds of four thousand frames
+    assert pace.fps == 30 and len(pace.numbers) == 121
+    assert pace.numbers[[0, 3, -1]].tolist() == [0, 100, 4000]
+
+
+@pytest.mark.parametrize("span", [*np.geomspace(1e-6, 1e6, 50), 2.999, 3.0, 8.0, 8.001])
+def test_a_film_lasts_three_to_eight_seconds_where_nothing_is_said(span: float):
+    speed = usual_speed(span)
+    assert span / speed * (1 + 1e-9) >= 3 and span / speed <= 8
+    assert (speed == 1) == (3 <= span <= 8)
+
+
+def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
+    pace = paced(np.arange(41) / 120)
+    assert 3 <= pace.seconds <= 8 and pace.words == "10 times slower than real"
+    assert paced(np.arange(61.0)).words == "10 times faster than real"
+
+
+def test_a_film_fills_its_frame_and_says_its_speed(result, tmp_path, caplog):
+    """The ball's way is four times as high as wide, and so is the film, as far as its caption lets it."""
+    with caplog.at_level("INFO", logger="msmpetsc"):
+        render(result, "-o", tmp_path / "x.gif")
+    with Image.open(tmp_path / "x.gif") as film:
+        seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
+    assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-68]  # above the caption
+    assert pictures.shape[1] > 1.5 * pictures.shape[2]
+    body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
+    rows = np.flatnonzero(body.any(axis=1))
+    assert np.ptp(rows) > 0.75 * pictures.shape[1]
 
 
 def test_slow_motion_shows_all_frames_for_longer():

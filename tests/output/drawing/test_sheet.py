@@ -200,6 +200,9 @@ def test_what_would_hide_the_body_is_glass(panels):
     ground = plane(0.4, "[0, 0, 1]")
     below = panels(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
+    turned = panels(ground, frames=[0], eye=(3, -1, 2))[0].overlays
+    assert turned.grounds[0].corners == pytest.approx(below.grounds[0].corners), "it is of the scene, not of the view"
+    assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx([0.64, 0.64])  # of a ball of 0.2 m
     assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
     assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.corners) == 0  # over half a ball away
 
@@ -328,30 +331,31 @@ def drawing(result, tmp_path, monkeypatch):
     return calls[0][:3]
 
 
-def test_a_wide_picture_shows_every_panel(drawing, tmp_path):
-    """Wider than the 8192 pixels at which Mesa's pictures end."""
+def test_many_panels_stand_in_rows_and_each_is_shown(drawing, tmp_path):
+    """Nineteen of them, in four rows of five, in a sheet that a screen shows."""
     panels, triangles, camera = drawing
-    sheet.draw(13 * panels, triangles, camera, tmp_path / "x.png")
+    sheet.draw([*9 * panels, panels[0]], triangles, camera, tmp_path / "x.png")
     drawn = np.array(Image.open(tmp_path / "x.png"))
-    assert drawn.shape[1] > 8192
-    sheets = np.split(drawn, 26, axis=1)
-    for first, other in zip(sheets[:2] * 12, sheets[2:], strict=True):
+    assert 1000 < drawn.shape[1] <= 2000
+    each = [part for row in np.split(drawn, 4) for part in np.split(row, 5, axis=1)]
+    for first, other in zip((each[:2] * 10)[2:19], each[2:19], strict=True):
         np.testing.assert_array_equal(other, first)
-    assert body_rows(sheets[1])[0] > body_rows(sheets[0])[0] > 0
+    assert (each[19] == 255).all()
+    assert body_rows(each[1])[0] > body_rows(each[0])[0] > 0
 
 
-def test_a_picture_too_wide_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
+def test_a_picture_too_high_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
     panels, triangles, camera = drawing
     with pytest.raises(
-        InputError, match=r"200 moments are too many for one picture: of panels \d+ pixels wide at most \d+ fit"
+        InputError, match=r"2000 moments are too many for one picture: of panels of \d+ by \d+ pixels at most \d+ fit"
     ):
-        sheet.draw(100 * panels, triangles, camera, tmp_path / "y.png")
-    monkeypatch.setattr(sheet, "WIDEST", 2000)
+        sheet.draw(1000 * panels, triangles, camera, tmp_path / "y.png")
+    monkeypatch.setattr(sheet, "HIGHEST", 100)
     monkeypatch.setattr(subject, "surface_points", lambda *_: pytest.fail("a surface was read"))
     for options in ({"count": 10**9}, {"frames": list(range(11))}):
         with pytest.raises(
             InputError,
-            match="11 moments are too many for one picture: of panels 240 pixels wide at most 8 fit into 2000",
+            match="11 moments are too many for one picture: of panels of 240 by 68 pixels at most 8 fit",
         ):
             sheet.contact_sheet(result, tmp_path / "y.png", **options)
     assert not (tmp_path / "y.png").exists()

@@ -49,9 +49,8 @@ def as_argument(value: np.ndarray | float) -> tuple[str, Words]:
     """Return an argument's kind, which its type and its words' format follow from, and the words."""
     if isinstance(value, cupy.ndarray):
         return described(value.data.ptr, value.shape, value.strides, value.dtype.str)
-    if isinstance(value, np.generic):
-        value = value.item()
-    return SCALARS[type(value)], (value,)
+    number = value.item() if isinstance(value, np.generic) else value
+    return SCALARS[type(number)], (number,)  # type: ignore[return-value]  # no array
 
 
 @lru_cache(maxsize=KEPT)
@@ -70,7 +69,7 @@ def type_of(kind: str) -> object:
     if kind in TYPES:
         return TYPES[kind]
     dtype, dimensions, layout = kind.split()
-    return numba.types.Array(numba.from_dtype(np.dtype(dtype)), int(dimensions), layout)
+    return numba.types.Array(numba.from_dtype(np.dtype(dtype)), int(dimensions), layout)  # type: ignore[call-overload]
 
 
 def format_of(kind: str) -> str:

@@ -22,6 +22,7 @@ import numpy as np
 
 import msmpetsc
 from msmpetsc.errors import InputError
+from msmpetsc.output.disk import write_whole
 from msmpetsc.study.process import environment, last_error
 
 ERROR = 1e-9  # of each step, relative
@@ -165,9 +166,8 @@ def row(name: str, counts: dict[str, int], off: tuple[float, float], seconds: fl
 
 
 def write(path: Path, numbers: Numbers) -> None:
-    """Store numbers. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(numbers, indent=1) + "\n")
+    """Store numbers. Raises InputError."""
+    write_whole(path, json.dumps(numbers, indent=1) + "\n")
 
 
 def read(path: Path) -> Numbers:

@@ -20,10 +20,15 @@ LEAST = 4096  # [byte]: what is shorter is not worth a filter
 def pack(path: Path) -> None:
     """Replace the file by its packed self once that is whole. Raises InputError, and then the file is as it was."""
     try:
-        with whole_file(path) as part, open_result(path) as file, Storage(part, "w+") as storage, storage.telling():
-            with open_new(storage) as packed:
-                packed.attrs.update(file.attrs)
-                file.visititems(lambda name, source: _copy(name, source, packed))
+        with (
+            whole_file(path) as part,
+            open_result(path) as file,
+            Storage(part, "w+") as storage,
+            storage.telling(),  # when it is closed
+            open_new(storage) as packed,
+        ):
+            packed.attrs.update(file.attrs)
+            file.visititems(lambda name, source: _copy(name, source, packed))
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} is damaged: {one_line(error)}") from error
 

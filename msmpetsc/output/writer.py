@@ -31,7 +31,15 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.fields import FRAME_FIELDS, Frame, unit_of
-from msmpetsc.output.disk import Lock, Storage, bytes_taken, copy_sparse, plain_errors, refuse_no_file, refuse_small_disk
+from msmpetsc.output.disk import (
+    Lock,
+    Storage,
+    bytes_taken,
+    copy_sparse,
+    plain_errors,
+    refuse_no_file,
+    refuse_small_disk,
+)
 from msmpetsc.output.layout import Layout, open_again, open_new
 from msmpetsc.output.reader import (
     FORMAT,

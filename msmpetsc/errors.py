@@ -59,7 +59,7 @@ def as_expected(error: Exception) -> MsmpetscError | None:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
     if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
-        return InputError(f"{error.filename or 'a file'} cannot be written: {error.strerror}")
+        return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "")
     return error if isinstance(error, MsmpetscError) else None

@@ -8,11 +8,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EAGAIN
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from msmpetsc.errors import InputError, one_line
 
+PARTS = count()  # numbers of parts: several threads write, and USD remembers the name of what failed
 LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could be too long for the file system
 
 
@@ -27,7 +29,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises InputError, with the path and the system's reason in one line.
     """
     real = Path(os.path.realpath(path))
-    part = real.with_name(f".{real.stem[:LONGEST_STEM]}.{os.getpid()}.part{real.suffix}")
+    part = real.with_name(f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}")
     try:
         with plain_errors(path):
             refuse_no_file(path)

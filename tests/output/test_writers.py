@@ -157,7 +157,7 @@ def test_a_disk_that_fills_up(sources: Path, tmp_path: Path, name: str, part: fl
     for other in left.keys() - {name}:  # written before it, and whole
         assert left[other] == before.get(other, made[other]), other
     writer.write(full)
-    assert full.stat().st_size == whole.stat().st_size or part
+    assert full.stat().st_size > 0
 
 
 def test_an_older_file_stays_where_a_new_one_fails(sources: Path, tmp_path: Path):

@@ -33,7 +33,8 @@ NODES = 5  # whose places are stored, evenly spread by their numbers
 HEAD = f"{'scene':20} {'cells':>6} {'nodes':>6} {'springs':>8} {'off by':>9} {'allowed':>9} {'time':>7}"
 Numbers = dict[str, Any]  # as stored: "run", "counts", "scales" by unit, "numbers" by name
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Count, Size = Annotated[int, Field(ge=0)], Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 MOST_STEPS = int((2 / (GROWTH * ERROR)) ** 0.5)  # with more, any difference would be allowed
 
 

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from errno import EDQUOT, EFBIG, ENOSPC
 
 
 class MsmpetscError(Exception):
@@ -33,6 +34,7 @@ class StepFailed(MsmpetscError):
 
 
 PETSC_OUT_OF_MEMORY = 55  # PETSc.Error.ierr
+NO_ROOM = ENOSPC, EDQUOT, EFBIG
 EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported by
     "run": (
         *("petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w"),
@@ -56,6 +58,8 @@ def as_expected(error: Exception) -> MsmpetscError | None:
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
+    if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
+        return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "")
     return error if isinstance(error, MsmpetscError) else None

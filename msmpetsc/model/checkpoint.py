@@ -13,6 +13,7 @@ from mpi4py import MPI
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
+MOST = 1e60  # of any number: its fourth power is still finite
 AT_REST = "at_rest"  # number of a run that ends at rest (time.until): whether it has come there
 
 
@@ -54,10 +55,11 @@ class Checkpoint:
         return int(self.number(name, 0, 0, most))
 
     def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
-        """Raise InputError for rows that are not of the shape of those in ``like``, or not finite (collective)."""
+        """Raise InputError for rows not of the shape of those in ``like``, not finite or absurd (collective)."""
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():
-                if self.rows[name].shape != like.rows[name].shape or not np.isfinite(self.rows[name]).all():
+                rows = self.rows[name]
+                if rows.shape != like.rows[name].shape or not (np.abs(rows) < MOST).all():
                     raise InputError(
                         f"the checkpoint is damaged: {name} is not of finite numbers, {like.rows[name].shape}"
                     )

@@ -3,13 +3,12 @@
 It is not packed while it is written: chunks of packed sizes have no room set aside, and a kill could spoil the file.
 """
 
-import os
 from pathlib import Path
 
 import h5py
 
 from msmpetsc.errors import InputError, one_line
-from msmpetsc.output.disk import plain_errors
+from msmpetsc.output.disk import Storage, whole_file
 from msmpetsc.output.layout import open_new
 from msmpetsc.output.reader import DEFLATE_MOST, open_result
 from msmpetsc.output.transfer import pieces
@@ -20,17 +19,17 @@ LEAST = 4096  # [byte]: what is shorter is not worth a filter
 
 def pack(path: Path) -> None:
     """Replace the file by its packed self once that is whole. Raises InputError, and then the file is as it was."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        with plain_errors(part), open_result(path) as file, open_new(part) as packed:
+        with (
+            whole_file(path) as part,
+            open_result(path) as file,
+            Storage(part, "w+") as storage,
+            storage.telling(),  # when it is closed
+            open_new(storage) as packed,
+        ):
             packed.attrs.update(file.attrs)
             file.visititems(lambda name, source: _copy(name, source, packed))
-        os.replace(part, path)
-    except InputError:
-        part.unlink(missing_ok=True)
-        raise
     except (RuntimeError, KeyError, ValueError, TypeError) as error:
-        part.unlink(missing_ok=True)
         raise InputError(f"{path} is damaged: {one_line(error)}") from error
 
 

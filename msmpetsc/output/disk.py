@@ -1,15 +1,100 @@
-"""The disk below a result file: a lock against a second run, room for what is planned, errors in one line."""
+"""The disk below what is written: files that come whole or not at all, a lock, room for what is planned."""
 
 import fcntl
+import io
 import os
 import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EAGAIN
+from itertools import count
 from pathlib import Path
+from typing import Any
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, one_line
+
+PARTS = count()  # numbers of parts: several threads write, and USD remembers the name of what failed
+LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could be too long for the file system
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a name to write a file under; it gets its own when it is whole, and of one that fails nothing is left.
+
+    That name ends alike, for many writers go by the ending. Links are followed; a file that is replaced keeps its
+    rights, and one that may not be written stays. Every file that a command leaves is written so, but for results,
+    which grow (output.writer).
+
+    Raises InputError, with the path and the system's reason in one line.
+    """
+    real = Path(os.path.realpath(path))
+    part = real.with_name(f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}")
+    try:
+        with plain_errors(path):
+            refuse_no_file(path)
+            real.parent.mkdir(parents=True, exist_ok=True)
+            if real.exists():
+                open(real, "r+b").close()
+            yield part
+            with open(part, "r+b") as file:
+                os.fsync(file.fileno())  # some file systems say only now that they are full
+            if real.exists():
+                shutil.copymode(real, part)
+            part.replace(real)
+    finally:
+        with suppress(OSError):  # of a folder that is none
+            part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a text or bytes as a whole file. Raises InputError."""
+    with whole_file(path) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def refuse_no_file(path: Path) -> None:
+    """Raise InputError for the name of a folder, a pipe or a device."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a file")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a pipe or a device, not a file")
+
+
+class Storage(io.FileIO):
+    """A file for HDF5 to write, which hears of no failure: with what it could not write, HDF5 crashes as it ends.
+
+    failure : the first, to be raised by who writes
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of it where the file stands."""
+        left = memoryview(data).cast("B")
+        try:
+            while len(left):
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = self.failure or error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Give the file another length [byte]."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Raise after the block what failed so far: whatever HDF5 makes of it comes from it."""
+        try:
+            yield
+        finally:
+            if self.failure is not None:
+                raise self.failure
 
 
 class Lock:
@@ -77,5 +162,5 @@ def plain_errors(path: Path) -> Iterator[None]:
         message = re.search(r"error message = '([^']*)'", str(error))
         if not message and not isinstance(error, OSError):
             raise
-        reason = message[1] if message else getattr(error, "strerror", None) or error
+        reason = message[1] if message else getattr(error, "strerror", None) or one_line(error)
         raise InputError(f"{path} cannot be written: {reason}") from error

@@ -7,29 +7,29 @@ buffered. While frames are written, no metadata changes.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import h5py
 import numpy as np
 
 from msmpetsc.model.fields import FIELDS, FRAME_FIELDS, unit_of
+from msmpetsc.output.disk import Storage
 
 CHUNK_BYTES = 64 * 2**20
 
 
-def open_new(path: Path) -> h5py.File:
-    """Create an empty file, of a kind that a kill cannot spoil.
+def open_new(storage: Storage) -> h5py.File:
+    """Begin an empty file, of a kind that a kill cannot spoil.
 
     libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
     cache: nothing waits to be written. No lock: a running result may be looked at.
     """
-    return h5py.File(path, "w", libver="earliest", rdcc_nbytes=0, locking=False)
+    return h5py.File(storage, "w", libver="earliest", rdcc_nbytes=0, locking=False)
 
 
-def open_again(path: Path) -> h5py.File:
+def open_again(storage: Storage) -> h5py.File:
     """Open a file of that kind, to be written further."""
-    return h5py.File(path, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+    return h5py.File(storage, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
 
 
 class Plan(NamedTuple):

@@ -25,6 +25,7 @@ from msmpetsc.output.reader import (
 )
 from msmpetsc.output.transfer import scatter_rows
 
+NEAR, FARTHEST = 0.01, 1e6  # of the body's longest side
 SAME = 1e-9  # of the greatest: sums over cells go another way on another number of ranks
 
 
@@ -122,6 +123,31 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
         names, numbers = file.checkpoint_numbers(), file.values("checkpoint/numbers")
         values = numbers[slot].tolist() if names and numbers is not None else []
         return Checkpoint(int(steps[slot]), rows, dict(zip(names, values, strict=True)))
+
+
+def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
+    """Raise InputError where the newest checkpoint's positions cannot be those of a body as a frame shows it.
+
+    number   : of the last frame up to its step
+    is_frame : whether it is of that very step
+
+    They need not be equal: contact may have reflected nodes since, and after a stop other ranks may have gone on. But a
+    body goes no farther than its own length in a step, and most of it stays nearly where the frame has it.
+    """
+    with Result(path) as run:
+        slot = newest_slot(run["checkpoint/step"][:])
+        q, q_previous = (run[f"checkpoint/{name}"][slot] for name in ("q", "q_previous"))
+        frame = run.frames.position[number]
+        moved = np.abs(frame - run.frames.position[number - 1]).max() if number else 0.0
+        size = np.ptp(run.lattice.nodes[:], axis=0).max()
+    far, step = (np.abs(a - b).max(axis=1) for a, b in ((q, frame), (q, q_previous)))
+    most, usual = (size + moved, NEAR * size + moved) if is_frame else (FARTHEST * size, FARTHEST * size)
+    in_step = most if number else FARTHEST * size  # a body may start fast
+    if not (far.max() <= most and np.median(far) <= usual and step.max() <= in_step):
+        raise InputError(
+            f"{path} is damaged: its checkpoint's positions are {far.max():.3g} m from those of frame {number}, "
+            f"and moved by {step.max():.3g} m in a step"
+        )
 
 
 def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, np.ndarray]) -> None:

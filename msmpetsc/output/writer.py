@@ -18,7 +18,7 @@ then either. Else it writes a new one, takes the frames over, and renames it whe
 import os
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,15 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.fields import FRAME_FIELDS, Frame, unit_of
-from msmpetsc.output.disk import Lock, bytes_taken, copy_sparse, plain_errors, refuse_small_disk
+from msmpetsc.output.disk import (
+    Lock,
+    Storage,
+    bytes_taken,
+    copy_sparse,
+    plain_errors,
+    refuse_no_file,
+    refuse_small_disk,
+)
 from msmpetsc.output.layout import Layout, open_again, open_new
 from msmpetsc.output.reader import (
     FORMAT,
@@ -81,6 +89,7 @@ class ResultFile:
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm, self._begin, self._gathers = comm, begin, gathers
         self._file: h5py.File | None = None  # open on rank 0 only
+        self._storage: Storage | None = None  # that it is written to
         self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
         self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
         self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
@@ -178,9 +187,9 @@ class ResultFile:
             if self._file is not None:
                 for name, numbers in self._numbers.items():
                     numbers[index] = getattr(frame, name)
-                self._file.flush()
+                self._flush(self._file)
                 self._file["frames/time"][index] = frame.time  # from here on the frame is there
-                self._file.flush()
+                self._flush(self._file)
         self.finished += 1
 
     def newest_surface(self) -> np.ndarray | None:
@@ -201,7 +210,7 @@ class ResultFile:
             if self._file is not None:
                 slot = int(np.argmin(self._file["checkpoint/step"]))
                 self._file["checkpoint/step"][slot] = -1
-                self._file.flush()
+                self._flush(self._file)
         slot = self._comm.bcast(slot)
         for name, values in saved.rows.items():
             self._collect(values, np.dtype("f8"), self._nodes, f"checkpoint/{name}", slot)
@@ -209,9 +218,9 @@ class ResultFile:
             if self._file is not None:
                 if numbers:
                     self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
-                self._file.flush()
+                self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
-                self._file.flush()
+                self._flush(self._file)
                 self._refuse_removed()
 
     def close(self, trim: bool = True) -> None:
@@ -233,9 +242,11 @@ class ResultFile:
         try:
             if self._begin is Begin.IN_PLACE:
                 open_result(self.path).close()
-                self._file = open_again(self.path)
+                self._storage = Storage(self.path, "r+")
+                self._file = open_again(self._storage)
             else:
-                self._file = open_new(self._part)
+                self._storage = Storage(self._part, "w+")
+                self._file = open_new(self._storage)
                 self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
         except Exception:
             self._part.unlink(missing_ok=True)
@@ -243,11 +254,14 @@ class ResultFile:
             raise
         self._lock = lock
 
+    def _flush(self, file: h5py.File) -> None:
+        """Write what is still in memory. Raises OSError for what could not be written so far."""
+        file.flush()
+        if self._storage is not None and self._storage.failure is not None:
+            raise self._storage.failure
+
     def _refuse_to_replace(self) -> None:
-        if self.path.is_dir():
-            raise InputError(f"{self.path} is a folder, not a file")
-        if self.path.exists() and not self.path.is_file():
-            raise InputError(f"{self.path} is a pipe or a device, not a file")
+        refuse_no_file(self.path)
         if self.path.exists() and self._begin is Begin.NEW:
             raise InputError(f"{self.path} exists: --overwrite replaces it")
 
@@ -283,7 +297,7 @@ class ResultFile:
     def _publish(self, file: h5py.File) -> None:
         """Give a new file its name."""
         if self._begin is not Begin.IN_PLACE:
-            file.flush()
+            self._flush(file)
             self._refuse_to_replace()
             os.replace(self._part, self.path)
 
@@ -316,6 +330,8 @@ class ResultFile:
                     for dataset in file["frames"].values():
                         dataset.resize(self.finished, axis=0)
         finally:
+            if self._storage is not None:
+                self._storage.close()
             if self._lock is not None:
                 self._lock.free()
 
@@ -325,7 +341,8 @@ class ResultFile:
     def _together(self) -> Iterator[None]:
         """Raise after the block, on all ranks, what one rank could not do in it."""
         try:
-            with together(self._comm), plain_errors(self.path):
+            telling = self._storage.telling() if self._storage else nullcontext()
+            with together(self._comm), plain_errors(self.path), telling:
                 yield
         except InputError:
             self._failed = True

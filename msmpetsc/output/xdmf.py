@@ -1,16 +1,16 @@
 """The XDMF 3 file beside a result: it lets ParaView open the frames and holds no data itself."""
 
-import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+from msmpetsc.output.disk import write_whole
 from msmpetsc.output.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 
 
 def write_xdmf(h5_path: str | Path) -> Path:
-    """Write x.xdmf beside x.h5 once that is closed, and return its path.
+    """Write x.xdmf beside x.h5 once that is closed, and return its path. Raises InputError.
 
     Two temporal collections: the surface triangles, where the surface was stored, and the lattice cells.
     """
@@ -25,9 +25,7 @@ def write_xdmf(h5_path: str | Path) -> Path:
             kind.append(_data_item(run, "lattice/cell_kind"))
     ET.indent(root)
     path = h5_path.with_suffix(".xdmf")
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
-    os.replace(part, path)
+    write_whole(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
     return path
 
 

@@ -54,7 +54,7 @@ def scene_of(
     keys = {_override(data, override): override for override in overrides}
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:
-        _refuse_outside(path, checked, keys if by_user else ())
+        _refuse_outside(path, checked, keys if by_user else None)
     numbers = with_numbers(data, checked)
     text = tomli_w.dumps(numbers) if overrides or numbers != data else file_text
     return Scene(**_given(checked), text=text, folder=path.parent)
@@ -97,15 +97,17 @@ def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
     return text, _parse(path, text)
 
 
-def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]]) -> None:
-    """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name."""
+def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]] | None) -> None:
+    """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name.
+
+    given : keys of the user's own words; None where a user cannot give any
+    """
     for keys, name in scene.named_files():
-        if any(keys[: len(own)] == own for own in given) or lies_below(path.parent, name):
+        if any(keys[: len(own)] == own for own in given or ()) or lies_below(path.parent, name):
             continue
         key = ".".join(map(str, keys))
-        raise InputError(
-            f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it; --set {key}=PATH allows it"
-        )
+        allows = "" if given is None else f"; --set {key}=PATH allows it"
+        raise InputError(f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it{allows}")
 
 
 def lies_below(folder: Path, name: str) -> bool:

@@ -12,6 +12,7 @@ import json
 import math
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.lattice import lattice_bytes
 from msmpetsc.model.partition import Partition
+from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.linear.system import assembly_bytes
 from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
@@ -201,8 +203,8 @@ def forecast(
                 trimesh.Trimesh(surface.points, surface.triangles, process=False).export(mesh)
             base = _case(file, scene, changes=changes, options=options, meshes=meshes, frames=frames)
             rows = _measured(Path(folder), [_on(base, scene, n) for n in (min(COARSE, max(1, fine // 8)), fine)])
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        cached.write_text(json.dumps(rows))
+        with suppress(InputError):  # a full disk, a home that cannot be written: it is a cache
+            write_whole(cached, json.dumps(rows))
     return Forecast(*map(ShortRun.of, rows))
 
 

@@ -16,6 +16,7 @@ import matplotlib.style
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup, escape
 
+from msmpetsc.output.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.cells import figure6_charts, growth_charts
 from msmpetsc.study.charts.convergence import convergence_charts
@@ -83,7 +84,7 @@ def write_report(folder: Path) -> Path:
     names = [name for name in table["study"] if name]
     title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
     path = folder / "report.html"
-    path.write_text(page(title, measured_on(folder), table, charts), encoding="utf-8")
+    write_whole(path, page(title, measured_on(folder), table, charts))
     return path
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Lock
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.distances import surface_error, trajectory_error
 from msmpetsc.study.metrics import of_frames, outcome, rates, read_costs, read_failure, read_trace, together
@@ -118,7 +119,7 @@ class Bench:
                 if self.processes.stopped:
                     return None, "stopped"
                 if ended.reason:
-                    failed.write_text(ended.reason)
+                    write_whole(failed, ended.reason)
                 else:
                     os.replace(part, path)
                 _remove_files(part, log=not ended.reason)
@@ -163,9 +164,8 @@ class StudyResults:
     def write(self) -> None:
         """Write table and traces, each replaced whole."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
-        part = self.folder / "traces.json.part"
-        part.write_text(json.dumps([self.traces[case] for case in self.order if case in self.traces]))
-        os.replace(part, self.folder / "traces.json")
+        traces = [self.traces[case] for case in self.order if case in self.traces]
+        write_whole(self.folder / "traces.json", json.dumps(traces))
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def run_study(
         _forget(own)
     known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
     results = _continued(known, {case: every[case] for case in wanted} if part else every)
-    (own / "study.toml").write_bytes(path.read_bytes())
+    write_whole(own / "study.toml", path.read_bytes())
     results.write()
     todo = [every[case] for case in wanted if not _is_done(every[case], results.rows)]
     bench = Bench(own, Processes(), path.stem)

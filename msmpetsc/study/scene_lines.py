@@ -1,7 +1,5 @@
 """A method as lines of a scene file, to paste or to put into the file as its author wrote it."""
 
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -9,6 +7,7 @@ from typing import Any
 
 import tomlkit
 
+from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.study.cases import inline, scene_tables
 from msmpetsc.study.plan import Candidate
@@ -48,9 +47,8 @@ def overrides(scene: Path, method: Candidate, more: Tables = MappingProxyType({}
 
 
 def put_into(scene: Path, method: Candidate, more: Tables = MappingProxyType({})) -> None:
-    """Change the scene file; comments, order and all else stay as they are. Raises OSError if it cannot be written."""
-    with open(scene, "r+", encoding="utf-8", newline="") as file:  # a file that is read-only is meant to stay
-        text = file.read()
+    """Change the scene file; comments, order and all else stay as they are. Raises InputError."""
+    text = scene.read_bytes().decode()
     line_end = "\r\n" if "\r\n" in text else "\n"
     document = tomlkit.parse(text)
     for name, table in tables(method, more).items():
@@ -62,8 +60,5 @@ def put_into(scene: Path, method: Candidate, more: Tables = MappingProxyType({})
                 old.pop(key, None)
             elif old.get(key) != value:
                 old[key] = value
-    part = scene.with_name(scene.name + ".part")
-    with open(part, "w", encoding="utf-8", newline="") as file:  # new lines end like the others
-        file.write(tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))
-    shutil.copymode(scene, part)
-    os.replace(part, scene)
+    # new lines end like the others
+    write_whole(scene, tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))

@@ -4,9 +4,7 @@ pandas is imported where it is used: the commands that need no table do not wait
 """
 
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,6 +14,7 @@ import numpy as np
 
 from msmpetsc.errors import EXTRAS, InputError, missing_package
 from msmpetsc.model.fields import FRAME_FIELDS
+from msmpetsc.output.disk import write_whole
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -119,10 +118,12 @@ def require_extra() -> None:
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
     """Write table.csv and table.h5, each replaced whole."""
     table = as_table(rows)
-    with _replaced(folder / "table.csv") as part:
-        table.map(_text).to_csv(part, index=False, lineterminator="\r\n")
-    with _replaced(folder / "table.h5") as part, h5py.File(part, "w") as file:
+    write_whole(folder / "table.csv", table.map(_text).to_csv(index=False, lineterminator="\r\n"))
+    with h5py.File("table.h5", "w", driver="core", backing_store=False) as file:  # on a full disk HDF5 may crash
         _fill(file, table)
+        file.flush()
+        content = file.id.get_file_image()
+    write_whole(folder / "table.h5", content)
 
 
 def read_table(folder: Path) -> "DataFrame":
@@ -193,17 +194,6 @@ def _fill(file: h5py.File, table: "DataFrame") -> None:
         file.create_dataset(name, data=table[name].to_numpy(), dtype=kinds[column.kind], shape=(len(table),))
         file[name].dims[0].attach_scale(file["row"])
         file[name].attrs.update({"units": column.unit, "long_name": column.about})
-
-
-@contextmanager
-def _replaced(path: Path) -> Iterator[Path]:
-    """Yield a name to write under; what was written replaces ``path`` at once."""
-    part = path.with_name(path.name + ".part")
-    try:
-        yield part
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 # Choosing rows

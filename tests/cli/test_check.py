@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from block_scene import block_scene
 
@@ -95,4 +96,47 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
     for text in ("{}", "[1]", "nonsense", '{"run": 1, "counts": {}, "numbers": {}}'):
         numbers.write_text(text)
         assert main(["check", str(scene)]) == 2
-        assert f"{numbers} has no numbers of a scene" in capsys.readouterr().err
+        assert f"{numbers} is damaged, or has no numbers of a scene" in capsys.readouterr().err
+
+
+DAMAGE = {
+    "scales.m": ("scales", "m", np.inf),
+    "scales.J": ("scales", "J", "a"),
+    "scales.kg m/s": ("scales", "kg m/s", -1.0),
+    "run.steps": ("run", "steps", np.inf),
+    "steps": ("run", "steps", 10**9),  # after so many any difference would be allowed
+    "cells asked for": ("run", "cells asked for", "30, 40"),
+    "run.changes": ("run", "changes", "mesh.source=x"),
+    "counts.cells": ("counts", "cells", "32"),
+    "numbers.kinetic": ("numbers", "kinetic", {"unit": "J", "value": np.nan}),
+    "kinetic.unit": ("numbers", "kinetic", {"unit": "N", "value": 0.0}),
+}
+
+
+@pytest.mark.parametrize("place", DAMAGE)
+def test_damaged_numbers_are_refused_before_anything_is_run(scene: Path, numbers: Path, capsys, place: str):
+    table, key, value = DAMAGE[place]
+    stored = json.loads(numbers.read_text())
+    stored[table][key] = value
+    numbers.write_text(json.dumps(stored))
+    assert main(["check", str(scene)]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.count("\n") == 1 and "damaged" in told.err and place in told.err
+
+
+def test_too_great_a_scale_hides_no_difference(numbers: Path):
+    found = json.loads(numbers.read_text())
+    stored = json.loads(numbers.read_text())
+    stored["scales"] = dict.fromkeys(stored["scales"], 1e300)
+    stored["numbers"]["elastic"]["value"] += 1000.0
+    assert judged(found, stored)["elastic"]
+
+
+def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, numbers: Path, ball: Path, capsys):
+    stored = json.loads(numbers.read_text())
+    stored["run"]["changes"] = [f"mesh.source={ball}"]
+    numbers.write_text(json.dumps(stored))
+    for command in (["check", str(scene)], ["baseline", str(scene), "--overwrite", "--set", f"mesh.source={ball}"]):
+        assert main(command) == 2
+        assert "is not in the scene's folder" in capsys.readouterr().err
+    assert json.loads(numbers.read_text()) == stored

@@ -138,8 +138,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
     disk = Disk()
     path = tmp_path / "x.h5"
 
-    def open_new(part):
-        part.touch()
+    def open_new(_):
         return h5py.File(disk, "w", libver="earliest", rdcc_nbytes=0)
 
     monkeypatch.setattr(writer, "open_new", open_new)

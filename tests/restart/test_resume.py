@@ -332,6 +332,43 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
+@pytest.mark.parametrize(("step", "value"), [(9, 1e160), (9, -1.0), (10, 1e160), (10, 1e8)])
+@pytest.mark.parametrize("name", ["q", "q_previous"])
+def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkeypatch, capsys, name, step, value):
+    """After step 9, of which there is a frame, and step 10, of which there is none."""
+    path = tmp_path / "x.h5"
+    with monkeypatch.context() as patch:
+        signal_after(patch, step, signal.SIGUSR1)
+        main(["run", str(whole.parent / "scene.toml"), "-o", str(path)])
+    with h5py.File(path, "r+") as file:
+        assert max(file["checkpoint/step"]) == step
+        file[f"checkpoint/{name}"][...] = value
+    before = path.read_bytes()
+    capsys.readouterr()
+    assert main(["run", "--resume", str(path)]) == 2
+    told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(told) == 1 and "damaged" in told[0] and path.read_bytes() == before
+
+
+@pytest.mark.parametrize("lies_there", ["mesh", "mesh and another scene"])
+def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path, tmp_path, capsys, lies_there: str):
+    """What it says of its scene's folder is not believed: that scene must lie there, and name the mesh."""
+    other = tmp_path / "other"
+    other.mkdir()
+    shutil.copy(whole.parent / "scene.ply", other / "scene.ply")
+    if lies_there != "mesh":
+        shutil.copy(other / "scene.ply", other / "its.ply")
+        text = (whole.parent / "scene.toml").read_text()
+        (other / "scene.toml").write_text(text.replace("scene.ply", "its.ply"))
+    with h5py.File(stopped, "r+") as file:
+        file.attrs["scene_file"] = str(other / "scene.toml")
+    for force in ([], ["--force"]):
+        assert main(["run", "--resume", str(stopped), *force]) == 2
+        told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+        assert len(told) == 1 and "name the SCENE too" in told[0]
+    assert main(["run", str(whole.parent / "scene.toml"), "--resume", str(stopped)]) == 0
+
+
 @pytest.mark.parametrize("option", ["-pc_type python -pc_python_type os.system", "-options_file x", "-log_view :x.py"])
 def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, capsys, tmp_path, monkeypatch, option: str):
     """Options without effect on results are forgotten, all others that choose no solver are refused."""

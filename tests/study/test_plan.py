@@ -1,6 +1,7 @@
 """Plans: which trials are made, which is the answer, and how it is told and written."""
 
 # ruff: noqa: F811 (fixtures are imported)
+import os
 import shlex
 from pathlib import Path
 
@@ -156,14 +157,17 @@ def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: st
 
 
 def test_an_answer_that_cannot_be_written_is_told_all_the_same(tmp_path: Path, monkeypatch, capsys, own_log):
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
     monkeypatch.setattr(plan, "try_all", lambda *_: [Trial(Candidate("verlet", 0.02), 1.0, 0.01)])
     path = tmp_path / "scene.toml"
     path.write_text(COMMENTED)
-    (tmp_path / "scene.toml.part").mkdir()
+    monkeypatch.setattr(os, "fsync", full)
     assert main(["plan", str(path), "--error", "0.05", "--write"]) == 2
     told = capsys.readouterr()
     assert 'integrator = "verlet"' in told.out and path.read_text() == COMMENTED
-    assert told.err == f"msmpetsc: error: {path}: cannot be written: Is a directory\n"
+    assert told.err == f"msmpetsc: error: {path} cannot be written: No space left on device\n"
 
 
 @pytest.mark.parametrize(

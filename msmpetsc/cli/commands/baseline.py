@@ -19,7 +19,7 @@ def run(args: argparse.Namespace) -> int:
     path = args.output or stored_beside(args.scene)
     if path.exists() and not args.overwrite:
         raise InputError(f"{path} exists already: --overwrite stores other numbers in its place")
-    scene = load_scene(args.scene, args.set)
+    scene = load_scene(args.scene, args.set, by_user=False)  # or check could not read what this stores
     if scene.time.error is not None:
         raise InputError(
             f"{args.scene}: time.error chooses steps by an estimate: how far numbers may be apart then is not known; "
@@ -27,10 +27,7 @@ def run(args: argparse.Namespace) -> int:
         )
     steps = min(args.frames, scene.time.steps)
     numbers = found(args.scene, Recipe(args.cells, steps, tuple(args.set)), args.ranks)
-    try:
-        baseline.write(path, numbers)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    baseline.write(path, numbers)
     count = sum(map(len, (numbers["counts"], numbers["numbers"])))
     print(f"{path}: {count} numbers after {steps} steps, positions to {baseline.allowed(steps, 'm'):.1g}")
     return 0
@@ -43,6 +40,7 @@ def stored_beside(scene: Path) -> Path:
 
 def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
     """Run a scene by a recipe; return its numbers. Raises InputError where the run fails."""
+    load_scene(scene, recipe.changes, by_user=False)  # they come with the scene, and name what lies beside it
     with tempfile.TemporaryDirectory(prefix="msmpetsc-numbers-") as folder:
         path = Path(folder) / "run.h5"
         try:

@@ -9,6 +9,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
+from msmpetsc.output.disk import whole_file, write_whole
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.shipped import shipped_text, shipped_titles
@@ -66,9 +67,6 @@ def beside(mesh: Path, scene: Path) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write the scene, and beside it the schema that its first line names. Raises InputError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-        path.with_name(SCHEMA_FILE).write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be written: {error.strerror}") from None
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+        write_whole(path.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")

@@ -81,10 +81,7 @@ def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables" 
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes, *options])
     print(command, flush=True)
     if args.write:
-        try:
-            put_into(args.scene, method, more)
-        except OSError as error:
-            raise InputError(f"{args.scene}: cannot be written: {error.strerror}") from None
+        put_into(args.scene, method, more)
         print(f"\nwritten into {args.scene}")
     return command
 

@@ -30,7 +30,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "msmpetsc render my.toml --show cells",
     ),
     "export": (
-        "msmpetsc export out/my.h5 -o out/my.vtkhdf --mesh lattice",
+        "msmpetsc export out/my.h5 -o out/my.glb --every 2",
         "msmpetsc export out/my.h5 -o out/last.obj --frames -1",
     ),
     "baseline": ("msmpetsc baseline my.toml --cells 400 --frames 10",),

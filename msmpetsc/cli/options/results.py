@@ -83,8 +83,8 @@ def add_export(commands: Commands) -> None:
     parser = commands.add_parser(
         "export",
         help="write frames of a result in another format",
-        description="Write frames of a result for another program; the name's ending says in which format: .vtkhdf, "
-        ".glb and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
+        description="Write frames of a result for another program; the name's ending says in which format: .glb "
+        "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
     )
     parser.add_argument("result", metavar="OUT.h5", type=file_argument)
     parser.add_argument("-o", "--output", metavar="FILE", type=file_argument, required=True, help="what to write")

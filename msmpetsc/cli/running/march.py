@@ -283,10 +283,7 @@ def write_companions(request: RunRequest, whole: bool) -> None:
         from msmpetsc.output.compress import pack
 
         pack(path)
-    try:
-        write_xdmf(path)
-    except OSError as error:
-        raise InputError(f"{path.with_suffix('.xdmf')} cannot be written: {error.strerror}") from None
+    write_xdmf(path)
     if whole and request.picture:
         from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
 

@@ -15,8 +15,9 @@ from msmpetsc import __version__
 from msmpetsc.backend.arrays import on_host
 from msmpetsc.backend.machine import machine
 from msmpetsc.comm import on_root
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import StepFailed
 from msmpetsc.model.fields import Frame
+from msmpetsc.output.disk import plain_errors, refuse_no_file, write_whole
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation
@@ -77,25 +78,19 @@ class Cost:
             "explicit_limit": explicit_limit(comm, simulation.model.lattice, simulation.elasticity),
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip
-        on_root(comm, lambda: _write(path, json.dumps(record, indent=1)))
+        on_root(comm, lambda: write_whole(path, json.dumps(record, indent=1)))
 
 
 def refuse_unwritable(path: Path | None) -> None:
     """Raise InputError for a file that cannot be written, before the run rather than after it."""
     if path:
         existed = path.exists()
-        _write(path, "", "a")
-        if not existed:
-            path.unlink()
-
-
-def _write(path: Path, text: str, mode: str = "w") -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, mode, encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        with plain_errors(path):
+            refuse_no_file(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            open(path, "a").close()
+            if not existed:
+                path.unlink()
 
 
 def peak_memory() -> int:

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 from mpi4py import MPI
 
 from msmpetsc import __version__
-from msmpetsc.comm import log
+from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
+from msmpetsc.geometry.registry import MODELS
 from msmpetsc.output.reader import refuse_deadly
-from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice
+from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
 from msmpetsc.output.writer import Begin, ResultFile
-from msmpetsc.scene.reading import scene_of
+from msmpetsc.scene.problems import as_given
+from msmpetsc.scene.reading import load_scene, scene_of
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
@@ -67,7 +69,34 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
-    return scene_of(Path(file), text, changes, presets)
+    scene = scene_of(Path(file), text, changes, presets)
+    _refuse_files_of_others(earlier, Path(file), scene, changes)
+    return scene
+
+
+def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes: list[str]) -> None:
+    """Raise InputError for a file named by a result's scene, but neither by that scene's file nor by the user.
+
+    The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
+    """
+    given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
+    unknown = {
+        keys: name
+        for keys, name in scene.named_files()
+        if name not in MODELS and not any(tuple(map(str, keys))[: len(own)] == own for own in given)
+    }
+    if not unknown:
+        return
+    try:
+        known = {name for _, name in load_scene(file).named_files()}
+    except InputError:
+        known = set()
+    for keys, name in unknown.items():
+        if name not in known:
+            raise InputError(
+                f"{earlier.path} names {as_given(name)}, and {as_given(str(file))} does not: name the SCENE too, "
+                f"or --set {'.'.join(map(str, keys))}=PATH"
+            )
 
 
 class Resumed:
@@ -135,6 +164,9 @@ class Resumed:
         kept = 0 if saved is None else simulation.stored_until(saved.step)
         if kept > self.earlier.finished:
             raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
+        if saved is not None:
+            is_frame = (kept - 1) * simulation.every == saved.step
+            on_root(comm, lambda: refuse_unlike_frame(path, kept - 1, is_frame))
         if self.differs:  # later frames are of how it was
             file.keep(kept)
         if saved is None:

@@ -1,17 +1,20 @@
 """Films: the frames of a result one after the other, for 3 to 8 s, or one body turned around."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
+from subprocess import DEVNULL, PIPE, Popen
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError, one_line
+from msmpetsc.errors import InputError, printable
+from msmpetsc.output.disk import whole_file
 from msmpetsc.output.drawing.fabric import Fabric, cut_open
 from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
 from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
@@ -28,7 +31,7 @@ from msmpetsc.output.reader import Result
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
 TURN = 6.0  # [s] that the eye takes to go around a body that stands still
-QUALITY = 8.0  # of 10, as imageio-ffmpeg counts
+QUALITY = 10  # as ffmpeg's -crf counts: 0 without loss, 51 the worst
 
 
 def write_film(
@@ -106,32 +109,43 @@ def _panel(subject: Subject, shot: Shot, seen: Survey, style: Style, fabric: tup
 @contextmanager
 def written(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Yield what adds a picture (height, width, 3) to a film, which has its name when it is whole."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with (_video if path.suffix.lower() == ".mp4" else _images)(part, size, fps) as add:
-            yield add
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or one_line(error)}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    write = _video if path.suffix.lower() == ".mp4" else _images
+    with whole_file(path) as part, write(part, size, fps) as add:
+        yield add
 
 
 @contextmanager
 def _video(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write H.264, which needs the extra "movie"."""
+    """Write H.264 by ffmpeg, which the extra "movie" brings. Raises OSError with the last that ffmpeg says.
+
+    imageio-ffmpeg's own writer does not ask how ffmpeg ended: on a full disk it leaves a film that nothing can open.
+    """
     import imageio_ffmpeg
 
-    path.touch()  # or ffmpeg would say why not, in many lines
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, quality=QUALITY, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    try:
-        yield lambda picture: writer.send(np.ascontiguousarray(picture))
-    finally:
-        writer.close()
+    pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size)]
+    rate = ["-r", str(Fraction(fps).limit_denominator())]
+    film = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", str(QUALITY)]
+    careful = ["-v", "error", "-xerror", "-y"]  # its older versions end a film that they could not close as done
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *careful, *pictures, *rate, "-i", "-", *film, str(path)]
+    # signals stay as they are here: what is too long for the system is told like what has no room, and Ctrl-C is ours
+    system: dict[str, Any] = dict(restore_signals=False, start_new_session=True)
+    with TemporaryFile() as said, Popen(command, stdin=PIPE, stdout=DEVNULL, stderr=said, **system) as ffmpeg:
+        stream: Any = ffmpeg.stdin
+        broken = False
+        try:
+            yield lambda picture: stream.write(np.ascontiguousarray(picture))
+        except BrokenPipeError:  # it has ended, and says why
+            broken = True
+        except BaseException:
+            ffmpeg.kill()
+            raise
+        finally:
+            with suppress(BrokenPipeError):
+                stream.close()
+        if ffmpeg.wait() or broken:
+            said.seek(0)
+            reason = said.readline().decode(errors="replace").rpartition("] ")[2].strip()
+            raise OSError(printable(reason) or f"ffmpeg ended with status {ffmpeg.returncode}")
 
 
 @contextmanager

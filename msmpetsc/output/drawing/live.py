@@ -14,9 +14,10 @@ import numpy as np
 from msmpetsc.comm import log
 from msmpetsc.errors import one_line
 from msmpetsc.model.fields import Frame
+from msmpetsc.output.disk import write_whole
 from msmpetsc.output.drawing.camera import camera_facing
 from msmpetsc.output.drawing.colouring import plain_colouring
-from msmpetsc.output.drawing.page import fixed_states, packed_frames, page_facts, page_text, write_whole
+from msmpetsc.output.drawing.page import fixed_states, packed_frames, page_facts, page_text
 from msmpetsc.output.drawing.shots import Style, Survey, shots_of
 from msmpetsc.output.drawing.skin import drawn
 from msmpetsc.output.drawing.subject import subject_of_surface

@@ -8,7 +8,6 @@ straight on from the two frames before, deflated and in base64.
 import base64
 import html
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.resources import files
@@ -20,6 +19,7 @@ import numpy as np
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.output.disk import write_whole
 from msmpetsc.output.drawing import colours
 from msmpetsc.output.drawing.colouring import Colouring
 from msmpetsc.output.drawing.fabric import KINDS, SHRUNK, THROUGH, Cut, cut_open
@@ -235,16 +235,3 @@ def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> s
     for name, part in parts.items():
         text = text.replace(f"{{{{ {name} }}}}", part)
     return text
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file under a name of its own, and rename it: who reads it sees the old one or the new one."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.disk import whole_file
 from msmpetsc.output.drawing.camera import Camera, camera_facing
 from msmpetsc.output.drawing.colouring import colouring_of, opened_reference, plain_colouring, scaled
 from msmpetsc.output.drawing.fabric import cut_open
@@ -159,10 +160,10 @@ def refuse_high(panels: int, size: tuple[int, int] = (NARROWEST, CAPTION)) -> in
 
 def _save(picture: np.ndarray, path: Path) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(path)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from error
+        with whole_file(path) as part:
+            Image.fromarray(picture).save(part)
+    except ValueError as error:  # of a format that Pillow does not know
+        raise InputError(f"{path} cannot be written: {error}") from error
 
 
 def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]:

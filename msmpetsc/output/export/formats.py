@@ -1,6 +1,5 @@
 """The formats that a result is exported to, in one table, and the export itself."""
 
-import os
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.disk import whole_file
 from msmpetsc.output.export.moments import Mesh, Moments
 from msmpetsc.output.reader import Result
 
@@ -38,7 +38,6 @@ class Format(NamedTuple):
 ONE_FRAME = ("one_frame", "write_one_frame")
 USD = Format(("usd", "write_usd"), True, ("surface",), "Blender, Houdini, Omniverse, usdview")
 FORMATS = {
-    ".vtkhdf": Format(("vtkhdf", "write_vtkhdf"), True, ("surface", "lattice"), "ParaView, VTK, pyvista"),
     ".glb": Format(("gltf", "write_glb"), True, ("surface",), "Blender, browsers"),
     ".usd": USD,
     ".usda": USD,
@@ -68,15 +67,8 @@ def export(
     write = chosen.load()
     with Result(result) as run:
         moments = Moments(run, _mesh(run, path, chosen, mesh), _frames(run, path, chosen, frames, every))
-        part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as part:
             write(moments, part)
-            part.replace(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-        finally:
-            part.unlink(missing_ok=True)
     return path
 
 

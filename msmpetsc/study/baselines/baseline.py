@@ -16,12 +16,14 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import msmpetsc
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
+from msmpetsc.output.disk import write_whole
 from msmpetsc.study.process import environment, last_error
 
 ERROR = 1e-9  # of each step, relative
@@ -30,6 +32,34 @@ ENERGIES = ("kinetic", "elastic", "potential", "contact")
 NODES = 5  # whose places are stored, evenly spread by their numbers
 HEAD = f"{'scene':20} {'cells':>6} {'nodes':>6} {'springs':>8} {'off by':>9} {'allowed':>9} {'time':>7}"
 Numbers = dict[str, Any]  # as stored: "run", "counts", "scales" by unit, "numbers" by name
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0)]
+Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+MOST_STEPS = int((2 / (GROWTH * ERROR)) ** 0.5)  # with more, any difference would be allowed
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class _StoredRun(_Strict):
+    cells: Annotated[int, Field(ge=1)] | None = Field(alias="cells asked for")
+    steps: int = Field(ge=1, le=MOST_STEPS)
+    changes: list[str]
+
+
+class _StoredNumber(_Strict):
+    unit: Literal["m", "J", "kg m/s"]
+    value: Finite | list[Finite]
+
+
+class Stored(_Strict):
+    """What the file of numbers must be: it may be damaged, or from anywhere."""
+
+    run: _StoredRun
+    counts: dict[str, Count]
+    scales: dict[Literal["m", "J", "kg m/s"], Size]
+    numbers: dict[str, _StoredNumber]
 
 
 @dataclass(frozen=True)
@@ -49,7 +79,7 @@ class Recipe:
     def of(cls, stored: Numbers) -> "Recipe":
         """Return the recipe by which stored numbers were made."""
         run = stored["run"]
-        return cls(run["cells asked for"], int(run["steps"]), tuple(run["changes"]))
+        return cls(run["cells asked for"], run["steps"], tuple(run["changes"]))
 
     def record(self) -> dict[str, Any]:
         """Return it as it is stored."""
@@ -128,7 +158,7 @@ def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, f
             yield name, np.inf, 0.0
             continue
         apart = np.abs(np.subtract(one["value"], other["value"], dtype=float)).max()
-        scale = stored["scales"][one["unit"]]
+        scale = min(numbers["scales"][one["unit"]] for numbers in (found, stored))  # of a damaged file any
         relative = 0.0 if apart == 0 else float(apart / scale) if scale > 0 else np.inf
         yield name, np.inf if np.isnan(relative) else relative, allowed(steps, one["unit"])
 
@@ -165,19 +195,22 @@ def row(name: str, counts: dict[str, int], off: tuple[float, float], seconds: fl
 
 
 def write(path: Path, numbers: Numbers) -> None:
-    """Store numbers. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(numbers, indent=1) + "\n")
+    """Store numbers. Raises InputError."""
+    write_whole(path, json.dumps(numbers, indent=1) + "\n")
 
 
 def read(path: Path) -> Numbers:
     """Return stored numbers. Raises InputError for what are none."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
+        Stored.model_validate(stored)
         judged(stored, stored)
-        Recipe.of(stored)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{path} has no numbers of a scene") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = printable(".".join(map(str, first["loc"])) or "all", 60)
+        raise InputError(f"{path} is damaged, or has no numbers of a scene: {where}: {first['msg']}") from None
+    except (ValueError, LookupError, RecursionError):
+        raise InputError(f"{path} is damaged, or has no numbers of a scene") from None
     return stored

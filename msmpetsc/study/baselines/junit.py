@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
+from msmpetsc.output.disk import write_whole
+
 
 @dataclass(frozen=True)
 class Checked:
@@ -25,7 +27,7 @@ class Checked:
 
 
 def write_junit(path: Path, outcomes: list[Checked]) -> None:
-    """Write a suite for each scene, a case for each number. Raises OSError."""
+    """Write a suite for each scene, a case for each number. Raises InputError."""
     root = ElementTree.Element("testsuites", name="msmpetsc check")
     for outcome in outcomes:
         counts = {"tests": str(len(outcome.lines)), "failures": str(len(outcome.wrong))}
@@ -35,5 +37,4 @@ def write_junit(path: Path, outcomes: list[Checked]) -> None:
             case = ElementTree.SubElement(suite, "testcase", classname=outcome.scene.stem, name=name)
             if line:
                 ElementTree.SubElement(case, "failure", message=line).text = line
-    path.parent.mkdir(parents=True, exist_ok=True)
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -24,6 +24,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, Formatter, FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
+from msmpetsc.output.disk import whole_file
 from msmpetsc.study import formatting
 from msmpetsc.study.table import Row, records, spread
 
@@ -301,7 +302,8 @@ def save_png(chart: Chart, folder: Path) -> Path:
     path = folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png"
     with matplotlib.style.context(["default", RC]):
         chart.figure.suptitle(chart.title, x=0.01, ha="left", weight="bold")
-        chart.figure.savefig(path)
+        with whole_file(path) as part:
+            chart.figure.savefig(part)
         chart.figure.suptitle("")
     return path
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msmpetsc
-from msmpetsc.cli.arguments import on_first_rank
+from msmpetsc.cli.ranks import world
 from msmpetsc.cli.versions import PYTHON
 from msmpetsc.errors import EXTRAS, one_line
 
@@ -56,7 +56,7 @@ class Failed(Exception):
 
 def run(_: argparse.Namespace) -> int:
     """Print a line for each thing; return 1 where a run lacks something that it needs."""
-    if not on_first_rank():
+    if world().rank != 0:
         return 0
     needed = (petsc, ranks, results, packages)
     states = set()

@@ -118,6 +118,28 @@ def test_doctor_names_what_is_missing_and_does_not_crash():
     assert "pip install 'msmpetsc[render]'" in lines["extra render"]
 
 
+def test_doctor_tells_what_is_missing_from_what_is_broken(tmp_path: Path):
+    hook = """
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("petsc4py", "numba"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Missing())
+"""
+    (tmp_path / "sitecustomize.py").write_text(hook)  # of the processes that it starts, too
+    (tmp_path / "tqdm.py").write_text('raise ImportError("libold.so: cannot open shared object file")')
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-m", "msmpetsc", "doctor"], env=environment, capture_output=True, text=True, timeout=100
+    )
+    lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
+    for name in ("PETSc", "solvers", "device", "kernels"):
+        assert lines[name].startswith("missing") and "msmpetsc[run]" in lines[name], lines[name]
+    assert lines["extra render"].startswith("BROKEN") and "tqdm: libold.so" in lines["extra render"]
+    assert lines["extra mesh"].startswith("ok") and done.returncode == 1
+
+
 def test_a_probe_that_dies_is_one_line(monkeypatch):
     monkeypatch.setattr(doctor, "PETSC", "import os, sys; print('cannot load libpetsc', file=sys.stderr); os.abort()")
     assert list(doctor.examined(doctor.petsc)) == [("petsc", doctor.BROKEN, "cannot load libpetsc")]

@@ -14,6 +14,8 @@ from test_extras import without
 
 from msmpetsc.cli.arguments import COMMANDS, command_parser, option_names, parsed
 from msmpetsc.cli.commands import doctor
+from msmpetsc.geometry import readers
+from msmpetsc.scene.reading import MESHES
 from msmpetsc.cli.main import main
 from msmpetsc.cli.options.examples import EXAMPLES
 
@@ -54,6 +56,32 @@ def test_a_study_given_to_run_is_named_as_one(tmp_path: Path, capsys):
     assert main(["run", str(study)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f"{study}: is a study, no scene: msmpetsc study {study}")
+
+
+def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(tmp_path: Path, capsys):
+    scene, mesh = block_scene(tmp_path), tmp_path / "scene.ply"
+    remedies = {
+        ("run", mesh): f"is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}",
+        ("inspect", mesh): "is a mesh, no scene",
+        ("study", scene): f"is a scene, no study: msmpetsc run {scene}",
+    }
+    for (command, path), remedy in remedies.items():
+        assert main([command, str(path)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{path}: {remedy}" in line
+
+
+def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, capsys):
+    """Bending of a bar of the sides 0.5 and 0.25 m, E = 1e5 Pa: 6.19 L^2 / (d c), c = 10 m/s, is 0.62 s."""
+    for step, integrator, said in ((0.7, "bdf2", 1), (0.5, "bdf2", 0), (0.7, "verlet", 0)):
+        time = {"step": step, "duration": step, "integrator": integrator}
+        scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})
+        assert main(["run", str(scene), "-o", str(tmp_path / "x.h5"), "--overwrite"]) == 0
+        assert capsys.readouterr().err.count("warning: time.step is 1.1 periods of the slowest vibration") == said
+
+
+def test_the_formats_of_meshes_are_those_that_are_read():
+    assert set(MESHES) == {f".{kind}" for kind in readers._READERS}
 
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):

@@ -206,7 +206,14 @@ def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.C
     assert main(["export", str(result), "-o", str(path)]) == 0
     assert capsys.readouterr().out == f"{path}\n" and path.is_file()
     assert main(["export", str(result), "-o", str(path), "--frames", "9"]) == 2
-    assert "no 9" in capsys.readouterr().err
+    assert "not 9" in capsys.readouterr().err
+
+
+def test_slices_choose_frames_as_for_render(result: Path, tmp_path: Path):
+    for name, frames in (("slice.glb", "0:5:2"), ("list.glb", "0,2,-1")):
+        assert main(["export", str(result), "-o", str(tmp_path / name), "--frames", frames]) == 0
+    whole = export(result, tmp_path / "whole.glb", frames=[0, 2, 4])
+    assert (tmp_path / "slice.glb").read_bytes() == whole.read_bytes() == (tmp_path / "list.glb").read_bytes()
 
 
 LIMITED = """

@@ -12,14 +12,12 @@ from msmpetsc.errors import as_expected
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from msmpetsc.cli.ranks import Alone
-
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other
 
 
 @contextmanager
-def ending_together(comm: "MPI.Comm | Alone", extra: str = "run") -> Iterator[None]:
+def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
     """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
 
     The others would wait for ever. It stands within whatever does collective work on leaving. A package that is missing
@@ -66,7 +64,7 @@ def _failing_ranks(meeting: "MPI.Comm") -> set[int]:
     return failed
 
 
-def _end_all(comm: "MPI.Comm | Alone", line: str, status: int) -> None:
+def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:
     """Say the line and end all ranks, for none can be asked any more. One rank alone is left to its own end."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)

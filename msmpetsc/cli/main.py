@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msmpetsc.cli.arguments import parsed, parsed_apart
-from msmpetsc.cli.ranks import Alone, world
+from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
 from msmpetsc.scene.toml import overrides_of
 
@@ -141,7 +141,7 @@ def command_words(name: str, value: Any) -> list[str]:
 
 
 @contextmanager
-def logged_on_root(comm: "MPI.Comm | Alone", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
+def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
     """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with the seconds since the start."""
     log = logging.getLogger("msmpetsc")
     before = log.handlers, log.level

@@ -1,7 +1,7 @@
 """The ranks that a command runs on, for those that need MPI only to see that there is but one."""
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -13,23 +13,23 @@ LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launch
 
 
 class Alone:
-    """The communicator of a process that no launcher started."""
+    """The communicator of a process that no launcher started, as far as one rank asks it."""
 
     rank, size = 0, 1
 
 
-def world(started: bool = False) -> "MPI.Comm | Alone":
+def world(started: bool = False) -> "MPI.Comm":
     """Return all ranks.
 
     started : whether MPI must be started, which takes 0.3 s; or else only where a launcher started the process, and
         that MPI can be started
     """
     if not (started or LAUNCHED & os.environ.keys()):
-        return Alone()
+        return cast("MPI.Comm", Alone())
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError):  # missing or broken, in a shell of a batch system, say: `run` says so
         if started:
             raise
-        return Alone()
+        return cast("MPI.Comm", Alone())
     return MPI.COMM_WORLD

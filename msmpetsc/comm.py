@@ -1,14 +1,18 @@
 """Ranks together: what rank 0 reads all know, what fails on any fails on all, rows travel to their owners."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.errors import MsmpetscError, as_expected
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 log = logging.getLogger("msmpetsc")  # the command line lets rank 0 alone speak
 
@@ -66,6 +70,8 @@ class Route:
         return answers
 
     def _alltoall(self, rows: np.ndarray, out_counts: np.ndarray, in_counts: np.ndarray) -> np.ndarray:
+        from mpi4py import MPI  # late: what draws results has none
+
         rows = np.ascontiguousarray(rows)
         result = np.empty((int(in_counts.sum()), *rows.shape[1:]), rows.dtype)
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()

@@ -41,7 +41,7 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
         *("trimesh", "igl", "pooch", "psutil", "tqdm", "shtab"),
     ),
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
-    "render": ("pyvista",),
+    "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
     "study": ("pandas", "matplotlib", "jinja2", "tomlkit"),
     "contact": ("ipctk",),
     "movie": ("imageio", "imageio_ffmpeg"),
@@ -53,27 +53,30 @@ EXTRAS = {  # what pyproject.toml's extras bring, by the names they are imported
 }
 
 
-def as_expected(error: Exception) -> MsmpetscError | None:
-    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is."""
+def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
+    """Return the error as one of ours, if it is one that a user can meet: memory that is not enough is.
+
+    extra : the one that is named for a package which several extras bring
+    """
     if isinstance(error, MemoryError) or getattr(error, "ierr", None) == PETSC_OUT_OF_MEMORY:
         reason = one_line(error)
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
     if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
         return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
-        return missing_package(error.name or "")
+        return missing_package(error.name or "", extra)
     return error if isinstance(error, MsmpetscError) else None
 
 
-def missing_package(name: str) -> InputError:
+def missing_package(name: str, extra: str = "run") -> InputError:
     """Return the error that says which extra brings a package that is not installed."""
-    return InputError(f"{name} is not installed: pip install 'msmpetsc[{extra_of(name)}]' brings it")
+    return InputError(f"{name} is not installed: pip install 'msmpetsc[{extra_of(name, extra)}]' brings it")
 
 
-def extra_of(module: str) -> str | None:
-    """Return the extra of pyproject.toml that brings a module; None for any other module."""
+def extra_of(module: str, first: str = "run") -> str | None:
+    """Return the extra of pyproject.toml that brings a module, the first if several do; None for any other module."""
     package = module.partition(".")[0]
-    return next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+    return next((extra for extra in (first, *EXTRAS) if package in EXTRAS[extra]), None)
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:

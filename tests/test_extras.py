@@ -1,6 +1,8 @@
 """Results are read with the core dependencies alone; a package that is missing is named in one line with its extra."""
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -9,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import small_result
+from ball_result import write_ball
 from conftest import ENVIRONMENT, ROOT
 
 from msmpetsc.errors import EXTRAS
@@ -54,6 +57,76 @@ def test_results_are_read_with_the_core_alone(tmp_path: Path):
     every = tuple(package for packages in EXTRAS.values() for package in packages)
     done = without(every, tmp_path / "x.h5", statement=read)
     assert done.stdout == "(12, 3) (12, 3) {'step': 0.01}\n", done.stderr
+
+
+OF_RUNS = tuple(name for name in EXTRAS["run"] if name not in (*EXTRAS["render"], "pooch"))  # which pyvista needs
+DRAWN = [
+    "render {} -o x.png",
+    "render {} -o x.gif --frames 0:4:2",
+    "render {} -o x.html --colour contact",
+    "render ball.ply -o mesh.png",
+    "export {} -o x.glb --frames 0:9:3",
+    "compare {} {}",
+]
+
+
+def test_what_runs_alone_need_is_named():
+    assert {"mpi4py", "petsc4py", "numba"} <= set(OF_RUNS)
+
+
+@pytest.mark.parametrize("command", DRAWN)
+def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compiler(
+    command: str, tmp_path: Path, ball: Path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    write_ball(tmp_path / "ball.h5", surface=True)
+    words = command.replace("ball.ply", str(ball)).format("ball.h5", "ball.h5").split()
+    done = without(OF_RUNS, *words)
+    assert done.returncode == 0, done.stderr
+    assert "-o" not in words or Path(words[words.index("-o") + 1]).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("command", ["export x.h5 -o x.glb --frames 0:5:2", "compare x.h5 x.h5"])
+def test_exporting_and_comparing_need_the_core_alone(command: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small_result.write(tmp_path / "x.h5")
+    done = without(tuple(package for packages in EXTRAS.values() for package in packages), *command.split())
+    assert done.returncode == 0, done.stderr
+
+
+def test_drawing_names_the_extra_that_draws_where_runs_need_the_package_too(tmp_path: Path):
+    done = without(("pydantic",), "render", small_result.write(tmp_path / "x.h5"))
+    assert (done.returncode, "msmpetsc[render]" in done.stderr) == (2, True), done.stderr
+
+
+def in_the_clean(python: Path, *words: object, folder: Path) -> subprocess.CompletedProcess:
+    """Return the finished command of a Python that sees nothing of this one's packages."""
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "OMPI_", "PMIX_"))}
+    return subprocess.run([python, *map(str, words)], cwd=folder, env=clean, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball: Path):
+    hidden = shutil.ignore_patterns(".*", "out", "tests", "build", "__pycache__", "*.egg-info", "*.png")
+    shutil.copytree(ROOT, tmp_path / "clone", symlinks=True, ignore=hidden)
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "clean"], check=True)
+    python = tmp_path / "clean" / "bin" / "python"
+    done = in_the_clean(python, "-m", "pip", "install", "--quiet", f"{tmp_path / 'clone'}[render]", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    write_ball(tmp_path / "ball.h5", surface=True)
+    absent = f"from importlib.util import find_spec; print([name for name in {OF_RUNS} if find_spec(name)])"
+    assert in_the_clean(python, "-c", absent, folder=tmp_path).stdout == "[]\n"
+    for command in DRAWN:
+        words = command.replace("ball.ply", str(ball)).format("ball.h5", "ball.h5").split()
+        done = in_the_clean(python, "-m", "msmpetsc", *words, folder=tmp_path)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
+    read = "import msmpetsc; print(msmpetsc.open('ball.h5').frames.position[-1].shape[1])"
+    assert in_the_clean(python, "-c", read, folder=tmp_path).stdout == "3\n"
+    doctor = in_the_clean(python, "-m", "msmpetsc", "doctor", folder=tmp_path)
+    assert doctor.returncode == 1 and "BROKEN" not in doctor.stdout and "ok       extra render" in doctor.stdout
+    refused = in_the_clean(python, "-m", "msmpetsc", "run", ball, folder=tmp_path)
+    assert refused.returncode == 2 and "msmpetsc[run]" in refused.stderr
 
 
 @pytest.mark.parametrize("package", ["mpi4py", "petsc4py", "numba", "trimesh"])

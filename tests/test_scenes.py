@@ -14,10 +14,10 @@ import pytest
 from conftest import run
 
 from msmpetsc.errors import InputError
+from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.registry import find
 from msmpetsc.model.elasticity.inversion import least_volumes
 from msmpetsc.model.loads import Motion
-from msmpetsc.model.region import inside
 from msmpetsc.scene.schema import SceneFile
 
 SCENES = Path(__file__).parents[1] / "scenes"

@@ -78,6 +78,10 @@ class Simulation:
         self.model: Model | None = None
         self._words = words_of(petsc_options)
         self._shape: Shape | None = None  # that the model was made of
+        self._reached = "not begun"  # for people
+
+    def __repr__(self) -> str:
+        return f"Simulation({self.scene!r}, {self._reached})"
 
     def frames(
         self,
@@ -115,6 +119,7 @@ class Simulation:
                     frame = next(steps, None)
                 if frame is None:
                     return
+                self._reached = f"step {frame.index}, t = {frame.time:.6g} s"
                 yield replace(frame, position=frame.position.copy())  # the next step starts from these numbers
 
     def _begin(self, scene: Scene, until_the_end: ExitStack) -> Iterator[Frame]:

@@ -4,7 +4,6 @@ What is imported at the top starts neither MPI nor PETSc, so that ``--help`` ans
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from itertools import pairwise
@@ -20,24 +19,11 @@ from msmpetsc.cli.options.results import add_compare, add_export, add_render
 from msmpetsc.cli.options.run import add_run
 from msmpetsc.cli.options.scenes import add_fetch, add_keys, add_new, add_schema
 from msmpetsc.cli.options.values import Commands, add_verbosity
+from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
 TAKE_PETSC_OPTIONS = ("run", "inspect")
-LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launchers of Cray and IBM set for each rank
-    "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID", "FLUX_TASK_RANK", "ALPS_APP_PE", "PALS_RANKID",
-    "JSM_NAMESPACE_RANK", "MPI_LOCALRANKID", "MV2_COMM_WORLD_RANK",
-}  # fmt: skip
-
-
-def on_first_rank() -> bool:
-    """Return whether this process is rank 0. MPI is started to say so only where a launcher started the process."""
-    if not LAUNCHED & os.environ.keys():
-        return True
-    from mpi4py import MPI  # 0.3 s, which help need not wait for
-
-    return MPI.COMM_WORLD.rank == 0
-
 
 # Parsing
 
@@ -114,7 +100,7 @@ class Parser(argparse.ArgumentParser):
         raise InputError(message)
 
     def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
-        if on_first_rank():
+        if world().rank == 0:
             super()._print_message(message, file)
 
 
@@ -208,9 +194,7 @@ def refuse_name_of_a_file(option: str, folder: Path | None) -> None:
 
 def refuse_ranks(command: str, why: str) -> None:
     """Raise InputError where mpiexec has started more than one of a command that is for one process alone."""
-    from mpi4py import MPI
-
-    if MPI.COMM_WORLD.size > 1:
+    if world().size > 1:
         raise InputError(f"{command} is started without mpiexec: {why}")
 
 

@@ -5,33 +5,36 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from msmpetsc.errors import as_expected
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 STATUS_BUG, STATUS_INTERRUPTED = 1, 130
 PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the other
 
 
 @contextmanager
-def ending_together(comm: MPI.Comm) -> Iterator[None]:
+def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
     """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
 
-    The others would wait for ever. It stands within whatever does collective work on leaving.
+    The others would wait for ever. It stands within whatever does collective work on leaving. A package that is missing
+    is named with this extra, if that brings it.
     """
-    meeting = comm.Dup() if comm.size > 1 else comm  # its messages meet no others
+    meeting = comm.Dup() if comm.size > 1 else None  # its messages meet no others
     try:
         yield
     except KeyboardInterrupt:
         _end_all(comm, f"rank {comm.rank}: interrupted", STATUS_INTERRUPTED)
         raise
     except Exception as raised:
-        error = as_expected(raised)
+        error = as_expected(raised, extra)
         if error is None:
             _end_all(comm, f"rank {comm.rank}: {traceback.format_exc()}", STATUS_BUG)
             raise
-        if not error.on_all_ranks:
+        if meeting is not None and not error.on_all_ranks:
             failed = _failing_ranks(meeting)
             if len(failed) < comm.size:
                 if comm.rank > min(failed):
@@ -39,12 +42,14 @@ def ending_together(comm: MPI.Comm) -> Iterator[None]:
                 _end_all(comm, f"error: {error}", error.exit_status)
             error.on_all_ranks = True
         raise error from raised
-    if comm.size > 1:
+    if meeting is not None:
         meeting.Free()
 
 
-def _failing_ranks(meeting: MPI.Comm) -> set[int]:
+def _failing_ranks(meeting: "MPI.Comm") -> set[int]:
     """Return the ranks that fail, this one among them: as soon as all do, or when patience ends."""
+    from mpi4py import MPI
+
     failed, until = {meeting.rank}, time.monotonic() + PATIENCE
     sent = [meeting.isend(None, rank) for rank in range(meeting.size) if rank != meeting.rank]
     while len(failed) < meeting.size and time.monotonic() < until:
@@ -59,7 +64,7 @@ def _failing_ranks(meeting: MPI.Comm) -> set[int]:
     return failed
 
 
-def _end_all(comm: MPI.Comm, line: str, status: int) -> None:
+def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:
     """Say the line and end all ranks, for none can be asked any more. One rank alone is left to its own end."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msmpetsc.cli.arguments import parsed, parsed_apart
+from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, MsmpetscError, as_expected, did_you_mean
 from msmpetsc.scene.toml import overrides_of
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:  # MPI takes 0.3 s to start, which --help need not wait for
     from msmpetsc.model.fields import Frame
     from msmpetsc.scene.schema import Scene
 
-WITHOUT_MPI = ("doctor", "completion")  # which must work where MPI does not
+DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
 LINE = "msmpetsc: %(levelname)s: %(message)s"
 
 
@@ -41,19 +42,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         args = parsed(words)  # --help and --version leave from here
         verbose, level = args.verbose, logging.WARNING if args.quiet else logging.INFO
-        if args.command in WITHOUT_MPI:
-            return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
     except InputError as error:
         refused = error
-    from mpi4py import MPI
-
     from msmpetsc.cli.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
 
-    comm = MPI.COMM_WORLD
+    comm = world(started=refused is None and args.command == "run")  # the other commands are for one process
     with logged_on_root(comm, level, verbose):
         try:
-            with ending_together(comm):
-                if refused:
+            with ending_together(comm, "render" if refused is None and args.command in DRAWING else "run"):
+                if refused is not None:
                     raise refused
                 return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
         except MsmpetscError as error:

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.step_cache import cached
-from msmpetsc.geometry.surface import Surface, edge_use, examine, first_of_equal, merged_triangles
+from msmpetsc.geometry.surface import Surface, compact, edge_use, examine, first_of_equal, merged_triangles
 
 if TYPE_CHECKING:
     import manifold3d
@@ -176,12 +176,6 @@ def _bounds(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest coordinates of the points in use, (3,) each."""
     points = surface.points[np.unique(surface.triangles)]
     return points.min(axis=0), points.max(axis=0)
-
-
-def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
-    """Return the surface of these triangles and only their points, in the order they had."""
-    used, numbers = np.unique(triangles, return_inverse=True)
-    return Surface(points[used], numbers.reshape(-1, 3))
 
 
 def part_labels(surface: Surface) -> np.ndarray:

@@ -34,6 +34,12 @@ def joined(surfaces: Sequence[Surface]) -> Surface | None:
     return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
 
 
+def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
+    """Return the surface of these triangles and only their points, in the order they had."""
+    used, numbers = np.unique(triangles, return_inverse=True)
+    return Surface(points[used], numbers.reshape(-1, 3))
+
+
 def bounds_of(surface: Surface) -> np.ndarray:
     """Return the bounding box (2, 3) [m] of all points."""
     return np.array([surface.points.min(axis=0), surface.points.max(axis=0)])

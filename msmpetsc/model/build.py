@@ -12,9 +12,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
-from msmpetsc.geometry.prepare import compact, prepare
+from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
-from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, examine, joined
+from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.model.contact.build import build_obstacles, surfaces_of
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside

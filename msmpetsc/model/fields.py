@@ -89,6 +89,11 @@ class Frame:
     ] = math.nan
     self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
 
+    def __repr__(self) -> str:
+        """Return one line, for the arrays would fill the screen."""
+        solved = f"its {self.ksp_its}, error {self.step_error:.1e}"
+        return f"Frame({self.index}: t = {self.time:.6g} s, {solved}, position {self.position.shape})"
+
 
 FRAME_FIELDS: dict[str, Field] = {
     name: hint.__metadata__[0]

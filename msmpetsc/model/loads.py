@@ -2,15 +2,18 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.backend.arrays import like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
 from msmpetsc.scene.motion import ForceTable, Keyframe
 from msmpetsc.scene.values import Vector
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 SAME = 1e-12  # relative: a number of steps may come out a little less than the time it was meant to be
 
@@ -164,7 +167,7 @@ class OwnForce:
         return force
 
 
-def spread_by_mass(comm: MPI.Comm, total: Iterable[float], where: np.ndarray, mass: np.ndarray) -> np.ndarray:
+def spread_by_mass(comm: "MPI.Comm", total: Iterable[float], where: np.ndarray, mass: np.ndarray) -> np.ndarray:
     """Spread a total force [N] over nodes in proportion to their mass, (owned, 3) [N] (collective).
 
     where, mass : (owned,) bool, the nodes; (owned,) [kg]

@@ -3,6 +3,7 @@
 Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ EDGE, FACE_DIAGONAL, SPACE_DIAGONAL = 1, 2, 3  # squared length in cells
 CELLS_AROUND = np.array([0, 4, 2, 1])  # cells that share a spring of each kind inside a body
 # k1 : k2 : k3 = 40 : 16 : 9 is isotropic up to the sixth moment of the directions; then E = 7/4 k1 / h
 ISOTROPIC = np.array([0, 40, 16, 9]) / 40
+STEPS_A_PERIOD = 40  # that show a vibration well
 
 
 @dataclass(frozen=True)
@@ -44,3 +46,11 @@ def calibrated_stiffness(
 def edge_stiffness(young_modulus: float | np.ndarray, cell_size: float) -> float | np.ndarray:
     """Return k1 [N/m] of an edge inside a body of E [Pa], cells of h [m]."""
     return 4 / 7 * young_modulus * cell_size
+
+
+def bending_period(length: float, thick: float, young_modulus: float, density: float) -> float:
+    """Return the period [s] of a bar clamped at one end, which bends to and fro: of its motions the slowest.
+
+    length, thick : of the bar, and across it where it bends [m]
+    """
+    return 2 * math.pi * length**2 / (3.516 * thick) * math.sqrt(12 * density / young_modulus)

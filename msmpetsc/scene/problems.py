@@ -38,6 +38,9 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
+POISSON = "Poisson's ratio is 1/4, for the springs' forces are central"
+NO_KEYS = {name: POISSON for name in ("poisson_ratio", "poissons_ratio", "poisson", "nu")}
+EXAMPLES = {"gravity": "acceleration = [0, 0, -9.81]"}  # of tables that are taken for numbers
 
 
 def rule(words: str, *others: str) -> PydanticCustomError:
@@ -95,7 +98,9 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
     for e in problems[:MOST_REPORTED]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
         number = _line(e["loc"], prefixes)
-        where = f" (--set {as_given(culprit)})" if culprit else f" (line {number})" if number else ""
+        where = (
+            f" (--set {as_given(culprit)}{_in_place(e, culprit)})" if culprit else f" (line {number})" if number else ""
+        )
         lines.append(": ".join(filter(None, [str(path), _key(e["loc"]), f"{_words(e)}{where}"])))
     more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
@@ -126,6 +131,10 @@ def _key(loc: KeyPath) -> str:
 
 def _words(e: ErrorDetails) -> str:
     kind, context = e["type"], e.get("ctx", {})
+    if kind == "extra_forbidden" and e["loc"][-1] in NO_KEYS:
+        return f"unknown key: {NO_KEYS[e['loc'][-1]]}"
+    if kind == "model_type" and e["loc"][-1:] and e["loc"][-1] in EXAMPLES:
+        return f"must be a table, {{ {EXAMPLES[e['loc'][-1]]} }}, got {_got(e['input'])}"
     if kind == "extra_forbidden":
         return f"unknown key, {_suggestion(e['loc'][-1], context['valid'])}"
     if kind == "unknown_name":
@@ -135,6 +144,14 @@ def _words(e: ErrorDetails) -> str:
         return f"unknown value {_got(e['input'])}, {_suggestion(e['input'], valid)}"
     figures = {name: f"{x:g}" if isinstance(x, float) else x for name, x in context.items()}
     return WORDS.get(kind, "is not valid, got {got}").format(got=_got(e["input"]), **figures)
+
+
+def _in_place(e: ErrorDetails, override: str) -> str:
+    """Return how an override takes the place of the key that excludes it: nothing else removes a key of a file."""
+    *table, key = override.partition("=")[0].split(".")
+    if e["type"] != "one_of" or tuple(table) != e["loc"] or not table:
+        return ""
+    return f"; in place of all keys there: --set '{'.'.join(table)}={{{key}={override.partition('=')[2]}}}'"
 
 
 def _nearest(word: Any, valid: list[str]) -> str | None:

@@ -17,6 +17,7 @@ from msmpetsc.scene.toml import DEEPEST, plain, toml_of
 from msmpetsc.scene.units import with_numbers
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
+MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
 
 
@@ -33,6 +34,8 @@ def load_scene(
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
+    if path.name.lower().removesuffix(".gz").endswith(MESHES) and path.is_file():
+        raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
     return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
 
 

@@ -181,6 +181,15 @@ class Scene(SceneFile):
         """Return this scene with changes, checked as a whole. Raises InputError."""
         return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
 
+    def __repr__(self) -> str:
+        """Return one line: title, meshes, cells, integrator and steps; ``text`` has all of it."""
+        meshes = ", ".join(mesh.source for mesh in self.meshes.values())
+        cages, time = self.cages, self.time
+        cells = f"{cages.count} cells" if cages.cell_size is None else f"cells of {cages.cell_size:g} m"
+        return f"Scene({self.title!r}: {cells} of {meshes}, {time.integrator}, {time.steps} steps)"
+
+    __str__ = __repr__
+
     def _repr_html_(self) -> str:
         """Return the scene as a notebook shows it: its title over its text."""
         title = f"<b>{escape(self.title)}</b>" if self.title else ""

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.problems import problem_lines, rule
-from msmpetsc.scene.reading import read_toml
+from msmpetsc.scene.reading import OF_STUDIES, read_toml
 from msmpetsc.scene.values import Count, FileName, Integrator, ListOf, Positive, Preset, Table
 from msmpetsc.solve.petsc.words import unsafe_word
 
@@ -275,6 +275,8 @@ def load_study(path: Path, presets: Collection[str] | None = None) -> Study:
     Raises InputError naming every problem, one a line.
     """
     text, data = read_toml(path, "study")
+    if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
+        raise InputError(f"{path}: is a scene, no study: msmpetsc run {path}")
     try:
         return Study.model_validate(data, context={"presets": presets})
     except ValidationError as error:

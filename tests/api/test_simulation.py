@@ -171,6 +171,17 @@ def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
         assert np.array_equal([frame.position for frame in seen], result.frames.position[:])
 
 
+def test_scenes_frames_and_simulations_print_one_line(scene: Path):
+    simulation = msm.Simulation(scene)
+    before = repr(simulation)
+    last = list(simulation.frames(2))[-1]
+    for shown in (repr(simulation.scene), str(simulation.scene), before, repr(simulation), repr(last)):
+        assert "\n" not in shown and len(shown) < 200, shown
+    assert "cells of 0.125 m of scene.ply, implicit-euler" in repr(simulation.scene)
+    assert before != repr(simulation) and "step 2, t = " in repr(simulation)
+    assert repr(last).startswith("Frame(2: t = ") and str(last.position.shape) in repr(last)
+
+
 def test_the_notebook_shows_text_and_no_markup_of_the_scenes(scene: Path, tmp_path: Path):
     shown = msm.Scene.load(scene, {"title": "<script>"})._repr_html_()
     assert "<b>&lt;script&gt;</b>" in shown and "density = 1000" in shown and "<script>" not in shown

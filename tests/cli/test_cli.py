@@ -131,6 +131,8 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert "type: pipecg" in done.stdout and "type: cg\n" not in done.stdout
     assert done.stdout.count("PETSc Performance Summary") == 1
+    stages = [line.split(": ")[1] for line in done.stdout.splitlines() if line.startswith("--- Event Stage")]
+    assert {"Main Stage", "set-up", "steps", "output"} == set(stages)
 
 
 @pytest.mark.parametrize(

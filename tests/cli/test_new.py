@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -127,6 +128,21 @@ def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, caps
         assert fallen * 0.5 < moved < size, "it falls on the ground, or its end sinks"
 
 
+def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    box = trimesh.creation.box([0.1, 0.1, 0.1])
+    box.invert()
+    trimesh.util.concatenate([box, box.copy().apply_translation([0.3, 0, 0])]).export("two.ply")
+    assert main(["new", "two.toml", "--mesh", "two.ply"]) == 0
+    told = capsys.readouterr().err
+    assert "two.ply: 24 triangles, closed, 2 parts, the largest of 50% of the area" in told
+    assert "warning: two.ply: the faces are wound inwards" in told
+    hole = trimesh.Trimesh(box.vertices, box.faces[2:], process=False)
+    hole.export("open.ply")
+    assert main(["new", "open.toml", "--mesh", "open.ply"]) == 0
+    assert "warning: open.ply: the mesh is open (4 boundary edges)" in capsys.readouterr().err
+
+
 def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Path, monkeypatch, capsys):
     (tmp_path / "there").mkdir()
     monkeypatch.chdir(tmp_path / "there")
@@ -159,16 +175,26 @@ def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
     assert (tmp_path / "my.toml").read_text() == f"#:schema {SCHEMA_FILE}\n{shipped}"
 
 
-def test_the_wheel_holds_the_scenes_though_the_clone_has_them_once(tmp_path: Path):
-    assert (ROOT / "msmpetsc" / "shipped").is_symlink()
-    tree = tmp_path / "tree"
+def packed(folder: Path, kind: str) -> set[str]:
+    """The files of a wheel or a source archive of this clone, built in a folder."""
+    tree = folder / "tree"
     shutil.copytree(ROOT, tree, symlinks=True, ignore=lambda folder, names: [
         name for name in names if name.startswith(".") or name in ("out", "tests", "build", "__pycache__")
         or name.endswith((".egg-info", ".png"))
     ])  # fmt: skip
-    build = "from setuptools import build_meta; build_meta.build_wheel('..')"
+    build = f"from setuptools import build_meta; build_meta.build_{kind}('..')"
     done = subprocess.run([sys.executable, "-c", build], cwd=tree, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
-    for path in (ROOT / "scenes").glob("*.toml"):
-        assert f"msmpetsc/shipped/{path.name}" in names
+    if kind == "wheel":
+        return set(zipfile.ZipFile(next(folder.glob("*.whl"))).namelist())
+    return {name.partition("/")[2] for name in tarfile.open(next(folder.glob("*.tar.gz"))).getnames()}
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_what_is_passed_on_holds_scenes_studies_changes_and_citation(kind: str, tmp_path: Path):
+    assert (ROOT / "msmpetsc" / "shipped").is_symlink(), "the clone has them once"
+    names, scenes = packed(tmp_path, kind), ROOT / "scenes"
+    shipped = [path for path in scenes.rglob("*") if path.suffix in (".toml", ".obj", ".md")]
+    assert {scenes / "bunny_fall.toml", scenes / "studies" / "hard" / "plate.obj"} < set(shipped)
+    assert {f"msmpetsc/shipped/{path.relative_to(scenes)}" for path in shipped} <= names
+    assert all(any(name.endswith(own) for name in names) for own in ("CHANGELOG.md", "CITATION.cff", "LICENSE"))

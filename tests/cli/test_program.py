@@ -16,6 +16,8 @@ from msmpetsc.cli.arguments import COMMANDS, command_parser, option_names, parse
 from msmpetsc.cli.commands import doctor
 from msmpetsc.cli.main import main
 from msmpetsc.cli.options.examples import EXAMPLES
+from msmpetsc.geometry import readers
+from msmpetsc.scene.reading import MESHES
 
 ONCE = {"step": 0.01, "duration": 0.01}
 
@@ -54,6 +56,32 @@ def test_a_study_given_to_run_is_named_as_one(tmp_path: Path, capsys):
     assert main(["run", str(study)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f"{study}: is a study, no scene: msmpetsc study {study}")
+
+
+def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(tmp_path: Path, capsys):
+    scene, mesh = block_scene(tmp_path), tmp_path / "scene.ply"
+    remedies = {
+        ("run", mesh): f"is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}",
+        ("inspect", mesh): "is a mesh, no scene",
+        ("study", scene): f"is a scene, no study: msmpetsc run {scene}",
+    }
+    for (command, path), remedy in remedies.items():
+        assert main([command, str(path)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{path}: {remedy}" in line
+
+
+def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, capsys):
+    """Bending of a bar of the sides 0.5 and 0.25 m, E = 1e5 Pa: 6.19 L^2 / (d c), c = 10 m/s, is 0.62 s."""
+    for step, integrator, said in ((0.7, "bdf2", 1), (0.5, "bdf2", 0), (0.7, "verlet", 0)):
+        time = {"step": step, "duration": step, "integrator": integrator}
+        scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})
+        assert main(["run", str(scene), "-o", str(tmp_path / "x.h5"), "--overwrite"]) == 0
+        assert capsys.readouterr().err.count("warning: time.step is 1.1 periods of the slowest vibration") == said
+
+
+def test_the_formats_of_meshes_are_those_that_are_read():
+    assert set(MESHES) == {f".{kind}" for kind in readers._READERS}
 
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
@@ -116,6 +144,28 @@ def test_doctor_names_what_is_missing_and_does_not_crash():
     assert lines["PETSc"].startswith("missing") and "apt install python3-petsc4py" in lines["PETSc"]
     assert lines["MPI"].startswith("missing") and lines["HDF5"].startswith("missing")
     assert "pip install 'msmpetsc[render]'" in lines["extra render"]
+
+
+def test_doctor_tells_what_is_missing_from_what_is_broken(tmp_path: Path):
+    hook = """
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("petsc4py", "numba"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Missing())
+"""
+    (tmp_path / "sitecustomize.py").write_text(hook)  # of the processes that it starts, too
+    (tmp_path / "tqdm.py").write_text('raise ImportError("libold.so: cannot open shared object file")')
+    environment = ENVIRONMENT | {"PYTHONPATH": f"{tmp_path}:{ENVIRONMENT['PYTHONPATH']}"}
+    done = subprocess.run(
+        [sys.executable, "-m", "msmpetsc", "doctor"], env=environment, capture_output=True, text=True, timeout=100
+    )
+    lines = {line[9:26].strip(): line for line in done.stdout.splitlines()}
+    for name in ("PETSc", "solvers", "device", "kernels"):
+        assert lines[name].startswith("missing") and "msmpetsc[run]" in lines[name], lines[name]
+    assert lines["extra render"].startswith("BROKEN") and "tqdm: libold.so" in lines["extra render"]
+    assert lines["extra mesh"].startswith("ok") and done.returncode == 1
 
 
 def test_a_probe_that_dies_is_one_line(monkeypatch):

@@ -24,9 +24,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
-from msmpetsc.geometry.prepare import compact, prepare
+from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.surface import Surface, compact, examine
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))

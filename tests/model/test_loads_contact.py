@@ -10,13 +10,13 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.reflection import Exchange, Step
 from msmpetsc.model.contact.solids import Faces
 from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import Load, Motion, spread_by_mass
-from msmpetsc.model.region import inside
 from msmpetsc.scene.body import Region
 
 WORKER = WORKERS / "cages_worker.py"

@@ -187,6 +187,11 @@ MISTAKES = [
     ),
     ("density = 1000", "", "material.density: required, but missing (line 12)"),
     ("density = 1000", "density = true", "material.density: must be a number, got true (line 14)"),
+    (
+        "density = 1000",
+        "density = 1000\npoisson_ratio = 0.3",
+        "material.poisson_ratio: unknown key: Poisson's ratio is 1/4, for the springs' forces are central (line 15)",
+    ),
     ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
     ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),
     ("step = 0.0166667", "step = 1e300", "time.step: must be < 1e+60, got 1e+300 (line 17)"),
@@ -373,12 +378,16 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
     ("override", "expected"),
     [
         ("cages.count=-3", "scene.toml: cages.count: must be > 0, got -3 (--set cages.count=-3)"),
+        (
+            "gravity=-9.81",
+            "scene.toml: gravity: must be a table, { acceleration = [0, 0, -9.81] }, got -9.81 (--set gravity=-9.81)",
+        ),
         ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'? (--set cages.cout=3)"),
         ("pin.0=3", "scene.toml: pin.0: must be a table, got 3 (--set pin.0=3)"),
         (
             "cages.cell_size=1",
             "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size "
-            "(--set cages.cell_size=1)",
+            "(--set cages.cell_size=1; in place of all keys there: --set 'cages={cell_size=1}')",
         ),
         ("time.step=5", "scene.toml: time.duration: must hold at least one step of 5 s, got 2.0 (--set time.step=5)"),
         ("solver.error=1e-3x", 'scene.toml: solver.error: must be a number, got "1e-3x" (--set solver.error=1e-3x)'),

@@ -367,3 +367,11 @@ def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: 
     given = ("--preset", "anderson", "--frames", "1", "-options_file", tmp_path / "options")
     done = run(1, *COMMAND, scene, "-o", tmp_path / "o.h5", *given, timeout=60)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("option", "wanted"), [("ksp_type=pipcg", "pipecg"), ("pc_type=jacoby", "jacobi")])
+def test_a_misspelt_type_of_solver_is_named_with_the_nearest(option: str, wanted: str, tmp_path: Path, capsys):
+    name, value = option.split("=")
+    words = ["run", str(block_scene(tmp_path, **SCENE)), "-o", str(tmp_path / "o.h5"), f"-{name}", value]
+    assert main(words) == 2
+    assert f"{value}, did you mean {wanted!r}?" in capsys.readouterr().err

@@ -3,8 +3,9 @@
 import argparse
 from typing import Any
 
-from msmpetsc.cli.arguments import command_parser, on_first_rank
+from msmpetsc.cli.arguments import command_parser
 from msmpetsc.cli.options.values import file_argument, path_argument
+from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError
 
 
@@ -18,7 +19,7 @@ def run(args: argparse.Namespace) -> int:
     for action in parser._actions:
         for command in (action.choices or {}).values() if isinstance(action.choices, dict) else ():
             complete_files(command, shtab.FILE)
-    if on_first_rank():
+    if world().rank == 0:
         print(shtab.complete(parser, args.shell))
     return 0
 

@@ -1,4 +1,4 @@
-"""``msmpetsc doctor``: what is installed, and the command that brings what is not.
+"""``msmpetsc doctor``: what is installed, what is missing and the command that brings it, and what is broken.
 
 What could end the process, libraries that do not fit together above all, is loaded in one of its own.
 """
@@ -6,6 +6,7 @@ What could end the process, libraries that do not fit together above all, is loa
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import msmpetsc
-from msmpetsc.cli.arguments import on_first_rank
+from msmpetsc.cli.ranks import world
 from msmpetsc.cli.versions import PYTHON
-from msmpetsc.errors import EXTRAS, one_line
+from msmpetsc.errors import EXTRAS, extra_of, one_line
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
 PATIENCE = 60  # [s] that a library may take to load
@@ -45,6 +46,16 @@ MESHES = """
 from msmpetsc.geometry.registry import MODELS, find
 print(*(name for name in MODELS if find(name)))
 """
+IMPORTS = """
+import importlib, json
+reasons = {{}}
+for name in {names}:
+    try:
+        importlib.import_module(name)
+    except Exception as error:
+        reasons[name] = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+print(json.dumps(reasons))
+"""
 NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
 
 Finding = tuple[str, str, str]  # what, its state, and in words
@@ -54,9 +65,13 @@ class Failed(Exception):
     """A probe that did not end well; the line says how."""
 
 
+class Lacking(Exception):
+    """A probe that needs a package which is not installed; the line says which extra brings it."""
+
+
 def run(_: argparse.Namespace) -> int:
     """Print a line for each thing; return 1 where a run lacks something that it needs."""
-    if not on_first_rank():
+    if world().rank != 0:
         return 0
     needed = (petsc, ranks, results, packages)
     states = set()
@@ -74,6 +89,8 @@ def examined(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """Yield the findings of an examination, whatever happens in it."""
     try:
         yield from examine()
+    except Lacking as error:
+        yield examine.__name__, MISSING, str(error)
     except Failed as error:
         yield examine.__name__, BROKEN, str(error)
     except Exception as error:  # whatever is broken in an installation: it must be named, not end this
@@ -89,7 +106,7 @@ def installed(package: str) -> bool:
 
 
 def said(code: str, *launcher: str) -> str:
-    """Return what a Python of its own prints. Raises Failed."""
+    """Return what a Python of its own prints. Raises Failed, and Lacking where a package is not there."""
     command = [*launcher, sys.executable, "-c", code]
     alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
     try:
@@ -104,7 +121,11 @@ def said(code: str, *launcher: str) -> str:
         raise Failed(f"does not answer within {PATIENCE} s: {' '.join(launcher)}") from None
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if line.strip()]
-        raise Failed(lines[-1][:160] if lines else f"ends with status {done.returncode}")
+        last = lines[-1][:160] if lines else f"ends with status {done.returncode}"
+        gone = re.fullmatch(r"ModuleNotFoundError: No module named '([\w.]+)'", last)
+        if gone and (extra := extra_of(gone[1])) and not installed(gone[1].partition(".")[0]):
+            raise Lacking(f"{gone[1]}: pip install 'msmpetsc[{extra}]'")
+        raise Failed(last)
     return done.stdout
 
 
@@ -184,11 +205,15 @@ def kernels() -> Iterator[Finding]:
 
 
 def packages() -> Iterator[Finding]:
-    """The packages of each extra."""
+    """The packages of each extra: missing, or there but broken, so that they cannot be imported."""
     yield "msmpetsc", OK, f"{msmpetsc.__version__} in {Path(msmpetsc.__file__).parent}, {PYTHON}"
+    found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
+    reasons = json.loads(said(IMPORTS.format(names=found)).splitlines()[-1])
     for extra, names in EXTRAS.items():
         gone = [name for name in names if not installed(name)]
-        if gone and not (extra in NO_INSTALL and len(gone) == len(names)):
+        if broken := [f"{name}: {reasons[name]}" for name in names if name in reasons]:
+            yield f"extra {extra}", BROKEN, "; ".join(broken)
+        elif gone and not (extra in NO_INSTALL and len(gone) == len(names)):
             yield f"extra {extra}", MISSING, f"{', '.join(gone)}: pip install 'msmpetsc[{extra}]'"
         elif not gone:
             yield f"extra {extra}", OK, ", ".join(names)

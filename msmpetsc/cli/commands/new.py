@@ -14,7 +14,7 @@ from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.shipped import shipped_text, shipped_titles
 from msmpetsc.study.drafting.draft import draft, upwards
-from msmpetsc.study.drafting.measures import measured
+from msmpetsc.study.drafting.measures import MeshMeasures, measured
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,10 +46,22 @@ def drafted(mesh: Path, scene: Path) -> str:
     is_named = str(mesh) in MODELS
     source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), Path(mesh.name.removesuffix(".gz")).suffix)
     surface = load(source, scene.parent)
-    check_encloses(surface, examine(surface))
+    warnings = check_encloses(surface, examine(surface))
     measures = measured(surface, suffix)
+    log_findings(mesh, measures, warnings)
     log.info("%s", upwards(measures))
     return draft(source, scene.stem, measures)
+
+
+def log_findings(mesh: Path, measures: MeshMeasures, warnings: list[str]) -> None:
+    """Log what was found of a mesh; what the scene does about it stands in its comments."""
+    count, state = len(measures.parts), "closed" if measures.report.closed else "open"
+    parts = f"{count} parts, the largest of {measures.parts[0]:.0%} of the area" if count > 1 else "1 part"
+    log.info("%s: %d triangles, %s, %s", mesh, measures.triangles, state, parts)
+    for warning in warnings:
+        log.warning("%s: %s", mesh, warning)
+    if warnings or count > 1:
+        log.info("what the scene does about that stands in its comments")
 
 
 def beside(mesh: Path, scene: Path) -> str:

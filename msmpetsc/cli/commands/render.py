@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from mpi4py import MPI
 
 from msmpetsc.cli.arguments import (
     MOVIE_NAMES,
@@ -21,13 +20,12 @@ from msmpetsc.cli.arguments import (
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.build import build_model
 from msmpetsc.output.drawing.colouring import opened_reference
 from msmpetsc.output.drawing.fabric import SHOWN
-from msmpetsc.output.drawing.moments import Frames, frames_of
 from msmpetsc.output.drawing.page import write_page
 from msmpetsc.output.drawing.shots import Style
 from msmpetsc.output.drawing.subject import Subject, subject_of_model, subject_of_result, subject_of_surface
+from msmpetsc.output.frame_choice import Frames, frames_of
 from msmpetsc.output.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
 
@@ -54,10 +52,10 @@ def run(args: argparse.Namespace) -> int:
     for option, endings in ONLY.items():
         if getattr(args, option) and ending not in endings:
             raise InputError(f"--{option} is for {', '.join(f'*{end}' for end in endings)}, not for {path}")
-    style, frames = style_of(args), _frames(args.frames)
+    style = style_of(args)
     if args.subject.suffix.lower() in RESULT_NAMES:
         refuse_deadly(args.subject)
-        _draw_result(args, path, frames, style)
+        _draw_result(args, path, style)
     else:
         _draw_unrun(args, path, style)
     print(path)
@@ -66,9 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 def style_of(args: argparse.Namespace) -> Style:
     """Return how things are to look. Raises InputError."""
-    eye = numbers("--eye", args.eye, float, "1,-2,0.6")
-    if eye is not None and not (len(eye) == 3 and any(eye) and np.isfinite(eye).all()):
-        raise InputError(f"--eye takes three numbers, not all zero, not {args.eye!r}")
+    eye = None if args.eye is None else _direction(args.eye)
     shown = tuple(args.show.split(",")) if args.show else ()
     for name in shown:
         if name not in SHOWN:
@@ -80,17 +76,17 @@ def style_of(args: argparse.Namespace) -> Style:
     return Style(eye, args.colour, _size(args.size), args.axes, args.scale_bar, shown)
 
 
-def _draw_result(args: argparse.Namespace, path: Path, frames: Frames | None, style: Style) -> None:
+def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
         from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK, which a page does not need
 
-        contact_sheet(args.subject, path, frames, args.count, None, style, args.reference)
+        contact_sheet(args.subject, path, args.frames, args.count, None, style, args.reference)
         return
     with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
         subject = subject_of_result(run)
         everything: Frames = [slice(-1, None) if args.turntable else slice(None)]
-        numbers = frames_of(subject.name, frames or everything, len(subject.times))
+        numbers = frames_of(subject.name, args.frames or everything, len(subject.times))
         _draw_motion(args, subject, path, numbers, style, reference)
 
 
@@ -140,6 +136,10 @@ def subject_of_file(path: Path, changes: list[str]) -> tuple[Subject, tuple[str,
             raise InputError(f"--set changes a scene, and {path} is a mesh")
         surface = read_surface(path)
         return subject_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
+    from mpi4py import MPI
+
+    from msmpetsc.model.build import build_model  # compiled kernels, which drawing a result needs not
+
     scene = load_scene(path, changes)
     model = build_model(MPI.COMM_SELF, scene)
     subject = subject_of_model(path, scene, model)
@@ -157,24 +157,6 @@ def _counted(surface: Surface) -> str:
     return f"{len(surface.points)} points, {len(surface.triangles)} triangles"
 
 
-def _frames(text: str | None) -> Frames | None:
-    """Return the numbers and slices of "0,10:250:5". Raises InputError."""
-    if text is None:
-        return None
-    try:
-        return [_slice(part) if ":" in part else int(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"--frames takes numbers like 0,10,20 or slices like 0:250:5, not {text!r}") from None
-
-
-def _slice(text: str) -> slice:
-    """Return the slice of "0:250:5", from start to end without its end, as Python counts."""
-    numbers = [int(word) if word else None for word in text.split(":")]
-    if len(numbers) > 3 or numbers[2:] == [0]:
-        raise ValueError(text)
-    return slice(*numbers)
-
-
 def _size(text: str | None) -> tuple[int, int] | None:
     """Return width and height of "960x720"; of films both must be even."""
     if text is None:
@@ -186,11 +168,12 @@ def _size(text: str | None) -> tuple[int, int] | None:
     return size
 
 
-def numbers(option: str, text: str | None, kind: type, example: str) -> list | None:
-    """Return the numbers of "0,10,20". Raises InputError."""
-    if text is None:
-        return None
+def _direction(text: str) -> tuple[float, ...]:
+    """Return the vector (3,) of "1,-2,0.6". Raises InputError."""
     try:
-        return [kind(part) for part in text.split(",")]
+        vector = tuple(map(float, text.split(",")))
     except ValueError:
-        raise InputError(f"{option} takes numbers like {example}, not {text!r}") from None
+        raise InputError(f"--eye takes numbers like 1,-2,0.6, not {text!r}") from None
+    if not (len(vector) == 3 and any(vector) and np.isfinite(vector).all()):
+        raise InputError(f"--eye takes three numbers, not all zero, not {text!r}")
+    return vector

@@ -3,6 +3,7 @@
 import argparse
 
 from msmpetsc.cli.options.values import Commands, add_json, add_set, file_argument
+from msmpetsc.output.frame_choice import frames_in
 
 
 def add_compare(commands: Commands) -> None:
@@ -38,7 +39,7 @@ def add_render(commands: Commands) -> None:
         "-o", "--output", metavar="FILE", type=file_argument,
         help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
     )  # fmt: skip
-    parser.add_argument("--frames", metavar="0,10,20", help="these frames; slices like 0:250:5 as Python counts")
+    add_frames(parser, "these frames; slices like 0:250:5 as Python counts")
     parser.add_argument(
         "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"
     )
@@ -46,6 +47,11 @@ def add_render(commands: Commands) -> None:
     add_look(parser)
     add_film(parser)
     add_set(parser)
+
+
+def add_frames(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add ``--frames``, which chooses among those of a result."""
+    parser.add_argument("--frames", metavar="0,10,20", type=frames_in, help=about)
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:
@@ -89,5 +95,5 @@ def add_export(commands: Commands) -> None:
     parser.add_argument("result", metavar="OUT.h5", type=file_argument)
     parser.add_argument("-o", "--output", metavar="FILE", type=file_argument, required=True, help="what to write")
     parser.add_argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold")
-    parser.add_argument("--frames", metavar="0,10,20", help="these frames; default: all, or the last (-1) of one")
+    add_frames(parser, "these frames, or slices like 0:250:5; default: all, or the last (-1) of one")
     parser.add_argument("--every", metavar="N", type=int, default=1, help="every N-th of them (1)")

@@ -35,6 +35,7 @@ from msmpetsc.cli.running.resume import Resumed, stored_scene
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model
+from msmpetsc.model.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.model.reach import Reach
 from msmpetsc.output.model import write_model
 from msmpetsc.output.progress import duration
@@ -252,6 +253,7 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     """Build the model and say what it is made of (collective)."""
     model = build_model(comm, plan.scene)
     log_model(comm, model)
+    warn_of_long_steps(plan.scene, model)
     if plan.resumed:
         plan.resumed.refuse_other_lattice(comm, model)
     return model
@@ -322,6 +324,26 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
     )  # fmt: skip
     if named := taken(model.reaches):
         log.info("%s", ", ".join(named))
+
+
+def warn_of_long_steps(scene: Scene, model: Model) -> None:
+    """Warn of steps that are longer than the slowest motion of any body, which implicit steps damp away.
+
+    That is taken to be the bending of a bar of the body's longest and shortest side: of most bodies it is not so slow.
+    """
+    time = scene.time
+    if time.integrator not in ("implicit-euler", "bdf2") or time.error is not None:
+        return
+    moduli = [body.material and body.material.young_modulus for body in scene.body] or [None]
+    softest = min((modulus or scene.material.young_modulus or np.inf) for modulus in moduli)
+    lengths = [body.bounds[1] - body.bounds[0] for body in model.bodies]
+    period = max(bending_period(sides.max(), sides.min(), softest, scene.material.density) for sides in lengths)
+    if time.step > period > 0:
+        log.warning(
+            "time.step is %.2g periods of the slowest vibration, about %.1g s, which it damps away: time.step = %.1g "
+            'shows it, time.integrator = "static" goes to rest at once',
+            time.step / period, period, period / STEPS_A_PERIOD,
+        )  # fmt: skip
 
 
 def log_bodies(comm: MPI.Comm, model: Model) -> None:

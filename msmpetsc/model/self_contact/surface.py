@@ -8,8 +8,8 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.prepare import compact, simplify
-from msmpetsc.geometry.surface import Surface, joined
+from msmpetsc.geometry.prepare import simplify
+from msmpetsc.geometry.surface import Surface, compact, joined
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.barrier import BarrierLaw, crossings
 from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface

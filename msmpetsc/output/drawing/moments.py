@@ -1,27 +1,12 @@
-"""Which frames of a result are drawn: those asked for, those at given times, or those that tell the story."""
+"""Which frames of a result are drawn where none are asked for: those at given times, or those that tell the story."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from msmpetsc.errors import InputError
 from msmpetsc.output.reader import Result
 
 COUNT = 5  # moments, where nothing is said
-Frames = Sequence[int | slice]  # as "--frames 0,10:20,30" names them
-
-
-def frames_of(path: str, frames: Frames, total: int) -> list[int]:
-    """Return the numbers of frames and slices of them, in their order. Raises InputError where there are none."""
-    numbers = range(total)
-    chosen: list[int] = []
-    for part in frames:
-        if isinstance(part, int) and not 0 <= part < total:
-            raise InputError(f"{path} has frames 0 to {total - 1}, not {part}")
-        chosen += numbers[part] if isinstance(part, slice) else [part]
-    if not chosen:
-        raise InputError(f"{path} has frames 0 to {total - 1}, of which --frames names none")
-    return chosen
 
 
 def moments_at(run: Result, times: Sequence[float]) -> dict[int, str]:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, bounds_of
 from msmpetsc.model.loads import LoadTable, Motion, within
-from msmpetsc.model.region import inside_bodies
 from msmpetsc.output.drawing.camera import Camera, unit
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.schema import SceneFile

@@ -18,12 +18,13 @@ from msmpetsc.output.drawing.colouring import colouring_of, opened_reference, pl
 from msmpetsc.output.drawing.fabric import cut_open
 from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
 from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
-from msmpetsc.output.drawing.moments import COUNT, Frames, choose_moments, frames_of, moments_at
+from msmpetsc.output.drawing.moments import COUNT, choose_moments, moments_at
 from msmpetsc.output.drawing.overlays import MARGIN
 from msmpetsc.output.drawing.shots import Style
 from msmpetsc.output.drawing.skin import drawn
 from msmpetsc.output.drawing.stage import Panel, Stage
 from msmpetsc.output.drawing.subject import FARTHEST, Subject, subject_of_result
+from msmpetsc.output.frame_choice import Frames, frames_of
 from msmpetsc.output.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.prepare import compact
-from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.output.drawing.overlays import Overlays, Rest, SurfaceAtRest, fixed_nodes, overlays_at
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.bodies import OF_REGIONS

@@ -1,6 +1,6 @@
 """The formats that a result is exported to, in one table, and the export itself."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.output.disk import whole_file
 from msmpetsc.output.export.moments import Mesh, Moments
+from msmpetsc.output.frame_choice import Frames, frames_of
 from msmpetsc.output.reader import Result
 
 EXPORT = "msmpetsc.output.export."
@@ -50,12 +51,12 @@ FORMATS = {
 
 
 def export(
-    result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Sequence[int] | None = None, every: int = 1
+    result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None, every: int = 1
 ) -> Path:
     """Write frames of a result in the format that the path's ending names, and return the path.
 
     mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
-    frames : their numbers, -1 the last; all if None, or the last where the format holds one
+    frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
     every  : of the frames chosen take every so many
 
     Raises InputError.
@@ -82,17 +83,14 @@ def _mesh(run: Result, path: Path, chosen: Format, mesh: Mesh | None) -> Mesh:
     return mesh
 
 
-def _frames(run: Result, path: Path, chosen: Format, frames: Sequence[int] | None, every: int) -> list[int]:
+def _frames(run: Result, path: Path, chosen: Format, frames: Frames | None, every: int) -> list[int]:
     """Return the numbers of the frames meant. Raises InputError for frames that the result does not have."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")
     if frames is None:
-        frames = range(count) if chosen.moves else (-1,)
-    wrong = [frame for frame in frames if not -count <= frame < count]
-    if wrong or not len(frames):
-        raise InputError(f"{run.path} has frames 0 to {count - 1}, and no {wrong[0] if wrong else 'other'}")
-    numbers = [int(frame) % count for frame in frames][::every]
+        frames = [slice(None) if chosen.moves else -1]
+    numbers = frames_of(str(run.path), frames, count)[::every]
     if not chosen.moves and len(numbers) > 1:
         raise InputError(f"{path}: a *{path.suffix} holds one frame, not {len(numbers)}")
     if np.any(np.diff(numbers) <= 0):

@@ -9,7 +9,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.events import REFERENCE
+from msmpetsc.solve.petsc.events import REFERENCE, begun
 from msmpetsc.solve.presets import find_preset
 
 PRESET, ERROR = "newton-multigrid", 1e-10
@@ -20,7 +20,7 @@ class Reference:
     """The solver, its options under PREFIX; not timed with the run."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, time_step: float, touches: bool, static: bool = False):
-        with REFERENCE:
+        with begun(REFERENCE):
             self.stepper = Stepper(
                 comm, lattice, time_step, find_preset(PRESET), ERROR, touches=touches, prefix=PREFIX, static=static
             )
@@ -32,7 +32,7 @@ class Reference:
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
         """
         try:
-            with REFERENCE:
+            with begun(REFERENCE):
                 return self._errors(problem, positions)
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)

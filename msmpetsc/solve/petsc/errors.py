@@ -1,11 +1,12 @@
 """Errors of PETSc about options that it cannot use, as the one line of an InputError."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError, StepFailed, did_you_mean
 
 NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked to make an error of it
 
@@ -40,4 +41,14 @@ def last_words(error: BaseException) -> str:
     """Message of a PETSc error, without the calls it came through."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
-    return said[-1] if said else lines[0]
+    words = said[-1] if said else lines[0]
+    return words + _nearest_type(words)
+
+
+def _nearest_type(words: str) -> str:
+    """Return the nearest type of solver where PETSc has not found one: ", did you mean 'pipecg'?"."""
+    wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
+    if wanted is None:
+        return ""
+    types = getattr(PETSc, wanted[1]).Type
+    return did_you_mean(wanted[2], [name for name in vars(types).values() if isinstance(name, str)])

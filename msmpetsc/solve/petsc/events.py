@@ -11,6 +11,8 @@ from petsc4py import PETSc
 MAIN = 0  # PETSc's own stage: before the set-up, and after the last frame
 SETUP, STEPS, OUTPUT = (PETSc.Log.Stage(name) for name in ("set-up", "steps", "output"))
 REFERENCE = PETSc.Log.Stage("reference")  # steps solved once more, which are no part of the run
+for unused in REFERENCE, PETSc.Log.Stage("PCMPI"):  # PETSc's own of -mpi_linear_solver_server
+    unused.visible = False  # -log_view calls a stage that never begins Unknown
 OF_THE_RUN = (MAIN, SETUP.id, STEPS.id, OUTPUT.id)
 
 GRADIENT = PETSc.Log.Event("msmpetsc gradient")
@@ -31,7 +33,8 @@ count_flops = PETSc.Log.logFlops
 
 
 def begun(stage: PETSc.Log.Stage) -> ExitStack:
-    """Begin a stage, which ends when the stack is closed."""
+    """Begin a stage, which ends when the stack is closed, and which -log_view shows from then on."""
+    stage.visible = True
     stack = ExitStack()
     stack.enter_context(stage)
     return stack

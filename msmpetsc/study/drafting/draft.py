@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.model.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.scene.keys import SCHEMA_FILE
 from msmpetsc.study.drafting.measures import MeshMeasures
 
@@ -20,7 +21,7 @@ DROP = 0.2  # of the height, that a body falls
 ACROSS, CELLS = 3, (1000, 8000)  # cells across the mean thickness, within these counts
 SINKING = 100  # rho g H in Young's modulus, of a body that falls
 SAG, CLAMPED = 0.15, 0.05  # of a beam's length: what its end sinks by, what is clamped
-STEPS_A_PERIOD, PERIODS = 40, 3
+PERIODS = 3
 DEBRIS = 0.01  # of the area: all parts but the largest together
 COLUMN = 39  # where comments begin
 MOST_PLAIN = 10_000  # larger numbers have an exponent
@@ -122,7 +123,7 @@ def _clamped(body: Shape, axis: int) -> list[str]:
     """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
     length, thick = float(body.sides[axis]), float(body.sides[2])
     young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight
-    period = 2 * math.pi * length**2 / (3.516 * thick) * math.sqrt(12 * DENSITY / young)
+    period = bending_period(length, thick, young, DENSITY)
     normal = ["0", "0", "0"]
     normal[axis] = "-1"
     point = ["0", "0", "0"]

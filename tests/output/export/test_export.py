@@ -134,7 +134,7 @@ def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tm
 WRONG = {
     "what is exported is named *.glb, *.usd": ("x.abc", {}),
     "a *.glb holds no lattice, but the surface": ("x.glb", {"mesh": "lattice"}),
-    "has frames 0 to 4, and no 5": ("x.glb", {"frames": [0, 5]}),
+    "has frames 0 to 4, not 5": ("x.glb", {"frames": [0, 5]}),
     "a *.obj holds one frame, not 2": ("x.obj", {"frames": [0, 1]}),
     "must follow each other in time": ("x.glb", {"frames": [3, 1]}),
 }
@@ -164,7 +164,14 @@ def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.C
     assert main(["export", str(result), "-o", str(path)]) == 0
     assert capsys.readouterr().out == f"{path}\n" and path.is_file()
     assert main(["export", str(result), "-o", str(path), "--frames", "9"]) == 2
-    assert "no 9" in capsys.readouterr().err
+    assert "not 9" in capsys.readouterr().err
+
+
+def test_slices_choose_frames_as_for_render(result: Path, tmp_path: Path):
+    for name, frames in (("slice.glb", "0:5:2"), ("list.glb", "0,2,-1")):
+        assert main(["export", str(result), "-o", str(tmp_path / name), "--frames", frames]) == 0
+    whole = export(result, tmp_path / "whole.glb", frames=[0, 2, 4])
+    assert (tmp_path / "slice.glb").read_bytes() == whole.read_bytes() == (tmp_path / "list.glb").read_bytes()
 
 
 LIMITED = """

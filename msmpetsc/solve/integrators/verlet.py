@@ -115,7 +115,8 @@ class Verlet:
         has_begun = self.anchors is not None  # it has taken a step
         squared, known = (self.highest.squared, state.q is self.known) if has_begun else (-1.0, False)
         mode = self.highest.mode.values[: self.lattice.owned]
-        checkpoint.keep({"mode": mode}, {"squared": squared, "known": known, "substep": self.substep, "halvings": self.halvings, "springs_gained": self.gained})
+        numbers = {"squared": squared, "known": known, "substep": self.substep}
+        checkpoint.keep({"mode": mode}, {**numbers, "halvings": self.halvings, "springs_gained": self.gained})
 
     def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
         squared = checkpoint.number("squared", -1.0, -1.0, sys.float_info.max)

@@ -1,7 +1,7 @@
 """Tables of what moves the body: time, its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -95,7 +95,7 @@ class Start(Table):
     scale: Vector = Field(
         (1.0, 1.0, 1.0),
         description="factors along the axes, about the middle of the rest bounding box: "
-        "0 collapses, a negative one mirrors [-]",
+        "0 flattens, a negative one mirrors [-]",
     )
     twist: Twist | None = Field(None, description="a turn that grows along an axis")
     scatter: float = Field(
@@ -103,6 +103,12 @@ class Start(Table):
     )
     velocity: Vector = Field((0.0, 0.0, 0.0), description="[m/s]")
     spin: Vector = Field((0.0, 0.0, 0.0), description="angular velocity about the centre of mass [rad/s]")
+
+    @model_validator(mode="after")
+    def _is_no_point(self) -> Self:
+        if not any(self.scale) and not self.scatter:
+            raise rule("scales the body to a point, where springs have no direction; give 0.01 or scatter")
+        return self
 
 
 class Gravity(Table):

@@ -217,13 +217,6 @@ def test_a_column_bows_aside(name: str):
 # ---- what springs cannot see
 
 
-def test_a_point_swells():
-    """Zero lengths have no direction, in step with all the others: nothing pulls, but any way leads down."""
-    played = play("point")
-    assert played.last.elastic < 0.05 * played.frames[0].elastic
-    assert max(frame.step_error for frame in played.frames) < 1e-2  # the first comes down to rounding before 1e-3
-
-
 def test_a_flat_body_leaves_its_plane():
     """No spring pulls out of it, but in it a step is at a saddle."""
     played = play("flat")
@@ -344,12 +337,13 @@ def test_verlet_keeps_the_energy_of_what_swings():
     assert np.abs(energies - energies[0]).max() < 0.01 * max(frame.elastic for frame in played.frames)
 
 
-def test_verlet_gains_energy_where_cells_fold_over_each_other_unless_its_substeps_are_short():
+def test_verlet_halves_its_substeps_where_cells_fold_over_each_other():
     """A spring that is nearly of no length turns about within a substep: the limit of stability, which is that of small
-    swings, does not know of it. Substeps of a fifth of the limit keep the energy within a part in a hundred."""
-    alone, short = (play("stretched", *OTHERS["verlet"], *more) for more in ([], ["time.substep=1e-3"]))
-    assert "from nowhere" in alone.words and len(alone.frames) < len(short.frames)
-    assert not short.words and short.energy(short.last) == pytest.approx(short.frames[0].elastic, rel=0.02)
+    swings, does not know of it."""
+    played = play("stretched", *OTHERS["verlet"])
+    energies = np.array([played.energy(frame) for frame in played.frames])
+    assert not played.words and np.ptp(energies) < 0.05 * energies[0] and energies.max() < 1.02 * energies[0]
+    assert played.frames[5].iterations > 1.5 * played.frames[1].iterations  # as many as needed there, not everywhere
 
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):

@@ -6,6 +6,13 @@ Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact 
 
 The two half kicks at one time are one, but for a step's first and last: so v is of the same time as q wherever a
 frame may be stored. It is stable while dt < 2 / omega, omega^2 the greatest eigenvalue of M^(-1) (Hessian of E).
+
+That limit is of small swings. Where cells fold over each other springs turn about within a substep, and the body heats
+up below it. What all substeps of a step then gain is the error of the trapezoidal rule for the springs' work,
+
+    E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
+
+which is none for a quadratic E. A step that gains too much is taken again, in twice as many substeps.
 """
 
 import sys
@@ -33,7 +40,12 @@ from msmpetsc.solve.options import refuse_unused
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step
+GAIN = 2e-3  # of a body's kinetic and elastic energy, from nowhere in a step: worth half the substep
+CREDIT = 0.1  # of it, that springs may lose and gain again
+EASED = 1 / 32  # of that: twice the substep, which gains from 4 to 16 times as much, will do again
+HALVINGS = 5  # of substeps, for what they gain
 MOST_SUBSTEPS = 1e6  # of a step
+ROUNDING = 1e-14  # of the energy below, that a step may gain
 TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
 
 
@@ -63,9 +75,13 @@ class Verlet:
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.before = np.empty_like(self.q)
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
+        self.elastic = self.gradient[:owned]  # grad E without what obstacles push
         self.sides = environment.no_sides[:, :owned]
         self.damping = model.damping
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
+        self.springs_work = 0.0  # [J] in a step, that the springs of this rank's nodes took in
+        self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
+        self.halvings = 0  # of substeps, for what they gained
         self.end = 0.0  # of the step [s]
         self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
         self.anchors: int | None = None  # how many hold
@@ -99,7 +115,8 @@ class Verlet:
         has_begun = self.anchors is not None  # it has taken a step
         squared, known = (self.highest.squared, state.q is self.known) if has_begun else (-1.0, False)
         mode = self.highest.mode.values[: self.lattice.owned]
-        checkpoint.keep({"mode": mode}, {"squared": squared, "known": known, "substep": self.substep})
+        numbers = {"squared": squared, "known": known, "substep": self.substep}
+        checkpoint.keep({"mode": mode}, {**numbers, "halvings": self.halvings, "springs_gained": self.gained})
 
     def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
         squared = checkpoint.number("squared", -1.0, -1.0, sys.float_info.max)
@@ -110,6 +127,8 @@ class Verlet:
         self.highest.mode.update()
         self.highest.squared = squared
         self.substep = checkpoint.number("substep", self.substep, sys.float_info.min)
+        self.halvings = checkpoint.count("halvings", HALVINGS)
+        self.gained = checkpoint.number("springs_gained", 0.0, -sys.float_info.max, sys.float_info.max)
         if checkpoint.count("known", 1):
             self.known = state.q
             self.position.values[:] = state.q
@@ -119,27 +138,31 @@ class Verlet:
 
     def forget(self) -> None:
         self.known = self.anchors = None
+        self.gained, self.halvings = 0.0, 0
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
 
-        Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body.
+        Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body, folds
+        may heat it.
         """
         start, self.end = time - self.time_step, time
         self.environment.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
         pushed = self._pushed(start, time)
         squared = pushed + (self.highest.squared or self._elastic_squared())
-        for _ in range(1 + RETRIES):
-            count = self._count(squared)
+        for retry in range(1 + RETRIES):
+            count = self._count(squared) * 2**self.halvings
             begun = self._squared_acceleration(start)
             with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
                 self._take(count, start, time)
             energy, dt = self._energy(), self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
-            if dt**2 * after <= 4:
+            is_stable = dt**2 * after <= 4
+            if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
                 return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
-            squared = np.clip(after, 2 * squared, 16 * squared)
+            if not is_stable:
+                squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
         raise StepFailed(
             f"became unstable: elastic energy {energy:.2e} J after substeps of {dt:.2e} s; "
@@ -151,7 +174,7 @@ class Verlet:
         """q, v and grad E of a state."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
-        self.work = 0.0
+        self.work = self.springs_work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
             self._meet(state, start)
@@ -170,11 +193,31 @@ class Verlet:
         duration = 0.5 * (times[1] - start)
         for begin, end in pairwise(times):
             self._kick(begin, duration, begin, end)
+            before = self.q.copy()
             self._drift(begin, end)
+            moved = self.q - before
+            self.springs_work += 0.5 * np.vdot(self.elastic, moved)
             self.work += self.environment.energy_of_new_obstacles(self.q, begin, end, self.sides)
             self._pull(end)
+            self.springs_work += 0.5 * np.vdot(self.elastic, moved)
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
+
+    def _is_to_halve(self, start: np.ndarray, energy: float) -> bool:
+        """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and its substeps are now
+        halved; they are doubled again for the next one where it gained next to nothing (collective)."""
+        own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
+        mass = self.lattice.mass[: self.lattice.owned, None]
+        gain, kinetic = self.comm.allreduce(np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))]))
+        most = energy + kinetic
+        enough, gained = GAIN * most + ROUNDING * self.most, max(self.gained + gain, -CREDIT * most)
+        if min(gain, gained) > enough and self.halvings < HALVINGS:
+            self.halvings += 1
+            return True
+        self.gained = gained
+        if gain < EASED * enough and self.halvings:
+            self.halvings -= 1
+        return False
 
     def _squared_acceleration(self, time: float) -> float:
         """|M^(-1) (f_ext - grad E)|_M^2 of this rank's free nodes [J/s^2]."""
@@ -192,8 +235,10 @@ class Verlet:
         """grad E at q, with what obstacles push."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
+        self.elastic = self.gradient[: self.lattice.owned]
         contact = self.environment.push(time, self.sides)
         if contact:
+            self.elastic = self.elastic.copy()
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:

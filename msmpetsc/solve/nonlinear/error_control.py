@@ -147,7 +147,7 @@ class ErrorControl:
 
     def final_error(self, q: np.ndarray) -> float:
         """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
-        return self.rounding.added_to(self.now.error, self.functional.distance(q))
+        return self.rounding.added_to(self.now.error, self.functional.distance(q), self.now.at_rounding)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store what the next step's judgements depend on."""

@@ -46,9 +46,11 @@ class Rounding:
         """Return |e|_M over |x - y|_M, which is known no better than rounding leaves it."""
         return length / max(distance, self.reach, sys.float_info.min)
 
-    def added_to(self, error: float, away: float) -> float:
+    def added_to(self, error: float, away: float, is_rounding: bool = False) -> float:
         """A relative error of a step that took x ``away`` = |x - y|_M from y, or what rounding makes of it if that is
         more; where nothing moves but by rounding, that is relative to the size of the body.
+
+        is_rounding : F has nothing else left, which then is what made the error
 
         Raises StepFailed where rounding moves the body about as far as its forces do.
         """
@@ -61,6 +63,8 @@ class Rounding:
                 "different ones, or a smaller time.step",
                 "rounding",
             )
-        if not away > moved:
+        if is_rounding and HOPELESS * away < error * away <= NEGLIGIBLE * size:
+            moved = error * away  # a body at rest
+        if not away > moved / HOPELESS:
             return moved / max(size, np.finfo(float).tiny)
         return max(error, moved / away)

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.bodies import (
     OF_REGIONS,
@@ -23,7 +23,7 @@ from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactT
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.problems import KeyPath
 from msmpetsc.scene.self_contact import only_implicit
-from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion
+from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion, one_state
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
 
@@ -98,6 +98,7 @@ class SceneFile(Table):
     budget: Budget | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
+    _of_one_state = model_validator(mode="before")(classmethod(one_state))
     _of_one_kind = field_validator("body", "part")(as_the_material)
     _is_damped_in_motion = field_validator("time")(no_damping)
     _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import Integrator
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
@@ -110,7 +111,8 @@ class Sizer:
         self.cells, self.report = count, report
         self.step = self.as_given.time.step
         steps = min(frames, self.as_given.time.steps)
-        self.duration = self.step * max(1, steps // 2 * 2)  # twice the step fits into it, too
+        self.is_static = self.as_given.time.integrator == STATIC
+        self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)  # twice the step fits, too
         self.solved = min(1e-3, target / 10)  # step error of the trials
         self.bounds: list[str] = []
         self.cell_bound = ""  # what is not sure of the cells' error
@@ -139,6 +141,10 @@ class Sizer:
 
     def _steppings(self, cells: int) -> list[Stepping]:
         """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
+        if self.is_static:  # whose states have no such error
+            state = self._run(self._method(STATIC, self.step), cells)
+            self.step_errors = {state.method: 0.0} if state else {}
+            return [Stepping(method, 0.0, state.cost) for method in self.step_errors if state]
         ladder, sizes = self._explicit(cells)
         if len(ladder) < 2:
             ladder, sizes = self._implicit(cells)

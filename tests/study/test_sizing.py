@@ -11,7 +11,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import ENVIRONMENT, ROOT
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
@@ -28,7 +27,6 @@ from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import SizePlan, Sizer, Tried
-
 
 STATIC = 'integrator = "static"'
 

@@ -1,18 +1,18 @@
 """The error of a discretisation from runs of several sizes: Richardson's extrapolation with the order that is seen.
 
-A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p and C (Roache 1994, the
-grid convergence index). Errors are fields: that of a coarse run is its distance d to a finer one, plus the finer one's
-error, as vectors at an angle,
+A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p and C (Roache 1994,
+the grid convergence index). Errors are fields: that of a coarse run is its distance d to a finer one, plus the finer
+one's error, as vectors at an angle,
 
     e_a^2 = d^2 + e_b^2 + 2 c d e_b,        c its cosine.
 
-With c = 1, which is Roache's, all err to the same side, as time steps do. Lattices of unlike cells err by chance as well,
-each in its own way: distances of three of them tell c.
+With c = 1, which is Roache's, all err to the same side, as time steps do. Lattices of unlike cells err by chance as
+well, each in its own way: distances of three of them tell c.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scipy.optimize import brentq
 
@@ -42,6 +42,12 @@ class ErrorLaw:
     def size(self, error: float) -> float:
         """Return the greatest size of this error."""
         return (error / self.factor) ** (1 / self.order)
+
+    def through(self, *known: tuple[float, float]) -> "ErrorLaw":
+        """Return the law through (size, error) of one run, with this order, or of two, the coarser first."""
+        (a, error), (b, less) = known[0], known[-1]
+        order = math.log(error / less) / math.log(a / b) if a > b and error > less > 0 else self.order
+        return replace(self, factor=error / a**order, order=order)
 
     def measured(self, apart: float, finer: float) -> float:
         """Return the error of a run so far from a finer run of this size."""

@@ -297,10 +297,12 @@ class Sizer:
     def _checked(self, model: Model, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, Model]:
         """Choose, run the choice and measure it, until its error is little less than was asked for.
 
-        Each choice has fewer cells than those that met the error and more than those that did not, for errors go up and
-        down from lattice to lattice. Returns the model with what was learnt, too.
+        Each choice lies between the cells that met the error and those that did not, for errors go up and down from
+        lattice to lattice. Returns the model with what was learnt, too.
         """
-        met: Choice | None = None
+        law, finest, met = model.law, lattices[-1], None
+        fine = [(finest.edge, law.error(finest.edge))] if law.error(finest.edge) < AIM * self.target else []
+        coarse: list[tuple[float, float]] = []  # sizes and errors of what is too coarse, and of what is not
         for _ in range(CHOICES):
             choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
             if choice is None:
@@ -309,16 +311,18 @@ class Sizer:
             if run is None:
                 model = self._without(choice, model, math.ceil(lattices[0].cells))
                 continue
-            measured = self._measured(choice, run, lattices[-1], model)
+            measured = self._measured(choice, run, finest, law)
             error = measured.total / self.target
             if error <= 1:
-                met = replace(choice, cost=run.cost, budget=measured)
-            if ENOUGH <= error <= 1 or (error <= 1 and choice.cells <= model.least):
+                met, fine = replace(choice, cost=run.cost, budget=measured), [(run.edge, measured.cells)]
+                model = replace(model, most=choice.cells - 1)
+            else:
+                coarse = [(run.edge, measured.cells)]
+                model = replace(model, least=choice.cells + 1)
+            if ENOUGH <= error <= 1 or model.least > model.most:
                 break
             self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
-            law = replace(model.law, factor=measured.cells * choice.cells ** (model.law.order / 3))
-            bracket = {"least": choice.cells + 1} if error > 1 else {"most": choice.cells - 1}
-            model = replace(model, law=law, **bracket)
+            model = replace(model, law=law.through(*coarse, *fine))
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
     def _without(self, choice: Choice, model: Model, fewest: int) -> Model:
@@ -335,7 +339,7 @@ class Sizer:
         as_tried = self._as_tried(method)
         return finest if as_tried == finest.method else self._run(as_tried, finest.asked) or finest
 
-    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> Budget:
+    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
         """Return the errors of a run of the choice, that of its cells from its distance to the finest lattice.
 
         Where it is the finer one and they are alike, that is as expected: what they are apart is chance.
@@ -345,8 +349,8 @@ class Sizer:
         finest = self._alike(choice.method, finest)
         apart = _apart(run, finest)
         if run.edge < finest.edge:
-            return replace(choice.budget, cells=model.law.measured_finer(apart, run.edge, finest.edge))
-        return replace(choice.budget, cells=model.law.measured(apart, finest.edge))
+            return replace(choice.budget, cells=law.measured_finer(apart, run.edge, finest.edge))
+        return replace(choice.budget, cells=law.measured(apart, finest.edge))
 
     # What is said
 

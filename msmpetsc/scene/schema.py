@@ -98,7 +98,6 @@ class SceneFile(Table):
     budget: Budget | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
-    _of_one_state = model_validator(mode="before")(classmethod(one_state))
     _of_one_kind = field_validator("body", "part")(as_the_material)
     _is_damped_in_motion = field_validator("time")(no_damping)
     _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)
@@ -107,6 +106,11 @@ class SceneFile(Table):
     _only_presses = field_validator("obstacle")(no_impact)
     _is_given = field_validator("force")(no_functions)
     _meets_itself = field_validator("self_contact")(only_implicit)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_one_state(cls, data: Any) -> Any:
+        return one_state(data)
 
     @property
     def stored(self) -> int:

@@ -11,10 +11,10 @@ STATIC = "static"  # time.integrator
 OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or moves
 
 
-def one_state(cls: Any, data: Any) -> Any:
-    """Give a scene its one state where nothing changes in time, so that no step or duration is wanted.
+def one_state(data: Any) -> Any:
+    """Return a scene's data, unchecked, with its one state where nothing changes in time: it wants no step or duration.
 
-    It is of the data of a scene before they are checked. Of step and duration, either says how long the other is.
+    Of step and duration, either says how long the other is.
     """
     time = data.get("time") if isinstance(data, dict) else None
     if not isinstance(time, dict) or time.get("integrator") != STATIC or any(map(_changes, _loads(data))):

@@ -288,6 +288,14 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
         assert bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.7 * target
 
 
+def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
+    """At 300 cells, as where a foot folds one way or another: no lattice has the error asked for, or little less."""
+    monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: cells**-0.5 if cells > 300 else 2 * cells**-0.5)
+    plan, *_ = sized(tmp_path, monkeypatch, 0.1)
+    assert plan.met and 300 < plan.choice.cells < 330
+    assert plan.choice.budget.total == pytest.approx(plan.choice.cells**-0.5, rel=0.2)
+
+
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
     """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is, and that is said."""
     first, *_ = sized(tmp_path, monkeypatch, 0.1)
@@ -313,10 +321,10 @@ def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: P
 
 def test_lattices_out_of_step_tell_no_order(tmp_path: Path, monkeypatch):
     """Nothing is farther apart than 0.4, however coarse: the two distances are alike, and the usual order is taken."""
-    plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=5.0, most=0.45)
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.2, cell_error=5.0, most=0.45)
     (said,) = plan.bounds
     assert "apart, too far to tell); order 1.5 is taken" in said
-    assert 0.05 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) < 0.15
+    assert 0.14 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.2
 
 
 def test_where_no_order_is_seen_a_finer_lattice_is_asked(tmp_path: Path, monkeypatch):

@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 CELL_ORDERS = (1.0, 2.2)  # what is taken seriously: of a boundary seen by the share of its cells, of linear cells
 STEP_ORDERS = (1.0, 2.2)
 ALIKE = 1.9  # times: sizes nearer than that differ by chance as much as by their order
+CLOSE = 1.01  # times: what parts sizes nearer than that is chance alone
 UNSEEN = 0.05  # a measured order may lie so far below the range before it counts as not seen
 
 
@@ -44,9 +45,9 @@ class ErrorLaw:
         return (error / self.factor) ** (1 / self.order)
 
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
-        """Return the law through (size, error) of one run, with this order, or of two, the coarser first."""
+        """Return the law through (size, error) of a run, with this order, or of two unlike ones, the coarser first."""
         (a, error), (b, less) = known[0], known[-1]
-        order = math.log(error / less) / math.log(a / b) if a > b and error > less > 0 else self.order
+        order = math.log(error / less) / math.log(a / b) if a > CLOSE * b and error > less > 0 else self.order
         return replace(self, factor=error / a**order, order=order)
 
     def measured(self, apart: float, finer: float) -> float:

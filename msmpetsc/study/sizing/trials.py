@@ -35,6 +35,7 @@ USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
 LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
 CHOICES = 6  # that are tried
+NARROW = 1.05  # times the cells: between cells so alike none are tried
 AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
@@ -141,8 +142,11 @@ class Sizer:
         on = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
         model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
-        if not law.seen and model.cheapest(self.target) is None and (finer := self._run(method, self._coarser(-0.5))):
-            lattices = [*lattices[-2:], finer]  # where no order was seen, the finest that are known say most
+        wanted = model.cheapest(AIM * self.target)
+        like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
+        blind = wanted is None and not law.seen
+        if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
+            lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices)
         return replace(plan, bounds=self._bounds(plan, model, lattices), tried=self._tried(model))
@@ -319,7 +323,7 @@ class Sizer:
             else:
                 coarse = [(run.edge, measured.cells)]
                 model = replace(model, least=choice.cells + 1)
-            if ENOUGH <= error <= 1 or model.least > model.most:
+            if ENOUGH <= error <= 1 or model.least > model.most / NARROW:
                 break
             self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
             model = replace(model, law=law.through(*coarse, *fine))

@@ -22,8 +22,9 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench, CaseResult
+from msmpetsc.study.sizing.answer import SizePlan
 from msmpetsc.study.sizing.choice import Choice
-from msmpetsc.study.sizing.trials import SizePlan, Sizer
+from msmpetsc.study.sizing.trials import Sizer
 from msmpetsc.study.table import Row
 
 OUT, ERRORS, LIMIT = ROOT / "out" / "plan_study", (0.1, 0.03, 0.01), 900.0  # [s] a finer run

@@ -24,9 +24,10 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import CaseResult
 from msmpetsc.study.sizing import trials
+from msmpetsc.study.sizing.answer import SizePlan, Tried
 from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, cosine_of, error_law
-from msmpetsc.study.sizing.trials import SizePlan, Sizer, Tried
+from msmpetsc.study.sizing.trials import Sizer
 
 STATIC = 'integrator = "static"'
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from msmpetsc.study.plan import Candidate
     from msmpetsc.study.runner import Bench
     from msmpetsc.study.scene_lines import Tables
-    from msmpetsc.study.sizing.trials import SizePlan, SizeTrial
+    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial
 
 NOTHING_MEETS = 3
 HEAD = f"{'method':34} {'time step [s]':>13} {'step error':>10} {'cost [s/s]':>10} {'error':>9}"

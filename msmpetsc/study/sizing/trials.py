@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
@@ -16,6 +15,7 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried
 from msmpetsc.study.sizing.bounds import inverted_bound, size_bounds, time_bound
 from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
@@ -37,55 +37,6 @@ TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine 
 CHOICES = 6  # that are tried
 NARROW = 1.05  # times the cells: between cells so alike none are tried
 AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
-
-
-@dataclass(frozen=True)
-class SizeTrial:
-    """A run that was made.
-
-    asked, cells : valid cells asked for, and had
-    cost         : computing seconds a simulated second
-    substeps     : of a step, for verlet; else iterations; their mean
-    inverted     : cells that end inside out
-    result       : its file
-    """
-
-    method: Candidate
-    asked: int
-    cells: float
-    cost: float
-    substeps: float
-    inverted: float
-    result: Path
-
-    @property
-    def edge(self) -> float:
-        """Edge of a cell, of a body of one cell."""
-        return self.cells ** (-1 / 3)
-
-
-class Tried(NamedTuple):
-    """A trial as a point over cost and expected error."""
-
-    method: str
-    cells: float
-    cost: float
-    error: float
-
-
-@dataclass
-class SizePlan:
-    """The answer.
-
-    choice : the cheapest that meets the error, or of the smallest error there is
-    met    : whether it is expected to meet the error
-    bounds : what keeps the error from being smaller, or the estimate from being sure, in words
-    """
-
-    choice: Choice
-    met: bool
-    bounds: list[str] = field(default_factory=list)
-    tried: list[Tried] = field(default_factory=list)
 
 
 class Sizer:

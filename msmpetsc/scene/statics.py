@@ -1,13 +1,13 @@
 """Rules of a scene whose integrator is "static": what has no meaning where nothing moves is refused, or not wanted."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationInfo
 
 from msmpetsc.scene.problems import rule
 
-STATIC = "static"  # time.integrator
+STATIC: Final = "static"  # time.integrator
 OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or moves
 
 

@@ -235,7 +235,7 @@ class Sizer:
         far, inverted = len(runs) > 2 and apart[0] > FAR, runs[-1].inverted > 0
         orders = (least, least) if inverted else (USUAL if far else least, greatest)
         across = _apart(runs[0], runs[-1])
-        cosine = cosine_of(*apart, across) if len(runs) > 2 else 0.0
+        cosine = cosine_of(apart[0], apart[1], across) if len(runs) > 2 else 0.0
         law = error_law([each.edge for each in runs], apart, orders, None if far else across, cosine)
         law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:

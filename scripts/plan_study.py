@@ -3,9 +3,10 @@
 
     scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--cells N] [--frames N] [--limit SECONDS]
 
-The finer run has 8 times the cells of the choice (10 times, where a trial of the plan has as many), and explicit
-substeps or a quarter of its step. Where no choice meets the error, the best one is held against a finer run if that
-takes no longer than the limit. Runs stay in out/plan_study, so the same command goes on where it stopped.
+The finer run has 32 times the cells of the choice, or 8 times where that takes longer than the limit (a quarter more,
+where a trial of the plan has as many), and explicit substeps or a quarter of its step. Where no choice meets the error,
+the best one is held against a finer run if that takes no longer than the limit. Runs stay in out/plan_study, so the
+same command goes on where it stopped.
 """
 
 import json
@@ -21,8 +22,9 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench, CaseResult
+from msmpetsc.study.sizing.answer import SizePlan
 from msmpetsc.study.sizing.choice import Choice
-from msmpetsc.study.sizing.trials import SizePlan, Sizer
+from msmpetsc.study.sizing.trials import Sizer
 from msmpetsc.study.table import Row
 
 OUT, ERRORS, LIMIT = ROOT / "out" / "plan_study", (0.1, 0.03, 0.01), 900.0  # [s] a finer run
@@ -30,7 +32,8 @@ HEAD = (
     "scene", "asked", "chosen, cells", "expected: cells + time + step", "true error", "over asked", "s a simulated s",
     "what bounds it",
 )  # fmt: skip
-FINER, STILL_FINER = 8, 10  # times the cells; and where a trial of the plan has as many
+FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1
+MORE = 1.25  # times that, where a trial of the plan has as many
 LIKE = 1.1  # times the cells
 SHORTER = 4  # times, of implicit steps
 
@@ -80,20 +83,20 @@ class LastingBench(Bench):
         return result
 
 
-def finer_cells(sizer: Sizer, choice: Choice) -> int:
-    """Return the cells of the finer run."""
-    cells = FINER * choice.cells
+def finer_cells(sizer: Sizer, choice: Choice, times: int) -> int:
+    """Return the cells of the finer run, about so many times those of the choice."""
+    cells = times * choice.cells
     like = any(1 / LIKE < cells / each.cells < LIKE for each in sizer.trials)
-    return STILL_FINER * choice.cells if like else cells
+    return round(MORE * cells) if like else cells
 
 
-def finer_methods(sizer: Sizer, choice: Choice) -> list[tuple[float, Candidate]]:
-    """Return ways to step the finer run, the cheapest first, each with the seconds that it is expected to take.
+def finer_methods(sizer: Sizer, choice: Choice, cells: int) -> list[tuple[float, Candidate]]:
+    """Return ways to step the finer run of so many cells, the cheapest first, each with the seconds that it may take.
 
     Explicit substeps of the lattice's own length, if a trial of them ended well, and BDF2 in shorter steps.
     """
     known = {each.method.integrator: each for each in sizer.trials if each.method.time_step == sizer.step}
-    cells, method = finer_cells(sizer, choice), choice.method
+    method = choice.method
     ways: list[tuple[float, Candidate]] = []
     if explicit := known.get("verlet"):
         growth = (cells / explicit.cells) ** (4 / 3)
@@ -101,7 +104,7 @@ def finer_methods(sizer: Sizer, choice: Choice) -> list[tuple[float, Candidate]]
     if method.integrator != "verlet":
         step = method.time_step / SHORTER
         shorter = Candidate("bdf2", min(step, sizer.step), "newton", "", min(1e-3, method.step_error or 1e-3))
-        ways.append((choice.cost * FINER * SHORTER * sizer.duration, shorter))
+        ways.append((choice.cost * cells / choice.cells * SHORTER * sizer.duration, shorter))
     return sorted(ways, key=lambda way: way[0])
 
 
@@ -111,8 +114,8 @@ def true_error(sizer: Sizer, choice: Choice, limit: float) -> tuple[float | None
     row = sizer.bench.measure(replace(case, timeout=limit), keep=True).row
     if row["status"] != "ok":
         return None, row, f"the choice: {row['reason']}"
-    why, cells = "no way to run it finer", finer_cells(sizer, choice)
-    for seconds, method in finer_methods(sizer, choice):
+    why, finest = "no way to run it finer", [finer_cells(sizer, choice, times) for times in FINER]
+    for cells, (seconds, method) in ((count, way) for count in finest for way in finer_methods(sizer, choice, count)):
         if seconds > limit:
             why = f"the finer run ({method.integrator}) would take {seconds:.0f} s"
             continue

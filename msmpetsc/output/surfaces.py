@@ -21,6 +21,7 @@ from msmpetsc.output.compare import (
     point_text,
 )
 from msmpetsc.output.reader import Result
+from msmpetsc.scene.statics import STATIC
 
 NEEDED = ("frames/surface", "surface/points", "surface/triangles")
 MEAN = "surface, rms"  # name of the field
@@ -64,6 +65,8 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     pairs = pairs[times[pairs[:, 0]] <= until * (1 + SAME_TIME)]
+    if reference.scene.get("time", {}).get("integrator") == STATIC:
+        pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
     rms, greatest, worst, moved = np.empty(len(pairs)), np.empty(len(pairs)), np.empty(len(pairs), int), 0.0

@@ -18,7 +18,7 @@ from pydantic import (
 
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
-from msmpetsc.scene.statics import no_wait
+from msmpetsc.scene.statics import STATIC, no_wait
 from msmpetsc.scene.values import (
     Direction,
     FunctionName,
@@ -35,11 +35,18 @@ from msmpetsc.scene.values import (
 MOST_STEPS = 10**9
 
 
+def _wanted_in_motion(schema: dict[str, Any]) -> None:
+    """Say in the JSON schema that only statics may do without a step and a duration (``statics.one_state``)."""
+    is_static = {"properties": {"integrator": {"const": STATIC}}, "required": ["integrator"]}
+    schema.update({"if": is_static, "else": {"required": schema.pop("required")}})
+
+
 class Time(Table):
     """Simulated time."""
 
-    step: Positive = Field(description="time step [s]")
-    duration: Positive = Field(description="simulated time [s]")
+    model_config = ConfigDict(json_schema_extra=_wanted_in_motion)
+    step: Positive = Field(description="time step; required but of statics that stay the same if absent [s]")
+    duration: Positive = Field(description="simulated time; required but of statics that stay the same if absent [s]")
     integrator: Integrator = Field(
         "implicit-euler",
         description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.bodies import (
     OF_REGIONS,
@@ -23,7 +23,7 @@ from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactT
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.problems import KeyPath
 from msmpetsc.scene.self_contact import only_implicit
-from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion, only_of_one_step
+from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion, one_state, only_of_one_step
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
 
@@ -107,6 +107,11 @@ class SceneFile(Table):
     _of_one_step = field_validator("obstacle")(only_of_one_step)
     _is_given = field_validator("force")(no_functions)
     _meets_itself = field_validator("self_contact")(only_implicit)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_one_state(cls, data: Any) -> Any:
+        return one_state(data)
 
     @property
     def stored(self) -> int:

@@ -1,12 +1,40 @@
-"""Rules of a scene whose integrator is "static": what has no meaning where nothing moves is refused."""
+"""Rules of a scene whose integrator is "static": what has no meaning where nothing moves is refused, or not wanted."""
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, Final
 
 from pydantic import ValidationInfo
 
 from msmpetsc.scene.problems import rule
 
-STATIC = "static"  # time.integrator
+STATIC: Final = "static"  # time.integrator
+OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or moves
+
+
+def one_state(data: Any) -> Any:
+    """Return a scene's data, unchecked, with its one state where nothing changes in time: it wants no step or duration.
+
+    Of step and duration, either says how long the other is.
+    """
+    time = data.get("time") if isinstance(data, dict) else None
+    if not isinstance(time, dict) or time.get("integrator") != STATIC or any(map(_changes, _loads(data))):
+        return data
+    one = time.get("step", time.get("duration", 1.0))
+    return {**data, "time": {"step": one, "duration": one, **time}}
+
+
+def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield what moves or presses the bodies of a scene, unchecked."""
+    for name in ("anchor", "force", "obstacle", "body"):
+        given = tables.get(name)
+        for table in given if isinstance(given, list | tuple) else ():
+            if isinstance(table, dict):
+                yield from _loads(table) if name == "body" else [table]
+
+
+def _changes(load: dict[str, Any]) -> bool:
+    """Return whether a load may not be the same at all times, as a function of the user's may not."""
+    return isinstance(load.get("total"), dict) or "function" in load or any(name in load for name in OF_TIME)
 
 
 def _is_static(info: ValidationInfo) -> bool:

@@ -169,7 +169,7 @@ class Planner:
         self.scene, self.bench, self.presets, self.ranks, self.report = scene, bench, presets, ranks, report
         self.as_given = load_scene(scene, (), presets)
         if self.as_given.time.integrator == STATIC:
-            raise InputError(f'{scene}: a plan is of a motion, and its integrator is "{STATIC}"')
+            raise InputError(f'{scene}: nothing moves where integrator = "{STATIC}": --surface-error plans its cells')
         self.step = self.as_given.time.step
         self.duration = min(frames * self.step, self.as_given.time.duration)
         self.reference: ReferenceRun | None = None

@@ -9,6 +9,7 @@ import tomlkit
 
 from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.reading import read_toml
+from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import inline, scene_tables
 from msmpetsc.study.plan import Candidate
 
@@ -17,12 +18,13 @@ Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 
 def tables(method: Candidate, more: Tables = MappingProxyType({})) -> Tables:
     """Return what the method says of a scene, and ``more`` tables; None: the key must not stand there."""
-    return {**scene_tables(
-        {
-            "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
-            "error": method.step_error, "max_iterations": None,
-        }
-    ), **more}  # fmt: skip
+    values = {
+        "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
+        "error": method.step_error, "max_iterations": None,
+    }  # fmt: skip
+    if method.integrator == STATIC:
+        del values["time_step"]  # which spaces states, and need not stand there
+    return {**scene_tables(values), **more}
 
 
 def lines(method: Candidate, more: Tables = MappingProxyType({})) -> str:

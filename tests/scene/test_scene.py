@@ -482,3 +482,38 @@ def _inline(value) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_inline, value)) + "]"
     return tomli_w.dumps({"a": value})[4:-1]
+
+
+STATE = """
+mesh = { source = "bunny_scan" }
+cages = { count = 100 }
+material = { young_modulus = 1e5, density = 1000 }
+gravity = { acceleration = [0, 0, -9.81] }
+time = { integrator = "static" }
+pin = [{ region = { box = [[0, 0, 0], [1, 1, 1]] } }]
+force = [{ region = { box = [[0, 0, 0], [1, 1, 1]] }, total = [1, 0, 0] }]
+"""
+
+
+def test_statics_that_stay_the_same_want_no_step_and_no_duration(tmp_path):
+    time = load(tmp_path, STATE).time
+    assert (time.steps, time.step, time.duration) == (1, 1.0, 1.0)
+    again = load(tmp_path, STATE, "time.step=0.5").time
+    assert (again.step, again.duration) == (0.5, 0.5) and load(tmp_path, STATE, "time.duration=2").time.steps == 1
+    assert load(tmp_path, STATE, "time.step=0.5", "time.duration=2").time.steps == 4
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "time.integrator=verlet",
+        "force.0.start=1.0",
+        "force.0.total={times = [0, 1], values = [[0, 0, 0], [1, 0, 0]]}",
+        "anchor=[{region = {box = [[0, 0, 0], [1, 1, 1]]}, path = [{time = 1, by = [0, 0, 1]}]}]",
+        'obstacle=[{shape = "sphere", center = [0, 0, 0], radius = 1, response = "penalty", stop = 2.0}]',
+    ],
+)
+def test_what_changes_in_time_wants_both(tmp_path, change):
+    assert problems(tmp_path, STATE, change) == [
+        f"scene.toml: time.{key}: required, but missing (line 6)" for key in ("step", "duration")
+    ]

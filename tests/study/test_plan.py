@@ -185,7 +185,7 @@ def test_a_plan_refuses_with_status_2_and_one_line(tmp_path: Path, capsys, own_l
     assert line.startswith("msmpetsc: error: ") and words in line
 
 
-def test_a_plan_of_statics_is_refused(tmp_path: Path, capsys, own_log):
+def test_a_plan_of_statics_is_for_an_error_of_the_surface(tmp_path: Path, capsys, own_log):
     path = block_scene(tmp_path, time={"step": 1.0, "duration": 1.0, "integrator": "static"})
     assert main(["plan", str(path), "--error", "0.1"]) == 2
-    assert "a plan is of a motion" in capsys.readouterr().err
+    assert "--surface-error plans its cells" in capsys.readouterr().err

@@ -23,12 +23,13 @@ from msmpetsc.cli.arguments import (
 )
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
+from msmpetsc.scene.statics import STATIC
 
 if TYPE_CHECKING:
     from msmpetsc.study.plan import Candidate
     from msmpetsc.study.runner import Bench
     from msmpetsc.study.scene_lines import Tables
-    from msmpetsc.study.sizing.trials import SizePlan, SizeTrial
+    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial
 
 NOTHING_MEETS = 3
 HEAD = f"{'method':34} {'time step [s]':>13} {'step error':>10} {'cost [s/s]':>10} {'error':>9}"
@@ -159,7 +160,7 @@ def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, 
         },
     }  # fmt: skip
     command = print_command(args, choice.method, more) if plan.met else None
-    record = {"choice": asdict(choice), "bounds": plan.bounds, "check": plan.check, "command": command}
+    record = {"choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "command": command}
     return plan.met, json.loads(json.dumps(record, default=str))  # of paths the names
 
 
@@ -190,15 +191,16 @@ def print_size_trial(trial: "SizeTrial | str") -> None:
 
 
 def print_size(plan: "SizePlan", target: float) -> None:
-    """Print the choice with its budget, the check, and what bounds the error."""
+    """Print the choice with its error, the parts of that, and what bounds it."""
     choice, budget, shares = plan.choice, plan.choice.budget, plan.choice.shares
     print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")
-    print(f"{choice.cost:.3g} computing seconds a simulated second, surface error {budget.total:.1e} at most")
+    cost = f"{choice.cost:.3g} computing seconds a simulated second"
+    if choice.method.integrator == STATIC:
+        cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
+    print(f"{cost}, surface error {budget.total:.1e}")
     print(f"{'part':16} {'error':>9} {'of the cost':>11}")
     for name in vars(budget):
         print(f"{name:16} {getattr(budget, name):9.1e} {100 * getattr(shares, name):10.0f}%")
-    if plan.check is not None:
-        print(f"measured from the finest lattice: {plan.check:.1e}")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")
 

@@ -30,7 +30,7 @@ from msmpetsc.study.table import failed, grouped, measured, records, succeeded
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from msmpetsc.study.sizing.trials import SizePlan
+    from msmpetsc.study.sizing.answer import SizePlan
 
 KIND = "Surface error over cost"
 COST, SURFACE_ERROR = "computing time a simulated second", "surface error"

@@ -23,13 +23,17 @@ def size_bounds(model: Model, target: float, step_known: bool) -> list[str]:
     return bounds
 
 
-def inverted_bound(inverted: float, cells: float) -> list[str]:
-    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge."""
+def inverted_bound(inverted: float, cells: float, law: str) -> list[str]:
+    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge.
+
+    law : of the material
+    """
     if not inverted:
         return []
+    helps = "" if law == "stiffening" else ' or material.law = "stiffening"'
     return [
-        f"the motion: of {cells:.0f} cells {inverted:.0f} end inside out, each lattice in its own way; fewer --frames "
-        'or material.law = "stiffening" may help'
+        f"the motion: of {cells:.0f} cells {inverted:.0f} end inside out, each lattice in its own way; fewer --frames"
+        f"{helps} may help"
     ]
 
 

@@ -1,23 +1,24 @@
 """The trials that size a scene: coarse lattices tell the error of the step, three lattices that of the cells."""
 
 import math
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import Integrator
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried
 from msmpetsc.study.sizing.bounds import inverted_bound, size_bounds, time_bound
-from msmpetsc.study.sizing.choice import Choice, Model, Solving, Stepping
-from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, error_law
+from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
 COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
@@ -26,65 +27,16 @@ FINEST = 2  # times finer than the scene's: the finest cells that are chosen
 IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
-COARSE, FINE = 1 / 2, 4  # times the cells: between them a choice's distance from the finest lattice tells nothing
+FINE = 4  # times the cells: of a choice less fine than that its distance from a coarser lattice tells nothing
+FEWEST = 1000  # cells of the finest lattice that is worth beginning with
 PART = 8  # the error of the finest step must be so small a part of the error asked for
 FAR = 0.15  # surfaces so far apart move out of step: that is no small error any more, and shrinks with no order
 USUAL = 1.5  # order of cells that count by their fill: 1.5 to 2 on clamped bars
 LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
-CHOICES = 3  # that are tried
-TOO_MUCH = 1.1  # times the error asked for, measured, and the choice is made once more
-
-
-@dataclass(frozen=True)
-class SizeTrial:
-    """A run that was made.
-
-    asked, cells : valid cells asked for, and had
-    cost         : computing seconds a simulated second
-    substeps     : of a step, for verlet; else iterations; their mean
-    inverted     : cells that end inside out
-    result       : its file
-    """
-
-    method: Candidate
-    asked: int
-    cells: float
-    cost: float
-    substeps: float
-    inverted: float
-    result: Path
-
-    @property
-    def edge(self) -> float:
-        """Edge of a cell, of a body of one cell."""
-        return self.cells ** (-1 / 3)
-
-
-class Tried(NamedTuple):
-    """A trial as a point over cost and expected error."""
-
-    method: str
-    cells: float
-    cost: float
-    error: float
-
-
-@dataclass
-class SizePlan:
-    """The answer.
-
-    choice : the cheapest that meets the error, or of the smallest error there is
-    met    : whether it is expected to meet the error
-    bounds : what keeps the error from being smaller, or the estimate from being sure, in words
-    check  : the error of the choice as measured; None where that tells nothing
-    """
-
-    choice: Choice
-    met: bool
-    bounds: list[str]
-    check: float | None = None
-    tried: list[Tried] = field(default_factory=list)
+CHOICES = 6  # that are tried
+NARROW = 1.05  # times the cells: between cells so alike none are tried
+AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
 class Sizer:
@@ -110,7 +62,8 @@ class Sizer:
         self.cells, self.report = count, report
         self.step = self.as_given.time.step
         steps = min(frames, self.as_given.time.steps)
-        self.duration = self.step * max(1, steps // 2 * 2)  # twice the step fits into it, too
+        self.is_static = self.as_given.time.integrator == STATIC
+        self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)  # twice the step fits, too
         self.solved = min(1e-3, target / 10)  # step error of the trials
         self.bounds: list[str] = []
         self.cell_bound = ""  # what is not sure of the cells' error
@@ -118,7 +71,19 @@ class Sizer:
         self.step_errors: dict[Candidate, float] = {}  # of the time step alone
 
     def plan(self) -> SizePlan:
-        """Make the trials and choose. Raises InputError where too few runs end well."""
+        """Make the trials and choose, on few cells first. Raises InputError where too few runs end well."""
+        most, between = self.cells, COARSER**3
+        while self.cells >= between * FEWEST:
+            self.cells //= between
+        while True:
+            self.bounds.clear()
+            plan = self._sized()
+            if self.cells >= most or (plan.met and plan.choice.cells <= self.cells / 2):
+                return plan
+            self.cells = min(most, between * self.cells)
+
+    def _sized(self) -> SizePlan:
+        """Return the plan of lattices of ``cells`` and fewer."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
         method = self._provisional(steppings)
@@ -126,19 +91,25 @@ class Sizer:
         lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
-        least, most = math.ceil(lattices[0].cells), FINEST**3 * self.cells
         law = self._law(lattices)
-        model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", least, most)
-        if not law.seen and model.cheapest(self.target) is None and (finer := self._run(method, self._coarser(-0.5))):
-            lattices = [*lattices[-2:], finer]  # where no order was seen, the finest that are known say most
+        model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
+        wanted = model.cheapest(AIM * self.target)
+        like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
+        blind = wanted is None and not law.seen
+        if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
+            lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
-        plan, model = self._checked(model, lattices[-1])
+        plan, model = self._checked(model, lattices)
         return replace(plan, bounds=self._bounds(plan, model, lattices), tried=self._tried(model))
 
     # Time
 
     def _steppings(self, cells: int) -> list[Stepping]:
         """Return integrators and steps with the error of the step alone; the finest stands for the true motion."""
+        if self.is_static:  # whose states have no such error
+            state = self._run(self._method(STATIC, self.step), cells)
+            self.step_errors = {state.method: 0.0} if state else {}
+            return [Stepping(method, 0.0, state.cost) for method in self.step_errors if state]
         ladder, sizes = self._explicit(cells)
         if len(ladder) < 2:
             ladder, sizes = self._implicit(cells)
@@ -263,8 +234,9 @@ class Sizer:
         least, greatest = CELL_ORDERS
         far, inverted = len(runs) > 2 and apart[0] > FAR, runs[-1].inverted > 0
         orders = (least, least) if inverted else (USUAL if far else least, greatest)
-        across = None if far else _apart(runs[0], runs[-1])
-        law = error_law([each.edge for each in runs], apart, orders, across)
+        across = _apart(runs[0], runs[-1])
+        cosine = cosine_of(apart[0], apart[1], across) if len(runs) > 2 else 0.0
+        law = error_law([each.edge for each in runs], apart, orders, None if far else across, cosine)
         law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:
             why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
@@ -277,31 +249,43 @@ class Sizer:
         """Return the cells of the lattice coarsened so many times."""
         return max(1, round(self.cells / COARSER ** (3 * power)))
 
-    def _checked(self, model: Model, finest: SizeTrial) -> tuple[SizePlan, Model]:
-        """Choose and run the choice; choose once more without what fails, and where the error was too hopeful.
+    def _checked(self, model: Model, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, Model]:
+        """Choose, run the choice and measure it, until its error is little less than was asked for.
 
-        Returns the model with what was learnt, too.
+        Each choice lies between the cells that met the error and those that did not, for errors go up and down from
+        lattice to lattice. Returns the model with what was learnt, too.
         """
-        choice, measured = model.cheapest(self.target), None
+        law, finest, met = model.law, lattices[-1], None
+        fine = [(finest.edge, law.error(finest.edge))] if law.error(finest.edge) < AIM * self.target else []
+        coarse: list[tuple[float, float]] = []  # sizes and errors of what is too coarse, and of what is not
         for _ in range(CHOICES):
+            choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
             if choice is None:
                 break
             run = self._run(choice.method, choice.cells)
             if run is None:
-                model = self._without(choice.method, model)
+                model = self._without(choice, model, math.ceil(lattices[0].cells))
+                continue
+            measured = self._measured(choice, run, finest, law)
+            error = measured.total / self.target
+            if error <= 1:
+                met, fine = replace(choice, cost=run.cost, budget=measured), [(run.edge, measured.cells)]
+                model = replace(model, most=choice.cells - 1)
             else:
-                measured = self._measured(choice, run, finest, model)
-                if measured is None or measured <= TOO_MUCH * self.target:
-                    return SizePlan(replace(choice, cost=run.cost), True, [], measured), model
-                self.report(f"measured {measured:.1e}, more than expected: chosen once more")
-                law = replace(model.law, factor=model.law.factor * measured / choice.budget.total)
-                model = replace(model, law=law)
-            choice = model.cheapest(self.target)
-        return SizePlan(choice or model.best(), False, [], measured), model
+                coarse = [(run.edge, measured.cells)]
+                model = replace(model, least=choice.cells + 1)
+            if ENOUGH <= error <= 1 or model.least > model.most / NARROW:
+                break
+            self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
+            model = replace(model, law=law.through(*coarse, *fine))
+        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
 
-    def _without(self, method: Candidate, model: Model) -> Model:
-        """Return a model without a way to step, unless it is the last."""
-        kept = [each for each in model.steppings if each.method != replace(method, step_error=each.method.step_error)]
+    def _without(self, choice: Choice, model: Model, fewest: int) -> Model:
+        """Return a model without the cells of what fails, where they are fewer than were tried, or its way to step."""
+        if choice.cells < fewest:
+            return replace(model, least=fewest)
+        method = self._as_tried(choice.method)
+        kept = [each for each in model.steppings if each.method != method]
         self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
         return replace(model, steppings=kept or model.steppings)
 
@@ -310,27 +294,26 @@ class Sizer:
         as_tried = self._as_tried(method)
         return finest if as_tried == finest.method else self._run(as_tried, finest.asked) or finest
 
-    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, model: Model) -> float | None:
-        """Return the error of a run of the choice from its distance to the finest lattice.
+    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
+        """Return the errors of a run of the choice, that of its cells from its distance to the finest lattice.
 
-        None where their cells are so alike that it tells nothing: of two lattices with nearly the same error, what they
-        are apart is chance.
+        Where it is the finer one and they are alike, that is as expected: what they are apart is chance.
         """
-        if COARSE < run.cells / finest.cells < FINE:
-            return None
+        if 1 < run.cells / finest.cells < FINE:
+            return choice.budget
         finest = self._alike(choice.method, finest)
         apart = _apart(run, finest)
-        if run.edge < finest.edge:  # of the error of the finest, what the choice is better by
-            share = (run.edge / finest.edge) ** model.law.order
-            return apart * share / (1 - share) + choice.budget.time + choice.budget.step
-        return apart + model.law.error(finest.edge) + self.step_errors[finest.method]
+        if run.edge < finest.edge:
+            return replace(choice.budget, cells=law.measured_finer(apart, run.edge, finest.edge))
+        return replace(choice.budget, cells=law.measured(apart, finest.edge))
 
     # What is said
 
     def _bounds(self, plan: SizePlan, model: Model, lattices: list[SizeTrial]) -> list[str]:
         """Return what bounds the error, in words; of the lattices that tell the cells' error."""
         finest = max(self.trials, key=lambda each: each.cells)
-        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted_bound(finest.inverted, finest.cells)]
+        inverted = inverted_bound(finest.inverted, finest.cells, self.as_given.material.law)
+        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:
             times = [self.step * frame for frame in range(1, round(self.duration / self.step))]
             bounds += size_bounds(model, self.target, bool(self.bounds))

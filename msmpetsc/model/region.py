@@ -63,7 +63,7 @@ class Finder:
             raise InputError(f"{table.key}.region holds no node of the lattice{self._beside(table)}")
         if found < near:
             log.warning(
-                "%s.region only grazes the body: it means %d nodes, and %d that stick out into it are of what is not in it%s",
+                "%s.region only grazes the body: it means %d nodes, not %d that stick out into it from beside it%s",
                 table.key, found, near, self._beside(table),
             )  # fmt: skip
         return where

@@ -130,7 +130,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space at rest; the nodes in it are meant, or of a part the cells whose centres it holds."""
+    """A part of space at rest; the body in it is meant: its nodes, or of a part the cells whose middles it holds."""
 
     one_of = ("box", "sphere", "half_space", "painted")
     box: Box | None = Field(

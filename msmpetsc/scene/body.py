@@ -179,7 +179,7 @@ class OwnMaterial(Table):
 class PartTable(OwnMaterial):
     """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
 
-    region: Region = Field(description="the cells whose centres lie in it")
+    region: Region = Field(description="the cells whose middles lie in it")
 
 
 def refuse_unlike(material: Material | None, others: Mapping[str, OwnMaterial]) -> None:

@@ -4,29 +4,35 @@ import numpy as np
 
 from msmpetsc.scene.body import Region
 
-EDGE = 1e-9  # of the body's longest side: a node this near to a region counts as on its edge, whatever was rounded
+EDGE = 1e-6  # of the longest side: what is this near to a region is on its edge; many meshes have single precision
+
+
+def frame_of(region: Region, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the origin (3,), the scale (3,) and the length [m] that a region's numbers are in."""
+    sides = bounds[1] - bounds[0]
+    return (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
 
 
 def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Return which points (n, 3) [m] lie in a region or on its edge, (n,) bool.
 
+    Sides of a box at the body's bounding box, or beyond it, are open outwards: cells stick out there.
+
     bounds : (2, 3) the body's bounding box at rest [m]
     """
-    sides = bounds[1] - bounds[0]
-    origin, scale, length = (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
-    edge = EDGE * sides.max()
-
-    def to_body(point: tuple[float, ...]) -> np.ndarray:
-        return origin + np.asarray(point) * scale
-
+    origin, scale, length = frame_of(region, bounds)
+    edge = EDGE * (bounds[1] - bounds[0]).max()
     if region.box is not None:
-        low, high = region.box
-        return ((points >= to_body(low) - edge) & (points <= to_body(high) + edge)).all(axis=1)
+        low, high = origin + np.array(region.box) * scale
+        low = np.where(low <= bounds[0] + edge, -np.inf, low)
+        high = np.where(high >= bounds[1] - edge, np.inf, high)
+        return ((points >= low - edge) & (points <= high + edge)).all(axis=1)
     if region.sphere is not None:
-        distance = np.linalg.norm(points - to_body(region.sphere.center), axis=1)
+        distance = np.linalg.norm(points - (origin + np.array(region.sphere.center) * scale), axis=1)
         return distance <= region.sphere.radius * length + edge
     assert region.half_space is not None  # the schema has one of the four, and the painted ones are not asked for
-    return (points - to_body(region.half_space.point)) @ np.asarray(region.half_space.normal) >= -edge
+    point = origin + np.array(region.half_space.point) * scale
+    return (points - point) @ np.asarray(region.half_space.normal) >= -edge
 
 
 def inside_bodies(

@@ -15,15 +15,16 @@ from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
+from msmpetsc.model.clamp import clamped
 from msmpetsc.model.contact.build import build_obstacles, surfaces_of
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.outside import distance_outside
+from msmpetsc.model.contact.outside import distance_outside, nearest_of_body
 from msmpetsc.model.contact.penalty import Penalty
 from msmpetsc.model.contact.reflection import Exchange
 from msmpetsc.model.initial_state import InitialState, initial_state
 from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
-from msmpetsc.model.reach import Reach, Regions, reach_of, regions
+from msmpetsc.model.reach import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
 from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.contacts import CollisionSurface
@@ -92,7 +93,7 @@ class Shape:
         self.bodies = read_bodies(comm, scene)
         self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
-        self._outside: np.ndarray | None = None
+        self._nearest: np.ndarray | None = None
 
     def fits(self, scene: Scene) -> bool:
         """Return whether a scene has these meshes and these cages."""
@@ -105,14 +106,18 @@ class Shape:
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
-    def outside(self, lattice: Lattice) -> np.ndarray | None:
-        """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective).
+    def nearest(self, lattice: Lattice) -> np.ndarray:
+        """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective).
 
         lattice : of this shape, of any material
         """
-        if self._outside is None and self.cages.share is not None:
-            self._outside = distance_outside(self.bodies, self.cages, lattice)
-        return self._outside
+        if self._nearest is None:
+            self._nearest = nearest_of_body(self.bodies, self.cages, lattice)
+        return self._nearest
+
+    def outside(self, lattice: Lattice) -> np.ndarray | None:
+        """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective)."""
+        return None if self.cages.share is None else distance_outside(lattice, self.nearest(lattice))
 
 
 def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Model:
@@ -124,7 +129,9 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
-    masks = regions(scene, lattice, finder)
+    has_regions = any(any(scene.tables(kind)) for kind in NODES)
+    points = shape.nearest(lattice) if has_regions else lattice.nodes
+    masks = regions(scene, lattice, finder, points)
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
     anchors = _anchors(scene, lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
@@ -134,7 +141,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
     obstacles = build_obstacles(comm, scene, lattice, outside)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
-        lattice=lattice,
+        lattice=clamped(scene, lattice, masks, finder, points),
         embedding=shape.embedding if scene.output.surface else None,
         loads=_loads(comm, scene, lattice, masks),
         own_forces=_own_forces(scene, lattice, masks),

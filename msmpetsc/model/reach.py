@@ -21,6 +21,7 @@ from msmpetsc.scene.motion import Force, Time
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.schema import Scene
 
+NODES = ("pin", "anchor", "force")  # tables whose regions mean nodes
 Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 
 
@@ -39,10 +40,13 @@ class Reach:
     kind: str
 
 
-def regions(scene: Scene, lattice: Lattice, finder: Finder) -> dict[str, np.ndarray]:
-    """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes."""
-    tables = chain.from_iterable(scene.tables(kind) for kind in ("pin", "anchor", "force"))
-    return {table.key: finder.find(table, lattice) for table in tables}
+def regions(scene: Scene, lattice: Lattice, finder: Finder, points: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes.
+
+    points : (l, 3) of the bodies that nodes are nearest to [m]
+    """
+    tables = chain.from_iterable(scene.tables(kind) for kind in NODES)
+    return {table.key: finder.find(table, lattice, points) for table in tables}
 
 
 def reach_of(

@@ -130,7 +130,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space at rest; the nodes in it are meant, or of a part the cells whose centres it holds."""
+    """A part of space at rest; the body in it is meant: its nodes, or of a part the cells whose middles it holds."""
 
     one_of = ("box", "sphere", "half_space", "painted")
     box: Box | None = Field(
@@ -179,7 +179,7 @@ class OwnMaterial(Table):
 class PartTable(OwnMaterial):
     """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
 
-    region: Region = Field(description="the cells whose centres lie in it")
+    region: Region = Field(description="the cells whose middles lie in it")
 
 
 def refuse_unlike(material: Material | None, others: Mapping[str, OwnMaterial]) -> None:

@@ -54,7 +54,7 @@ class ObstacleTable(Table):
         missing = [name for name in NEEDED[self.shape] if getattr(self, name) is None]
         if missing:
             raise rule(f'needs {" and ".join(missing)} for shape = "{self.shape}"')
-        uses = {name: (shape,) for shape, names in NEEDED.items() for name in names}
+        uses: dict[str, tuple[str, ...]] = {name: (shape,) for shape, names in NEEDED.items() for name in names}
         uses |= {"restitution": ("reflect", "exchange"), "stiffness": ("penalty",), "friction": ("penalty",)}
         for name, use in uses.items():
             if getattr(self, name) is not None and not {self.shape, self.response} & set(use):

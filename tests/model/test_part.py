@@ -211,5 +211,5 @@ def test_a_mistake_is_one_line(tmp_path: Path, change: str, line: str):
 
 def test_a_part_of_no_cell_is_refused(tmp_path: Path):
     corner = {"box": [[0, 0, 0], [0.05, 0.05, 0.05]]}  # holds a node, but the middle of no cell
-    with pytest.raises(InputError, match=r"^part\.0\.region holds the centre of no cell$"):
+    with pytest.raises(InputError, match=r"^part\.0\.region holds the centre of no cell: the body is from .* m$"):
         of_parts(tmp_path, {"region": corner, "density": 1.0})

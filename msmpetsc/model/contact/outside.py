@@ -1,4 +1,4 @@
-"""How far nodes stick out of the surface: the corners of boundary cells, by up to the diagonal of a cell.
+"""How far nodes stick out of the surface, and where the body is then: corners of boundary cells, by up to a diagonal.
 
 An obstacle should be met by the surface, not by the lattice that carries it. A node that sticks out by d meets it when
 it is d deep: there the surface is. Where the surface is flat as far as a cell that is exact, however the body has
@@ -18,24 +18,39 @@ from msmpetsc.model.lattice import Lattice
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
 
 
-def distance_outside(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> np.ndarray:
-    """Return how far each node (l,) sticks out of its body's surface at rest [m], 0 within it (collective)."""
+def nearest_of_body(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> np.ndarray:
+    """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
+
+    It is the node itself but where that sticks out of the surface.
+    """
     owned, comm = lattice.owned, bodies[0].comm
     springs = np.bincount(lattice.springs.ravel(), minlength=len(lattice.nodes))[:owned]
     body = lattice.body
     rows = np.flatnonzero((springs < INNER_SPRINGS) & np.array(cages.fills)[body[:owned]])
     to_root = Route(comm, np.zeros(len(rows), np.int64))
     points, of_point = to_root.send(lattice.nodes[rows]), to_root.send(body[rows])
-    distance = np.zeros(len(points))
     for number in np.unique(of_point):
         own = of_point == number
         surface = bodies[number].surface
         assert surface is not None  # here
-        distance[own] = np.maximum(-depth_below(surface, points[own]), 0.0)
-    outside = np.zeros(owned)
-    outside[rows] = to_root.answer(distance)
+        points[own] = _drawn_in(surface, points[own])
+    nearest = lattice.nodes[:owned].copy()
+    nearest[rows] = to_root.answer(points)
     ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
-    return np.concatenate([outside, lattice.table.rows_of(ghosts, outside)])
+    return np.concatenate([nearest, lattice.table.rows_of(ghosts, nearest)])
+
+
+def _drawn_in(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """Return points (n, 3), those outside a surface moved to the nearest of it."""
+    import igl  # for scenes with regions or obstacles
+
+    closest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[2]
+    return np.where(is_inside(surface, points)[:, None], points, closest)
+
+
+def distance_outside(lattice: Lattice, nearest: np.ndarray) -> np.ndarray:
+    """Return how far each node (l,) sticks out of its body at rest [m], from the nearest points (l, 3) of that."""
+    return np.linalg.norm(lattice.nodes - nearest, axis=1)
 
 
 def depth_below(surface: Surface, points: np.ndarray) -> np.ndarray:

@@ -115,7 +115,9 @@ class Rest:
         """
         region = table.table.region
         if region.painted is None:
-            return inside_bodies(region, self.nodes, self.bounds, self.body_of_node, table.body)
+            low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)  # what sticks out is where its body is
+            nodes = np.clip(self.nodes, low, high)
+            return inside_bodies(region, nodes, self.bounds, self.body_of_node, table.body)
         where = np.zeros(len(self.nodes), bool)
         where[self.cells[self._painted_cells(table)]] = True
         return where

@@ -21,7 +21,6 @@ from msmpetsc.output.compare import (
     point_text,
 )
 from msmpetsc.output.reader import Result
-from msmpetsc.scene.statics import STATIC
 
 NEEDED = ("frames/surface", "surface/points", "surface/triangles")
 MEAN = "surface, rms"  # name of the field
@@ -65,7 +64,7 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     pairs = pairs[times[pairs[:, 0]] <= until * (1 + SAME_TIME)]
-    if reference.scene.get("time", {}).get("integrator") == STATIC:
+    if reference.scene.get("time", {}).get("integrator") == "static":
         pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")

@@ -297,7 +297,7 @@ def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
     [
         ('time.integrator="verlet"', "is for time.integrator"),
         ('time.integrator="static"', "is for time.integrator"),
-        ('obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1]}]', "obstacles that reflect"),
+        ('obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1], response="exchange"}]', "past each other"),
         ("self_contact.distance=0", "self_contact.distance"),
         ("self_contact.friction=-1", "self_contact.friction"),
     ],

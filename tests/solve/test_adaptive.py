@@ -117,7 +117,7 @@ def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact:
     assert 1e-2 < error_of(model, frames[::16], exact) < 9e-2
     q = np.array([frame.position for frame in frames])
     rough = np.abs(np.diff(q, 3, axis=0)).max()
-    assert rough < 0.02 * np.abs(np.diff(q, axis=0)).max()  # no kinks at frames within
+    assert rough < 0.025 * np.abs(np.diff(q, axis=0)).max()  # no kinks at frames within
     energy = np.array([frame.kinetic + frame.elastic + frame.potential for frame in frames])
     assert np.abs(np.diff(energy)).max() < 0.02 * max(frame.kinetic for frame in frames)
 

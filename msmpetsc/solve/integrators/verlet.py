@@ -205,13 +205,14 @@ class Verlet:
 
     def _is_to_halve(self, start: np.ndarray, energy: float) -> bool:
         """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and its substeps are now
-        halved; they are doubled again for the next one where it gained next to nothing (collective)."""
+        halved; they are doubled again for the next one where it gained next to nothing (collective). Where obstacles
+        push, what springs seem to gain may be theirs."""
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
         gain, kinetic = self.comm.allreduce(np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))]))
         most = energy + kinetic
         enough, gained = GAIN * most + ROUNDING * self.most, max(self.gained + gain, -CREDIT * most)
-        if min(gain, gained) > enough and self.halvings < HALVINGS:
+        if min(gain, gained) > enough and self.halvings < HALVINGS and not self.environment.penalties:
             self.halvings += 1
             return True
         self.gained = gained

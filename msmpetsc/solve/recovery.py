@@ -107,14 +107,11 @@ class Recovery:
     def _in_pieces(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:
         """Take a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
         self.deepest = level
-        for solver in self.spare.values():
-            solver.forget()  # a resumed run has not seen what they did in the step before
         pieces, start = 2**level, time - self.time_step
         for piece in range(1, pieces + 1):
             result, state = self._piece(state, start + piece * self.time_step / pieces, level, cost)
         self.level = self.deepest if self.deepest > level else level - 1
-        if self.level == 0:
-            self.destroy()
+        self.destroy()  # a resumed run has not seen what the spare solvers did in this step
         return result, state
 
     def _piece(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:

@@ -69,7 +69,11 @@ def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path, capsys, own_log):
     path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "traces.json").mkdir(parents=True)
-    for folder, said in {"file/out": "Not a directory", "taken": "is a folder, not a file", "file": "not a folder"}.items():
+    for folder, said in {
+        "file/out": "Not a directory",
+        "taken": "is a folder, not a file",
+        "file": "not a folder",
+    }.items():
         assert main(["study", str(path), "-o", str(tmp_path / folder)]) == 2
         told = capsys.readouterr().err.splitlines()
         assert len(told) == 1 and said in told[0] and str(tmp_path / folder) in told[0]

@@ -16,7 +16,7 @@ from msmpetsc.output.reader import refuse_deadly
 from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
 from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
-from msmpetsc.scene.reading import lies_below, load_scene, scene_of
+from msmpetsc.scene.reading import load_scene, scene_of
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
@@ -75,7 +75,7 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
 
 
 def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes: list[str]) -> None:
-    """Raise InputError for a file named by a result's scene that neither lies with the result nor is named by that
+    """Raise InputError for a file named by a result's scene that neither lies beside it nor is named by that
     scene's file or by the user.
 
     The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
@@ -85,7 +85,7 @@ def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes:
         keys: name
         for keys, name in scene.named_files()
         if name not in MODELS
-        and not lies_below(earlier.path.parent, str(file.parent / name))
+        and (file.parent / name).resolve().parent != earlier.path.resolve().parent
         and not any(tuple(map(str, keys))[: len(own)] == own for own in given)
     }
     if not unknown:

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import h5py
+import igl
 import numpy as np
 import pytest
 from conftest import run
@@ -37,6 +38,7 @@ class Result:
             self.nodes, self.mass = file["lattice/nodes"][:], file["lattice/mass"][:]
             self.cells = file["lattice/cells"][:]
             points, self.surface = file["surface/points"][:], file["frames/surface"][:]
+            self.body = points, file["surface/triangles"][:].astype(np.int64)
             self.contacts, self.nearest = file["frames/self_contacts"][:], file["frames/self_distance"][:]
         self.h = np.ptp(self.nodes[self.cells[0]], axis=0).max()
         self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
@@ -48,8 +50,10 @@ class Result:
         return ((u >= low) & (u <= high)).all(axis=1)
 
     def region(self, table) -> np.ndarray:
-        """Nodes of a pin's, anchor's or force's region."""
-        return inside(table.region, self.nodes, self.bounds)
+        """Nodes of a pin's, anchor's or force's region: those that are inside, or where the body is nearest to them."""
+        distance, _, nearest, _ = igl.signed_distance(self.nodes, *self.body)
+        places = np.where(distance[:, None] > 0, nearest, self.nodes)
+        return inside(table.region, places, self.bounds)
 
     def mean(self, x: np.ndarray, where: np.ndarray) -> np.ndarray:
         """Mean by mass over some nodes of (..., n, 3)."""

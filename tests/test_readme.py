@@ -36,7 +36,6 @@ SMALLER = {  # a command's words -> those of the test
     "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500 --no-times",
     "--frames 0,100,200": "--frames 0,2,4",
     "--count 12": "--count 3",
-    "scene.toml --overwrite --watch": "scene.toml --set cages.count=200 --frames 3 --overwrite --watch",
     "render scene.toml": "render scene.toml --set cages.count=200",
     "scene.toml --surface-error 1e-2": "scene.toml --surface-error 0.3 --cells 300 --frames 4",
     "scene.toml --error 1e-2": "scene.toml --error 1e-1 --frames 3",

@@ -35,9 +35,6 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 def add_output(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``run`` on its files."""
     parser.add_argument("--picture", action="store_true", help="also draw a few moments: OUT.png")
-    parser.add_argument(
-        "--watch", type=file_argument, metavar="PAGE.html", help="keep a page that shows the newest frame in a browser"
-    )
     parser.add_argument("--overwrite", action="store_true", help="replace OUT.h5 if it exists")
     parser.add_argument(
         "--resume", type=file_argument, metavar="OUT.h5",

@@ -2,8 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from signal import Signals as Signal
@@ -25,7 +24,6 @@ from msmpetsc.cli.running.observers import (
     FrameWriter,
     Interval,
     Observer,
-    PageWriter,
     ProgressLine,
     Signals,
 )
@@ -129,8 +127,8 @@ def march(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
                 frames = start_output(comm, plan, file, model, simulation)
                 checkpoints = Checkpoints(file, simulation, plan.interval, signals)
                 set_up.close()
-                with ProgressLine.shown(comm, simulation.steps) as progress, live_page(comm, plan, file, model) as page:
-                    observers: list[Observer] = [FrameWriter(file, frames), *page, progress, checkpoints, cost]
+                with ProgressLine.shown(comm, simulation.steps) as progress:
+                    observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
                     observers += [Callback(plan.request.on_frame)] if plan.request.on_frame else []
                     signals.begin()
                     for frame in simulation.advance():
@@ -231,22 +229,6 @@ def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
         return plan.resumed.file(comm, plan.attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
     return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
-
-
-@contextmanager
-def live_page(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model) -> Iterator[list[Observer]]:
-    """Yield the observer that keeps a page of the run, on rank 0 and where it is asked for."""
-    path = plan.request.watch
-    if path is None or comm.rank > 0:
-        yield []
-        return
-    from msmpetsc.output.drawing.live import LivePage
-
-    page = LivePage(path, plan.scene, model.surface, file.newest_surface, model.body_of_point, model.solids)
-    try:
-        yield [PageWriter(page)]
-    finally:
-        page.end()
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

@@ -21,8 +21,7 @@ from msmpetsc.model.fields import Frame
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.writer import ResultFile
 
-if TYPE_CHECKING:  # what draws is loaded where it is asked for; PETSc must first be given its options
-    from msmpetsc.output.drawing.live import LivePage
+if TYPE_CHECKING:  # PETSc must first be given its options
     from msmpetsc.solve.simulate import Simulation
 
 STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
@@ -62,18 +61,6 @@ class Callback:
     def after_step(self, frame: Frame | None) -> bool:
         if frame is not None:
             self.function(frame)
-        return False
-
-
-class PageWriter:
-    """Keep a page of the run for a browser, on rank 0."""
-
-    def __init__(self, page: "LivePage"):
-        self.page = page
-
-    def after_step(self, frame: Frame | None) -> bool:
-        if frame is not None:
-            self.page.update(frame)
         return False
 
 

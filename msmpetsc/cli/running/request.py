@@ -9,7 +9,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from msmpetsc.cli.arguments import MEASURE_NAMES, PAGE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.cli.arguments import MEASURE_NAMES, RESULT_NAMES, refuse_below_one, refuse_other_format
 from msmpetsc.cli.running.resume import examined, options_to_keep
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError
@@ -44,7 +44,6 @@ class RunRequest:
     true_error: int | None = None
     trace: int | None = None
     measure: Path | None = None
-    watch: Path | None = None
     petsc_options: tuple[str, ...] = ()
     command: str = "msmpetsc run"
     made: Scene | None = None
@@ -64,7 +63,6 @@ class RunRequest:
         """Raise InputError for options that contradict each other, or name files of other formats."""
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
-        refuse_other_format("--watch", self.watch, PAGE_NAMES)
         if self.resume and (self.overwrite or self.output not in (None, self.resume)):
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
         refuse_below_one(true_error=self.true_error, trace=self.trace, frames=self.frames)

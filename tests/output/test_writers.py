@@ -21,7 +21,6 @@ from matplotlib.figure import Figure
 from msmpetsc.cli.arguments import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
 from msmpetsc.errors import InputError
-from msmpetsc.output.compress import pack
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
 from msmpetsc.output.drawing.sheet import contact_sheet
@@ -82,7 +81,6 @@ def writers(sources: Path) -> dict[str, Writer]:
     bar, ball = sources / "bar.h5", sources / "ball.h5"
     table = {
         "x.h5": Writer("output/writer.py", small_result.write),
-        "packed.h5": Writer("output/compress.py", pack, small_result.write),
         "x.xdmf": Writer(
             "output/xdmf.py",
             lambda path: write_xdmf(path.with_suffix(".h5")),

@@ -49,7 +49,6 @@ def add_output(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="let rank 0 write for all: where nodes of a cluster do not see one file alike",
     )
-    parser.add_argument("--compress", action="store_true", help="pack the finished OUT.h5: smaller, slower to read")
 
 
 def add_measuring(parser: argparse.ArgumentParser) -> None:

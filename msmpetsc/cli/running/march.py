@@ -261,12 +261,8 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
 
 
 def write_companions(request: RunRequest, whole: bool) -> None:
-    """Write the XDMF file, and for a whole run pack the result and draw it where asked. Raises InputError."""
+    """Write the XDMF file, and draw a whole run where asked. Raises InputError."""
     path = request.path
-    if whole and request.compress:
-        from msmpetsc.output.compress import pack
-
-        pack(path)
     write_xdmf(path)
     if whole and request.picture:
         from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK: a second that other runs need not wait

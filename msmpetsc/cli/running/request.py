@@ -40,7 +40,6 @@ class RunRequest:
     force: bool = False
     checkpoint_every: str | None = None
     gather: bool = False
-    compress: bool = False
     true_error: int | None = None
     trace: int | None = None
     measure: Path | None = None

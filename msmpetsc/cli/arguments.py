@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msmpetsc
-from msmpetsc.cli.options.checks import add_baseline, add_check
+from msmpetsc.cli.options.checks import add_check
 from msmpetsc.cli.options.examples import EXAMPLES, EXAMPLES_HEAD, ExamplesKept
 from msmpetsc.cli.options.planning import add_inspect, add_plan, add_study
 from msmpetsc.cli.options.program import add_completion, add_doctor
@@ -151,7 +151,6 @@ COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module
     "compare": add_compare,
     "render": add_render,
     "export": add_export,
-    "baseline": add_baseline,
     "check": add_check,
     "fetch": add_fetch,
     "keys": add_keys,

@@ -30,7 +30,7 @@ COMMANDS = [
     ["fetch", "{}"],
     ["new", "{}", "--mesh", "good.h5"],
     ["new", "new.toml", "--mesh", "{}"],
-    ["baseline", "{}"],
+    ["check", "--update", "{}"],
     ["check", "{}"],
 ]
 PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]

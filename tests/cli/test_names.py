@@ -61,7 +61,6 @@ ALONE = {
     "new": (["--list"], "new is started without mpiexec: it measures"),
     "keys": ([], "keys is started without mpiexec"),
     "schema": ([], "schema is started without mpiexec"),
-    "baseline": (["scene.toml"], "baseline is started without mpiexec: it starts its runs"),
     "check": (["scene.toml"], "check is started without mpiexec: it starts its runs"),
     "fetch": (["--list"], "fetch is started without mpiexec: it downloads"),
 }

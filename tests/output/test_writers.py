@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from msmpetsc.cli.arguments import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
+from msmpetsc.cli.commands.check import Checked, write_junit
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
@@ -30,7 +31,6 @@ from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.study.baselines import baseline
-from msmpetsc.study.baselines.junit import Checked, write_junit
 from msmpetsc.study.charts.style import Chart, save_png
 from msmpetsc.study.plan import Candidate
 from msmpetsc.study.report import write_report
@@ -89,7 +89,7 @@ def writers(sources: Path) -> dict[str, Writer]:
         "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
         "x.baseline.json": Writer("study/baselines/baseline.py", lambda path: baseline.write(path, {"counts": {}})),
         "junit.xml": Writer(
-            "study/baselines/junit.py",
+            "cli/commands/check.py",
             lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
         ),
         "planned.toml": Writer(

@@ -33,8 +33,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "msmpetsc export out/my.h5 -o out/my.glb --every 2",
         "msmpetsc export out/my.h5 -o out/last.obj --frames -1",
     ),
-    "baseline": ("msmpetsc baseline my.toml --cells 400 --frames 10",),
-    "check": ("msmpetsc check my.toml", "msmpetsc check my.toml other.toml --ranks 2 --junit out/check.xml"),
+    "check": (
+        "msmpetsc check my.toml --update --cells 400 --frames 10",
+        "msmpetsc check my.toml other.toml --ranks 2 --junit out/check.xml",
+    ),
     "fetch": ("msmpetsc fetch --list", "msmpetsc fetch bunny armadillo"),
     "keys": ("msmpetsc keys", "msmpetsc keys material", "msmpetsc keys pin.region"),
     "schema": ("msmpetsc schema > msmpetsc.schema.json",),

@@ -38,7 +38,6 @@ SMALLER = {  # a command's words -> those of the test
     "--count 12": "--count 3",
     "render scene.toml": "render scene.toml --set cages.count=200",
     "scene.toml --surface-error 1e-2": "scene.toml --surface-error 0.3 --cells 300 --frames 4",
-    "scene.toml --error 1e-2": "scene.toml --error 1e-1 --frames 3",
     "scene.toml --resume out/x.h5": "scene.toml --resume out/x.h5 --set time.duration=0.03 --set cages.count=200",
     "--set time.duration=4": "--set time.duration=0.05",
 }

@@ -26,7 +26,7 @@ COMMANDS = [
     ["render", "good.h5", "-o", "{}"],
     ["study", "{}"],
     ["study", "study.toml", "-o", "{}"],
-    ["plan", "{}", "--error", "0.1"],
+    ["plan", "{}", "--surface-error", "0.1"],
     ["fetch", "{}"],
     ["new", "{}", "--mesh", "good.h5"],
     ["new", "new.toml", "--mesh", "{}"],

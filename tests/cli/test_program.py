@@ -202,13 +202,3 @@ def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
     shown = json.loads(capsys.readouterr().out)
     assert shown["counts"]["cells"]["all"] == 32 and shown["counts"]["cells"]["mean"] == 16
     assert all(end["cells"] > 1e6 for end in shown["limits"].values())
-
-
-@pytest.mark.timeout(200)
-def test_a_plan_says_its_choice_as_json_and_its_trials_on_stderr(tmp_path: Path, capfd):
-    scene = str(block_scene(tmp_path, time={"step": 0.01, "duration": 0.05}, start={"scale": [1.0, 1.0, 1.1]}))
-    assert main(["plan", scene, "--step-error", "0.1", "--frames", "2", "--json"]) == 0
-    out, err = capfd.readouterr()
-    plan = json.loads(out)
-    assert plan["met"] and plan["choice"] in plan["trials"] and plan["choice"]["error"] < 0.1
-    assert plan["command"].startswith("msmpetsc run") and "step error" in err

@@ -32,10 +32,10 @@ from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.study.baselines import baseline
 from msmpetsc.study.charts.style import Chart, save_png
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
 from msmpetsc.study.scene_lines import put_into
+from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
 
 pytestmark = pytest.mark.timeout(100)

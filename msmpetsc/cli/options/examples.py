@@ -19,7 +19,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "study": ("msmpetsc study my_study.toml --list", "msmpetsc study my_study.toml -o out/my_study --jobs 2"),
     "plan": (
         "msmpetsc plan my.toml --surface-error 0.1 --write",
-        "msmpetsc plan my.toml --error 0.01 --frames 10",
+        "msmpetsc plan my.toml --surface-error 0.03 --frames 10 --chart out/plan.png",
     ),
     "compare": ("msmpetsc compare out/a.h5 out/b.h5 --rtol 1e-3", "msmpetsc compare out/a.h5 out/b.h5 --json"),
     "render": (

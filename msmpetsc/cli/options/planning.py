@@ -26,25 +26,20 @@ def add_plan(commands: Commands) -> None:
     """Add ``msmpetsc plan``."""
     parser = commands.add_parser(
         "plan",
-        help="find the cheapest options that meet an error",
-        description="Try integrators, time steps and presets, for a surface error lattices too, on the first frames "
-        "of a scene, and say which is the cheapest that meets the error. Exit status 3: none does.",
+        help="find the cheapest options that meet an error of the surface",
+        description="Try lattices, integrators, time steps and errors of a step on the first frames of a scene, and "
+        "say which is the cheapest that meets the error. Exit status 3: none does.",
     )
     parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
-    goal = parser.add_mutually_exclusive_group(required=True)
-    goal.add_argument("--error", type=float, metavar="E", help="relative error of the trajectory")
-    goal.add_argument("--step-error", type=float, metavar="E", help="true relative error of a step")
-    goal.add_argument(
-        "--surface-error", type=float, metavar="E",
+    parser.add_argument(
+        "--surface-error", type=float, metavar="E", required=True,
         help="error of the surface, of its largest displacement: cells, step and solver together",
     )  # fmt: skip
     parser.add_argument("--frames", type=int, default=20, metavar="N", help="of the scene's steps, the first N (20)")
     parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks of the trials")
     parser.add_argument("--write", action="store_true", help="put the answer into the scene file")
-    parser.add_argument("--cells", type=int, metavar="N", help="of --surface-error: finest trial; the scene's count")
-    parser.add_argument(
-        "--chart", type=file_argument, metavar="OUT.png", help="of --surface-error: draw error over cost of all trials"
-    )
+    parser.add_argument("--cells", type=int, metavar="N", help="of the finest trial; the scene's count")
+    parser.add_argument("--chart", type=file_argument, metavar="OUT.png", help="draw error over cost of all trials")
     add_json(parser)
 
 

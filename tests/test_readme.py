@@ -33,7 +33,7 @@ SMALLER = {  # a command's words -> those of the test
     "cages.count=3000": "cages.count=400 --frames 4",
     "run scenes/bunny_fall.toml --overwrite": "run scenes/bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
     "my.toml --picture": "my.toml --picture --frames 2 --set cages.count=200",
-    "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500 --no-times",
+    "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500",
     "--frames 0,100,200": "--frames 0,2,4",
     "--count 12": "--count 3",
     "render scene.toml": "render scene.toml --set cages.count=200",

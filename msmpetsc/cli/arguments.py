@@ -23,7 +23,7 @@ from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
-TAKE_PETSC_OPTIONS = ("run", "inspect")
+TAKE_PETSC_OPTIONS = ("run",)
 
 # Parsing
 

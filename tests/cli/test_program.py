@@ -198,7 +198,8 @@ def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
     assert same["agree"] and same["frames"] == 3 and same["fields"]["position"]["error"] == 0
     assert main(["compare", *files, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["agree"] is False, "one lacks a frame"
-    assert main(["inspect", scene, "--ranks", "2", "--no-times", "--json"]) == 0
+    assert main(["inspect", scene, "--ranks", "2", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["counts"]["cells"]["all"] == 32 and shown["counts"]["cells"]["mean"] == 16
+    assert 2 * 0.29e9 < shown["memory"]["all"] < 2 * 0.31e9
     assert all(end["cells"] > 1e6 for end in shown["limits"].values())

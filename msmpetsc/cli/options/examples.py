@@ -15,7 +15,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "msmpetsc run my.toml --error 1e-4 --measure out/cost.json -ksp_type pipecg -log_view",
         "msmpetsc run --resume out/my.h5",
     ),
-    "inspect": ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --no-times --json"),
+    "inspect": ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --json"),
     "study": ("msmpetsc study my_study.toml --list", "msmpetsc study my_study.toml -o out/my_study --jobs 2"),
     "plan": (
         "msmpetsc plan my.toml --surface-error 0.1 --write",

@@ -8,17 +8,11 @@ def add_inspect(commands: Commands) -> None:
     parser = commands.add_parser(
         "inspect",
         help="say what a scene would need on so many ranks",
-        description="Count cells, nodes, springs, ghosts and messages of each rank, and expect memory and time of a "
-        "frame from two short runs here, on coarser lattices. PETSc options (one dash) may follow.",
+        description="Count cells, nodes, springs, ghosts and messages of each rank, and expect its memory.",
     )
     parser.add_argument("scene", type=path_argument, metavar="SCENE", help="scene file (TOML)")
     parser.add_argument("--ranks", type=int, default=1, metavar="R", help="MPI ranks (1)")
     add_set(parser)
-    parser.add_argument("--frames", type=int, default=10, metavar="N", help="steps of the short runs (10)")
-    parser.add_argument("--measure-here", action="store_true", help="make the short runs again")
-    parser.add_argument("--no-times", action="store_true", help="make none: counts and limits only")
-    parser.add_argument("--latency", type=float, default=2e-6, metavar="S", help="of a message [s] (2e-6)")
-    parser.add_argument("--bandwidth", type=float, default=1e10, metavar="B", help="of a rank [byte/s] (1e10)")
     add_json(parser)
 
 

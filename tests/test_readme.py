@@ -17,6 +17,7 @@ import small_result
 import trimesh
 from conftest import ENVIRONMENT, ROOT
 
+from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
@@ -183,3 +184,18 @@ def test_the_study_files_are_some(tmp_path: Path):
         path.write_text(text)
         study = load_study(path, PRESETS)
         assert study.sweep or study.map
+
+
+def options_of_run() -> str:
+    """The table of what a run can be asked for, as the request has it."""
+    rows = ["| option | in Python | meaning |", "|---|---|---|"]
+    for name, option in OPTIONS.items():
+        value = option.value or "|".join(option.choices or ())
+        words = f"{option.short} {flag_of(name)} {value}" if name != "scene" else value
+        shown = "" if option.python else f"`{words.strip()}`".replace("|", "\\|")
+        rows.append(f"| {shown} | `{name}` | {option.help} |")
+    return "\n".join(rows)
+
+
+def test_the_table_of_options_is_that_of_the_request():
+    assert options_of_run() in (ROOT / "msmpetsc" / "README.md").read_text(), options_of_run()

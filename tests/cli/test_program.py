@@ -15,7 +15,7 @@ from test_extras import without
 from msmpetsc.cli.arguments import COMMANDS, command_parser, option_names, parsed
 from msmpetsc.cli.commands import doctor
 from msmpetsc.cli.main import main
-from msmpetsc.cli.options.examples import EXAMPLES
+from msmpetsc.cli.options import EXAMPLES
 from msmpetsc.geometry import readers
 from msmpetsc.scene.reading import MESHES
 

@@ -18,7 +18,7 @@ from ball_result import write_ball
 from conftest import ROOT
 from matplotlib.figure import Figure
 
-from msmpetsc.cli.arguments import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
+from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
 from msmpetsc.cli.commands.check import Checked, write_junit
 from msmpetsc.errors import InputError
@@ -116,7 +116,7 @@ def writers(sources: Path) -> dict[str, Writer]:
 
 NAMES = [*writers(Path())]
 # what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
-NOT_TRIED = {"cli/running/profile.py"}
+NOT_TRIED = {"app/profile.py"}
 
 
 @contextmanager
@@ -183,7 +183,7 @@ ALLOWED = {
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
-    "cli/running/profile.py": "asks before a run whether it could write",
+    "app/profile.py": "asks before a run whether it could write",
     "output/drawing/stage.py": "/dev/null",
 }
 

@@ -9,14 +9,8 @@ from pathlib import Path
 from time import perf_counter
 from xml.etree import ElementTree
 
-from msmpetsc.cli.arguments import (
-    MEASURE_NAMES,
-    RUNS_ITSELF,
-    XML_NAMES,
-    refuse_below_one,
-    refuse_other_format,
-    refuse_ranks,
-)
+from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.reading import load_scene

@@ -12,8 +12,9 @@ import numpy as np
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
-from msmpetsc.cli.running.profile import peak_memory
+from msmpetsc.app.checks import refuse_below_one
+from msmpetsc.app.profile import peak_memory
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene

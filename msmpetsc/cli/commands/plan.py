@@ -12,14 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msmpetsc.cli.arguments import (
-    PICTURE_NAMES,
-    RUNS_ITSELF,
-    interrupt,
-    refuse_below_one,
-    refuse_other_format,
-    refuse_ranks,
-)
+from msmpetsc.app.checks import PICTURE_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.cli.ranks import RUNS_ITSELF, interrupt, refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
 

@@ -99,8 +99,9 @@ class Interval:
     adapts: bool
 
     @classmethod
-    def parsed(cls, text: str | None) -> "Interval":
-        """Parse "3", "5min", or None. Raises InputError."""
+    def parsed(cls, given: int | str | None) -> "Interval":
+        """Parse 3, "3", "5min", or None. Raises InputError."""
+        text = None if given is None else str(given)
         match = re.fullmatch(r"(\d{1,18})(s|min|h)?", text or "0s", re.ASCII)
         if not match or (text and not int(match[1])):
             raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {text}")

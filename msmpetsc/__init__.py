@@ -2,12 +2,12 @@
 
 import hashlib
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msmpetsc.api.simulation import Simulation, frames
+    from msmpetsc.app.simulation import Simulation, frames
+    from msmpetsc.app.start import run
     from msmpetsc.extensions import register_force, register_obstacle, register_preset
     from msmpetsc.model.fields import Frame
     from msmpetsc.output.reader import Result
@@ -30,11 +30,12 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
     "Frame": "msmpetsc.model.fields",
     "Result": "msmpetsc.output.reader",
     "Scene": "msmpetsc.scene.schema",
-    "Simulation": "msmpetsc.api.simulation",
-    "frames": "msmpetsc.api.simulation",
+    "Simulation": "msmpetsc.app.simulation",
+    "frames": "msmpetsc.app.simulation",
     "register_force": "msmpetsc.extensions",
     "register_obstacle": "msmpetsc.extensions",
     "register_preset": "msmpetsc.extensions",
+    "run": "msmpetsc.app.start",
 }
 
 
@@ -83,17 +84,3 @@ def open(path: str | Path) -> "Result":
     from msmpetsc.output.reader import Result  # late: the package itself stays quick to import
 
     return Result(path)
-
-
-def run(
-    scene: "str | Path | Mapping[str, Any] | Scene | None" = None, output: str | Path | None = None, **options: Any
-) -> Path:
-    """Simulate a scene as ``msmpetsc run`` does, on all ranks, and return the path of the result (cli.main.simulate).
-
-        path = msmpetsc.run("scenes/bunny_fall.toml", "out/b.h5", frames=10, petsc_options={"ksp_rtol": 1e-5})
-
-    Raises InputError, one line, for what cannot be used, and StepFailed for a step that did not converge.
-    """
-    from msmpetsc.cli.main import simulate
-
-    return simulate(scene, output, **options)

@@ -29,9 +29,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.app.profile import machine, versions
 from msmpetsc.backend import arrays, cuda
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.cli.running.profile import machine, versions
 from msmpetsc.model.build import Model, build_model, to_device
 from msmpetsc.model.elasticity.springs import SpringGather
 from msmpetsc.output.reader import Result

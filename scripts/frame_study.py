@@ -18,8 +18,8 @@ from typing import Any
 
 from clone import ROOT, parser
 
+from msmpetsc.app.observers import FrameWriter
 from msmpetsc.cli.main import main as msmpetsc
-from msmpetsc.cli.running.observers import FrameWriter
 from msmpetsc.output.writer import ResultFile
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.linear.surface import SurfaceMotion

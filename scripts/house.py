@@ -27,8 +27,9 @@ LAYERS = (
     "model",
     "solve",
     "output",
+    "app",
     "study",
-    "cli api __main__",
+    "cli __main__",
 )
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names.split()}
 LONGEST = 35  # lines of a function, docstrings not counted

@@ -19,11 +19,10 @@ from msmpetsc.errors import InputError
 from msmpetsc.solve.presets import preset_names
 from msmpetsc.study.cases import Case
 from msmpetsc.study.distances import surface_error
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench, CaseResult
 from msmpetsc.study.sizing.answer import SizePlan
-from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.sizing.choice import Candidate, Choice
 from msmpetsc.study.sizing.trials import Sizer
 from msmpetsc.study.table import Row
 
@@ -103,7 +102,7 @@ def finer_methods(sizer: Sizer, choice: Choice, cells: int) -> list[tuple[float,
         ways.append((explicit.cost * growth * sizer.duration, Candidate("verlet", sizer.step)))
     if method.integrator != "verlet":
         step = method.time_step / SHORTER
-        shorter = Candidate("bdf2", min(step, sizer.step), "newton", "", min(1e-3, method.step_error or 1e-3))
+        shorter = Candidate("bdf2", min(step, sizer.step), "newton", min(1e-3, method.step_error or 1e-3))
         ways.append((choice.cost * cells / choice.cells * SHORTER * sizer.duration, shorter))
     return sorted(ways, key=lambda way: way[0])
 

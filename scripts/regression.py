@@ -8,7 +8,7 @@ of ranks nor the way in which a step is solved shows. Counts must be equal, the 
 tolerance.
 Exit status 0: all are; 1: something differs, or nothing was compared. --update stores the numbers found.
 
-The numbers and their tolerance are those of `msmpetsc baseline` and `msmpetsc check` (msmpetsc/study/baselines).
+The numbers and their tolerance are those of `msmpetsc check` (msmpetsc/study/baselines).
 """
 
 import sys

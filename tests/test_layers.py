@@ -9,10 +9,10 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
 LAYERS = [
     {"errors"}, {"scene", "comm", "backend", "extensions"}, {"geometry"}, {"model"}, {"solve"}, {"output"},
-    {"study"}, {"cli", "api", "__main__"},
+    {"app"}, {"study"}, {"cli", "__main__"},
 ]  # fmt: skip
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
-ONLY_IN = {"petsc4py": {"solve", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
+ONLY_IN = {"petsc4py": {"solve", "app", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
 NEVER = {("output", "solve")}  # a result can be read and drawn where there is no PETSc
 
 

@@ -17,6 +17,7 @@ import small_result
 import trimesh
 from conftest import ENVIRONMENT, ROOT
 
+from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
@@ -33,13 +34,11 @@ SMALLER = {  # a command's words -> those of the test
     "cages.count=3000": "cages.count=400 --frames 4",
     "run scenes/bunny_fall.toml --overwrite": "run scenes/bunny_fall.toml --overwrite --set cages.count=400 --frames 2",
     "my.toml --picture": "my.toml --picture --frames 2 --set cages.count=200",
-    "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500 --no-times",
+    "scene.toml --ranks 512": "scene.toml --ranks 8 --set cages.count=500",
     "--frames 0,100,200": "--frames 0,2,4",
     "--count 12": "--count 3",
-    "scene.toml --overwrite --watch": "scene.toml --set cages.count=200 --frames 3 --overwrite --watch",
     "render scene.toml": "render scene.toml --set cages.count=200",
     "scene.toml --surface-error 1e-2": "scene.toml --surface-error 0.3 --cells 300 --frames 4",
-    "scene.toml --error 1e-2": "scene.toml --error 1e-1 --frames 3",
     "scene.toml --resume out/x.h5": "scene.toml --resume out/x.h5 --set time.duration=0.03 --set cages.count=200",
     "--set time.duration=4": "--set time.duration=0.05",
 }
@@ -185,3 +184,18 @@ def test_the_study_files_are_some(tmp_path: Path):
         path.write_text(text)
         study = load_study(path, PRESETS)
         assert study.sweep or study.map
+
+
+def options_of_run() -> str:
+    """The table of what a run can be asked for, as the request has it."""
+    rows = ["| option | in Python | meaning |", "|---|---|---|"]
+    for name, option in OPTIONS.items():
+        value = option.value or "|".join(option.choices or ())
+        words = f"{option.short} {flag_of(name)} {value}" if name != "scene" else value
+        shown = "" if option.python else f"`{words.strip()}`".replace("|", "\\|")
+        rows.append(f"| {shown} | `{name}` | {option.help} |")
+    return "\n".join(rows)
+
+
+def test_the_table_of_options_is_that_of_the_request():
+    assert options_of_run() in (ROOT / "msmpetsc" / "README.md").read_text(), options_of_run()

@@ -1,56 +1,35 @@
-"""The command line parsed, and what several commands refuse of it; options/ has the arguments of each command.
+"""The command line parsed; options.py has the arguments of each command.
 
 What is imported at the top starts neither MPI nor PETSc, so that ``--help`` answers at once.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import msmpetsc
-from msmpetsc.cli.options.checks import add_baseline, add_check
-from msmpetsc.cli.options.examples import EXAMPLES, EXAMPLES_HEAD, ExamplesKept
-from msmpetsc.cli.options.planning import add_inspect, add_plan, add_study
-from msmpetsc.cli.options.program import add_completion, add_doctor
-from msmpetsc.cli.options.results import add_compare, add_export, add_render
-from msmpetsc.cli.options.run import add_run
-from msmpetsc.cli.options.scenes import add_fetch, add_keys, add_new, add_schema
-from msmpetsc.cli.options.values import Commands, add_verbosity
+from msmpetsc.app.checks import SCENE_NAMES
+from msmpetsc.cli import options
+from msmpetsc.cli.options import EXAMPLES, EXAMPLES_HEAD, Commands, ExamplesKept, add_verbosity
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
-TAKE_PETSC_OPTIONS = ("run", "inspect")
-
-# Parsing
+TAKE_PETSC_OPTIONS = ("run",)
 
 
 def parsed(words: list[str]) -> argparse.Namespace:
-    """Parse a whole command line. Raises InputError."""
-    return parsed_apart(*split_petsc_options(words), words)
-
-
-def parsed_apart(ours: list[str], petsc: list[str], words: list[str]) -> argparse.Namespace:
-    """Parse our own arguments and PETSc's options.
-
-    ours  : the command, then its arguments
-    petsc : PETSc's options, each of them followed by its value if it has one
-    words : all of them as they are to be recorded
-
-    Raises InputError.
-    """
+    """Parse a whole command line: our own arguments, and PETSc's options. Raises InputError."""
+    ours, petsc = split_petsc_options(words)
     _refuse_unknown_command(ours)
     _refuse_one_dash(ours, petsc)
-    given = argparse.Namespace(petsc_options=tuple(petsc), words=tuple(words))
-    args, unknown = command_parser().parse_known_args(ours, given)
+    args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))
     if unknown:
         near = did_you_mean(unknown[0], option_names(args.command))
         raise InputError(f"{args.command}: unknown argument {unknown[0]}{near}")
-    if petsc and args.command not in TAKE_PETSC_OPTIONS:
-        raise InputError(f"{petsc[0]}: {args.command} takes no PETSc options")
     return args
 
 
@@ -143,61 +122,18 @@ def option_names(command: str) -> list[str]:
 
 
 COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module of its name
-    "new": add_new,
-    "run": add_run,
-    "inspect": add_inspect,
-    "study": add_study,
-    "plan": add_plan,
-    "compare": add_compare,
-    "render": add_render,
-    "export": add_export,
-    "baseline": add_baseline,
-    "check": add_check,
-    "fetch": add_fetch,
-    "keys": add_keys,
-    "schema": add_schema,
-    "doctor": add_doctor,
-    "completion": add_completion,
+    "new": options.add_new,
+    "run": options.add_run,
+    "inspect": options.add_inspect,
+    "study": options.add_study,
+    "plan": options.add_plan,
+    "compare": options.add_compare,
+    "render": options.add_render,
+    "export": options.add_export,
+    "check": options.add_check,
+    "fetch": options.add_fetch,
+    "keys": options.add_keys,
+    "schema": options.add_schema,
+    "doctor": options.add_doctor,
+    "completion": options.add_completion,
 }
-
-
-# What several commands refuse
-
-RUNS_ITSELF = "it starts its runs on as many ranks as they need"
-RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
-MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
-SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
-NO_FOLDERS = (
-    *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES,
-    ".csv", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"
-)  # fmt: skip
-
-
-def refuse_below_one(**numbers: int | None) -> None:
-    """Raise InputError for the first option that is given and below 1: ``true_error=0`` for ``--true-error 0``."""
-    for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise InputError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
-
-
-def refuse_other_format(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Raise InputError for the name of a file of another format than is written."""
-    if path is not None and path.suffix.lower() not in endings:
-        raise InputError(f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}")
-
-
-def refuse_name_of_a_file(option: str, folder: Path | None) -> None:
-    """Raise InputError for a folder that is to be made under the name of a file."""
-    if folder is not None and folder.suffix.lower() in NO_FOLDERS and not folder.is_dir():
-        raise InputError(f"{option} {folder}: what is written there is a folder, no {folder.suffix} file")
-
-
-def refuse_ranks(command: str, why: str) -> None:
-    """Raise InputError where mpiexec has started more than one of a command that is for one process alone."""
-    if world().size > 1:
-        raise InputError(f"{command} is started without mpiexec: {why}")
-
-
-def interrupt(*_: Any) -> None:
-    """Treat a signal to end as Ctrl-C: the runs under way end with this process."""
-    raise KeyboardInterrupt

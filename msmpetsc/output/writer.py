@@ -192,12 +192,6 @@ class ResultFile:
                 self._flush(self._file)
         self.finished += 1
 
-    def newest_surface(self) -> np.ndarray | None:
-        """Return the surface points (v, 3) [m] of the newest frame on rank 0; None on others, or if none is stored."""
-        if self._file is None or not self._points or not self.finished:
-            return None
-        return self._file["frames/surface"][self.finished - 1].astype(float)
-
     def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
         rows, numbers = self._layout.rows, self._layout.numbers

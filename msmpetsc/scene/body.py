@@ -1,12 +1,11 @@
 """Tables of what the body is: surface, cells, material, parts, and regions of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.scene.problems import rule, unknown_name
-from msmpetsc.scene.units import is_quantity
 from msmpetsc.scene.values import (
     Box,
     Count,
@@ -144,13 +143,6 @@ class Region(Table):
         "text file beside this file that lists them: the cells they lie in are meant, or their corners [-]",
     )
     relative: bool = Field(False, description="coordinates run 0..1 along each axis of the rest bounding box")
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _relative_without_units(cls, data: Any, handler: Callable[[Any], Self]) -> Self:
-        if isinstance(data, dict) and data.get("relative") is True and is_quantity(data):
-            raise rule("has no units where relative = true: coordinates run 0..1 along the bounding box")
-        return handler(data)
 
     @field_validator("relative")
     @classmethod

@@ -1,19 +1,19 @@
 """The keys of a scene as a table, out of its schema: unit, default, range and meaning of each."""
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.scene.units import NUMBER, units_of, words_of
 
 SCHEMA_FILE = "msmpetsc.schema.json"  # which a scene's first line names, for editors
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 IF_ABSENT = re.compile(r"[;,] ([^;,]+) if absent")
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 UNREACHED = 1e18  # a bound beyond it only keeps numbers within a double or a 64-bit integer
+BRACES, BRACKETS = re.compile(r"\{.*?\}"), re.compile(r"\[([^]]+)\]")  # units; those within braces are of an example
 NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
 
 
@@ -33,7 +33,7 @@ class SceneKey:
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema of a scene file. TOML has no null: a key that may be absent is of its kind alone."""
-    return {"$schema": DIALECT, **_with_words(_without_null(SceneFile.model_json_schema()))}
+    return {"$schema": DIALECT, **_without_null(SceneFile.model_json_schema())}
 
 
 def keys(prefix: str = "") -> list[SceneKey]:
@@ -61,7 +61,7 @@ def _keys(schema: dict[str, Any], table: dict[str, Any], prefix: str) -> Iterato
             default = f"one of {', '.join(one_of)}"
         else:
             default = "required" if name in table.get("required", ()) else _default(found, text)
-        yield SceneKey(prefix + name, " or ".join(units_of(text)), default, _bounds(found), _about(text))
+        yield SceneKey(prefix + name, _units(text), default, _bounds(found), _about(text))
 
 
 def _default(found: dict[str, Any], text: str) -> str:
@@ -70,6 +70,11 @@ def _default(found: dict[str, Any], text: str) -> str:
         return absent[1]
     value = found.get("default")
     return "none" if value in (None, [], "") else str(value).lower() if isinstance(value, bool) else f"{value}"
+
+
+def _units(text: str) -> str:
+    """Return the units that a description names in brackets, each once."""
+    return " or ".join(dict.fromkeys(BRACKETS.findall(BRACES.sub("", text))))
 
 
 def _bounds(found: dict[str, Any]) -> str:
@@ -98,16 +103,3 @@ def _without_null(node: Any) -> Any:
     elif choices:
         kept["anyOf"] = choices
     return {name: _without_null(inner) for name, inner in kept.items()}
-
-
-def _with_words(node: Any, words: Collection[str] = ()) -> Any:
-    """Return a schema in which a number may be one with a word of its key's unit."""
-    if isinstance(node, list):
-        return [_with_words(inner, words) for inner in node]
-    if not isinstance(node, dict):
-        return node
-    words = words_of(node["description"]) if "description" in node else words
-    if words and node.get("type") == "number":
-        pattern = rf"^\s*{NUMBER}\s*({'|'.join(map(re.escape, words))})\s*$"
-        return node | {"type": ["number", "string"], "pattern": pattern}
-    return {name: _with_words(inner, words) for name, inner in node.items()}

@@ -14,7 +14,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import Scene, SceneFile
 from msmpetsc.scene.toml import DEEPEST, plain, toml_of
-from msmpetsc.scene.units import with_numbers
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
@@ -58,8 +57,7 @@ def scene_of(
     checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
-    numbers = with_numbers(data, checked)
-    text = tomli_w.dumps(numbers) if overrides or numbers != data else file_text
+    text = tomli_w.dumps(data) if overrides else file_text
     return Scene(**_given(checked), text=text, folder=path.parent)
 
 
@@ -79,7 +77,7 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     keys = {_override(data, override): override for override in overrides}
     checked = _checked(path, data, None, "", keys)
     try:
-        return Scene(**_given(checked), text=tomli_w.dumps(with_numbers(data, checked)), folder=folder)
+        return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 

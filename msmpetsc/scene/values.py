@@ -17,7 +17,6 @@ from pydantic import (
 )
 
 from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
-from msmpetsc.scene.units import in_si
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -117,13 +116,11 @@ class Table(BaseModel):
     def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
         """Add what pydantic does not check, and lose none of what it does."""
         known = list(cls.model_fields)
-        plain, problems = in_si(data, cls.model_fields)
-        misnamed = {problem["loc"] for problem in problems}
-        problems += one_of_problems(data, cls.one_of, known)
+        problems = one_of_problems(data, cls.one_of, known)
         try:
-            table = handler(plain)
+            table = handler(data)
         except ValidationError as error:
-            problems += [problem for problem in restated(error, known) if problem["loc"] not in misnamed]
+            problems += restated(error, known)
         if problems:
             raise ValidationError.from_exception_data(cls.__name__, problems)
         return table

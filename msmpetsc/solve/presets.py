@@ -90,17 +90,6 @@ PRESETS = {
         },
         inexact=True,
     ),
-    "ngmres": Preset(
-        "Nonlinear GMRES over the same iterations, its own line search: where anderson runs astray",
-        {
-            "snes_type": "ngmres",
-            "snes_ngmres_m": "5",
-            "snes_max_it": "300",
-            **NO_STOP_BY_SIZE,
-            **LOCAL_GLOBAL,
-        },
-        inexact=True,
-    ),
     "lbfgs": Preset(
         "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
         {

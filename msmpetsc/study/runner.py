@@ -77,10 +77,6 @@ class Bench:
             row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
         return CaseResult(row | rates(row, case.time_step), trace, seconds)
 
-    def references(self) -> list[Path]:
-        """Return the results of the references made so far."""
-        return sorted((self.folder / "references").glob("*.h5"))
-
     def _named(self, case: Case) -> Row:
         """Return what is known of a case before it runs."""
         return case.columns | {"study": self.study, "command": shown_command(case)}

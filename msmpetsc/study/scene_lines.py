@@ -11,7 +11,7 @@ from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import inline, scene_tables
-from msmpetsc.study.plan import Candidate
+from msmpetsc.study.sizing.choice import Candidate
 
 Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 

@@ -26,11 +26,11 @@ COMMANDS = [
     ["render", "good.h5", "-o", "{}"],
     ["study", "{}"],
     ["study", "study.toml", "-o", "{}"],
-    ["plan", "{}", "--error", "0.1"],
+    ["plan", "{}", "--surface-error", "0.1"],
     ["fetch", "{}"],
     ["new", "{}", "--mesh", "good.h5"],
     ["new", "new.toml", "--mesh", "{}"],
-    ["baseline", "{}"],
+    ["check", "--update", "{}"],
     ["check", "{}"],
 ]
 PATHS = ["", ".", "..", "/", "folder", "folder/", "x" * 300 + ".h5", "a\nb.h5", "\udcff.h5", "device", "pipe"]

@@ -1,4 +1,4 @@
-"""``msmpetsc baseline`` and ``msmpetsc check``: a scene of one's own guarded by its numbers."""
+"""``msmpetsc check``: a scene of one's own guarded by its numbers."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("own")
     fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": {"acceleration": [0, 0, -9.81]}}
     path = block_scene(folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}])
-    assert main(["baseline", str(path), "--frames", str(STEPS), "--set", "material.density=900.0"]) == 0
+    assert main(["check", "--update", str(path), "--frames", str(STEPS), "--set", "material.density=900.0"]) == 0
     return path
 
 
@@ -67,15 +67,17 @@ def test_what_differs_is_named_and_counted(scene: Path, numbers: Path, tmp_path:
     assert suite.get("failures") == "2" and failed == ["elastic", "pinned"]
 
 
-def test_a_changed_scene_differs(scene: Path, capfd):
-    text = scene.read_text()
+def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(scene: Path, numbers: Path, capfd):
+    text, before = scene.read_text(), json.loads(numbers.read_text())
     scene.write_text(text.replace("young_modulus = 100000.0", "young_modulus = 100010.0"))
     try:
         assert scene.read_text() != text and main(["check", str(scene)]) == 1
+        assert main(["check", "--update", str(scene)]) == 0
     finally:
         scene.write_text(text)
-    out = capfd.readouterr().out
+    out, after = capfd.readouterr().out, json.loads(numbers.read_text())
     assert "DIFFERS" in out and f"{scene}: elastic: " in out
+    assert after["run"] == before["run"] and after["numbers"] != before["numbers"]
 
 
 def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Path, tmp_path: Path, capsys):
@@ -83,11 +85,11 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
     few = ("--set", "time={step=1e-2, duration=1}")
     refused = {
         "nothing is stored of": ["check", str(other)],
-        "--overwrite": ["baseline", str(scene)],
-        "time.error": ["baseline", str(other)],
+        "are for --update": ["check", str(scene), "--cells", "30"],
+        "time.error": ["check", "--update", str(other)],
         "is named *.xml": ["check", str(scene), "--junit", "x.txt"],
-        "--frames must be at least 1": ["baseline", str(other), "--frames", "0"],
-        "the run failed": ["baseline", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
+        "--frames must be at least 1": ["check", "--update", str(other), "--frames", "0"],
+        "the run failed": ["check", "--update", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
     }
     for words, command in refused.items():
         assert main(command) == 2, words
@@ -136,7 +138,7 @@ def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, 
     stored = json.loads(numbers.read_text())
     stored["run"]["changes"] = [f"mesh.source={ball}"]
     numbers.write_text(json.dumps(stored))
-    for command in (["check", str(scene)], ["baseline", str(scene), "--overwrite", "--set", f"mesh.source={ball}"]):
+    for command in (["check", str(scene)], ["check", "--update", str(scene), "--set", f"mesh.source={ball}"]):
         assert main(command) == 2
         assert "is not in the scene's folder" in capsys.readouterr().err
     assert json.loads(numbers.read_text()) == stored

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,6 @@ from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc import limits
-from msmpetsc.study import forecast
-from msmpetsc.study.forecast import Forecast, Network, ShortRun, held, units
 
 WORKER = WORKERS / "shares_worker.py"
 SELF = MPI.COMM_SELF
@@ -148,49 +145,6 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     unknowns.destroy()
 
 
-# Memory and time
-
-
-def trial(side: int, program: float, factor: float, its: float) -> ShortRun:
-    """As of a machine that takes 2e-5 s + 3e-9 s a spring for an iteration."""
-    cube = a_cube(side)
-    cells, nodes, springs, nonzeros = (float(v[0]) for v in (cube.cells, cube.nodes, cube.inner, cube.nonzeros))
-    memory = program + factor * held(cells, nodes, springs, nonzeros)
-    return ShortRun(cells, nodes, springs, nonzeros, memory, units(its, 2) * (2e-5 + 3e-9 * springs), 2, its)
-
-
-def test_the_laws_of_memory_and_time_are_found():
-    found = Forecast(trial(8, 3e8, 1.2, 40), trial(20, 3e8, 1.2, 100))  # its as the side
-    cube = a_cube(60)
-    assert found.program == pytest.approx(3e8)
-    arrays = held(cube.cells, cube.nodes, cube.inner, cube.nonzeros)
-    assert found.memory(cube) == pytest.approx(3e8 + 1.2 * arrays)
-    assert found.memory(cube, mesh=1e12) == pytest.approx(3e8 + 1e12)
-    assert found.its(cube.cells.sum()) == pytest.approx(300)
-    assert found.computing(cube) == pytest.approx(units(300, 2) * (2e-5 + 3e-9 * cube.inner[0]))
-    assert found.messages(cube, Network(1e-6, 1e9)) == 0  # alone
-
-
-def test_its_grow_no_faster_than_the_side_and_never_fall():
-    assert Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 500)).its(40**3) == pytest.approx(1000)
-    assert Forecast(trial(8, 0, 1, 30), trial(20, 0, 1, 20)).its(40**3) == 20
-    solved = Forecast(trial(8, 0, 1, 0), trial(20, 0, 1, 0))
-    assert solved.its(40**3) == 0 and solved.iterations(40**3) == 2
-
-
-def test_substeps_of_verlet_grow_as_the_side():
-    coarse, fine = (replace(trial(side, 0, 1, 0), iterations=side) for side in (8, 20))
-    assert Forecast(coarse, fine).iterations(40**3) == pytest.approx(40)
-
-
-def test_messages_cost_latency_and_bandwidth():
-    """Two ranks of 1000 ghosts, one neighbour each."""
-    two = Partition(*(np.array([v, v], float) for v in (1e4, 1e4, 1000, 1e5, 1e4, 1)))
-    found = Forecast(trial(8, 0, 1, 10), trial(20, 0, 1, 10))
-    exchanges, sums = 10 + 4 * 3, 3 * 10 + 10 * 3
-    assert found.messages(two, Network(1e-6, 1e9)) == pytest.approx(exchanges * (1e-6 + 24e-6) + sums * 2e-6)
-
-
 # The command
 
 
@@ -198,9 +152,6 @@ def test_messages_cost_latency_and_bandwidth():
     ("words", "said"),
     [
         (["--ranks", "0"], "--ranks must be at least 1"),
-        (["--frames", "0"], "--frames must be at least 1"),
-        (["--latency", "-1"], "--latency must be no less than 0"),
-        (["--bandwidth", "0"], "--bandwidth must be more than 0"),
         (["--set", "cages.cuont=3"], "did you mean 'count'"),
         (["--ranks", "many"], "invalid int value"),
     ],
@@ -211,18 +162,18 @@ def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, own_log, words:
     assert said in told.err and told.err.count("\n") == 1 and told.out == ""
 
 
-def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log, monkeypatch):
-    monkeypatch.setattr(forecast, "forecast", None)
+def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log):
     found = counted(scene, 300, 3)
-    assert main(["inspect", str(scene), "--ranks", "3", "--no-times"]) == 0
+    assert main(["inspect", str(scene), "--ranks", "3"]) == 0
     told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
     assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
     assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
+    assert 3 * 0.29 < float(told["memory [GB]"][0]) < 3 * 0.31
 
 
 def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Path, capsys, own_log):
     budget = "budget={target = 0.1, cells = 0.05, time = 0.02, step = 0.001, count = 300, time_step = 0.01}"
-    words = ["inspect", str(scene), "--no-times", "--set", budget]
+    words = ["inspect", str(scene), "--set", budget]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert re.search(r"surface error expected +0.071, asked for 0.1\n +of the cells +0.05\n", out)
@@ -236,31 +187,17 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, o
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):
         fill_cages(read_bodies(SELF, load_scene(scene)), load_scene(scene, [many]))
-    assert main(["inspect", str(scene), "--ranks", "8", "--no-times", "--set", many]) == 0
+    assert main(["inspect", str(scene), "--ranks", "8", "--set", many]) == 0
     told = capsys.readouterr()
     assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err
-    assert main(["inspect", str(scene), "--no-times", "--set", "cages={cell_size = 0.02}"]) == 0
+    assert main(["inspect", str(scene), "--set", "cages={cell_size = 0.02}"]) == 0
     (cells,) = [line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")]
     volume = 4 / 3 * np.pi * 0.98  # of 320 triangles inside the sphere
     assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
 
 
-def test_times_are_measured_once_and_kept(scene: Path, capsys, own_log, monkeypatch, tmp_path: Path):
-    for name, value in {**ENVIRONMENT, "XDG_CACHE_HOME": str(tmp_path / "cache")}.items():
-        monkeypatch.setenv(name, value)
-    words = ["inspect", str(scene), "--ranks", "2", "--frames", "2"]
-    assert main(words) == 0
-    first = capsys.readouterr().out
-    monkeypatch.setattr(forecast, "_measured", None)  # not again
-    assert main(words) == 0
-    assert capsys.readouterr().out == first
-    (memory,) = [float(line.split()[-2]) for line in first.splitlines() if line.startswith("memory")]
-    assert 0.1 < memory < 1  # [GB]: a Python with PETSc
-    assert "time of a frame" in first and "KSP iterations and" in first
-
-
 def test_memory_is_that_of_the_process_not_of_its_parent():
-    code = "from msmpetsc.cli.running.profile import peak_memory; print(peak_memory())"
+    code = "from msmpetsc.app.profile import peak_memory; print(peak_memory())"
     large = np.ones(75_000_000)  # 600 MB
     told = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert 2e7 < int(told.stdout) < large.nbytes

@@ -56,12 +56,11 @@ ALONE = {
     "compare": (["bar.h5", "bar.h5"], "compare is started without mpiexec: it reads two files"),
     "render": (["bar.h5"], "render is started without mpiexec: it draws on one process"),
     "study": (["study.toml"], "study is started without mpiexec: it starts its runs on as many ranks as they need"),
-    "plan": (["scene.toml", "--error", "0.1"], "plan is started without mpiexec: it starts its runs"),
+    "plan": (["scene.toml", "--surface-error", "0.1"], "plan is started without mpiexec: it starts its runs"),
     "inspect": (["scene.toml"], "inspect is started without mpiexec: it counts for --ranks R"),
     "new": (["--list"], "new is started without mpiexec: it measures"),
     "keys": ([], "keys is started without mpiexec"),
     "schema": ([], "schema is started without mpiexec"),
-    "baseline": (["scene.toml"], "baseline is started without mpiexec: it starts its runs"),
     "check": (["scene.toml"], "check is started without mpiexec: it starts its runs"),
     "fetch": (["--list"], "fetch is started without mpiexec: it downloads"),
 }

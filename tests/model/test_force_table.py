@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from block_scene import DENSITY, SIDES, block_scene, play
 
-from msmpetsc.cli.running.resume import flat
+from msmpetsc.app.resume import flat
 from msmpetsc.errors import InputError
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.keys import keys

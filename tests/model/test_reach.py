@@ -13,8 +13,8 @@ from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
 
+from msmpetsc.app.summary import log_model, taken
 from msmpetsc.cli.main import main
-from msmpetsc.cli.running.march import log_model, taken
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, build_model, read_bodies
 from msmpetsc.model.reach import Reach

@@ -3,14 +3,12 @@
 import io
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -24,7 +22,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.fields import FRAME_FIELDS
 from msmpetsc.output import writer
-from msmpetsc.output.compress import pack
 from msmpetsc.output.reader import finished, newest_slot, open_result
 from msmpetsc.output.writer import Begin, ResultFile
 from msmpetsc.output.xdmf import write_xdmf
@@ -93,44 +90,6 @@ def test_who_writes_does_not_show_in_the_file(tmp_path):
         run_on_ranks(ranks, action, tmp_path / f"{ranks} {action}.h5")
     one, *others = [path.read_bytes() for path in sorted(tmp_path.glob("*.h5"))]
     assert len(others) == 2 and all(other == one for other in others)
-
-
-def test_a_packed_file_is_the_same_and_smaller(tmp_path):
-    path, rows = tmp_path / "x.h5", 4000  # of 96 kB a frame
-    with ResultFile(path, MPI.COMM_SELF, {"scene": "title = 'a test'"}) as file:
-        file.write("lattice/nodes", positions(0, rows))
-        file.write("lattice/pinned", np.zeros(0, int))
-        file.start_frames(3, rows)
-        for index in range(3):
-            file.append(replace(frame(index, points=None), position=positions(index, rows)))
-    shutil.copy(path, tmp_path / "before.h5")
-    pack(path)
-    assert path.stat().st_size < 0.5 * (tmp_path / "before.h5").stat().st_size
-    with h5py.File(path) as file, h5py.File(tmp_path / "before.h5") as before:
-        assert {**file.attrs} == {**before.attrs}
-        names = []
-        before.visit(names.append)
-        for name in names:
-            assert {**file[name].attrs} == {**before[name].attrs}
-            if isinstance(before[name], h5py.Dataset):
-                assert np.array_equal(file[name][...], before[name][...], equal_nan=True)
-        assert file["frames/position"].chunks == (1, rows, 3)  # a frame is read alone
-
-
-def test_packing_on_a_full_disk_leaves_the_file_as_it_was(tmp_path, monkeypatch):
-    path = tmp_path / "x.h5"
-    with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(1, NODES)
-        file.append(frame(0, points=None))
-    before = path.read_bytes()
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(h5py.Dataset, "__setitem__", full)
-    with pytest.raises(InputError, match="No space left on device"):
-        pack(path)
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["x.h5"]
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):

@@ -18,10 +18,10 @@ from ball_result import write_ball
 from conftest import ROOT
 from matplotlib.figure import Figure
 
-from msmpetsc.cli.arguments import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
+from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
+from msmpetsc.cli.commands.check import Checked, write_junit
 from msmpetsc.errors import InputError
-from msmpetsc.output.compress import pack
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
 from msmpetsc.output.drawing.sheet import contact_sheet
@@ -31,12 +31,11 @@ from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.study.baselines import baseline
-from msmpetsc.study.baselines.junit import Checked, write_junit
 from msmpetsc.study.charts.style import Chart, save_png
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
 from msmpetsc.study.scene_lines import put_into
+from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
 
 pytestmark = pytest.mark.timeout(100)
@@ -82,7 +81,6 @@ def writers(sources: Path) -> dict[str, Writer]:
     bar, ball = sources / "bar.h5", sources / "ball.h5"
     table = {
         "x.h5": Writer("output/writer.py", small_result.write),
-        "packed.h5": Writer("output/compress.py", pack, small_result.write),
         "x.xdmf": Writer(
             "output/xdmf.py",
             lambda path: write_xdmf(path.with_suffix(".h5")),
@@ -91,7 +89,7 @@ def writers(sources: Path) -> dict[str, Writer]:
         "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
         "x.baseline.json": Writer("study/baselines/baseline.py", lambda path: baseline.write(path, {"counts": {}})),
         "junit.xml": Writer(
-            "study/baselines/junit.py",
+            "cli/commands/check.py",
             lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
         ),
         "planned.toml": Writer(
@@ -118,7 +116,7 @@ def writers(sources: Path) -> dict[str, Writer]:
 
 NAMES = [*writers(Path())]
 # what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
-NOT_TRIED = {"output/drawing/live.py", "study/forecast.py", "cli/running/profile.py"}
+NOT_TRIED = {"app/profile.py"}
 
 
 @contextmanager
@@ -185,7 +183,7 @@ ALLOWED = {
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
-    "cli/running/profile.py": "asks before a run whether it could write",
+    "app/profile.py": "asks before a run whether it could write",
     "output/drawing/stage.py": "/dev/null",
 }
 

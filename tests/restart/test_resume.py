@@ -18,8 +18,8 @@ from conftest import WORKERS
 from mpi4py import MPI
 from stopped_runs import STEPS, assert_same, hanging, signal_after
 
+from msmpetsc.app.resume import Resumed
 from msmpetsc.cli.main import main
-from msmpetsc.cli.running.resume import Resumed
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.output.reader import finished

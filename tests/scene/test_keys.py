@@ -87,9 +87,7 @@ def test_the_json_schema_takes_every_shipped_scene_and_no_mistake(name: str):
     assert not accepts(schema, schema, scene | {"obstacles": []})
     assert not accepts(schema, schema, scene | {"material": {"density": 1000.0}})
     assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": -1.0}})
-    assert accepts(schema, schema, scene | {"time": scene["time"] | {"step": "2.5e-1 ms"}})
-    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "1 mm"}})
-    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "ms"}})
+    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "2.5e-1 ms"}})
     assert accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, -9.81]}})
     assert not accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, "1 m"]}})
 

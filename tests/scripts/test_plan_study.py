@@ -8,10 +8,9 @@ import plan_study
 import pytest
 
 from msmpetsc.study.cases import Case
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench, CaseResult
-from msmpetsc.study.sizing.choice import Budget, Choice
+from msmpetsc.study.sizing.choice import Budget, Candidate, Choice
 
 CASE = Case(scene="", file=Path(), content="", set=(), integrator="verlet", time_step=0.01, timeout=10.0)
 NOTHING = Budget(0.0, 0.0, 0.0)
@@ -51,10 +50,10 @@ def test_no_trial_of_the_plan_is_a_finer_run(cells: int, finer: int):
 
 def test_a_finer_run_takes_the_cheaper_way():
     """Explicit substeps of their own length, or BDF2 in a quarter of the step, by what the trials cost."""
-    choice = Choice(Candidate("implicit-euler", 0.02, "newton", "", 1e-2), 1000, NOTHING, 2.0, NOTHING)
+    choice = Choice(Candidate("implicit-euler", 0.02, "newton", 1e-2), 1000, NOTHING, 2.0, NOTHING)
     sizer = SimpleNamespace(trials=[trial("verlet", 0.01, 1000.0, 1.0)], step=0.01, duration=0.5)
     (seconds, explicit), (more, implicit) = plan_study.finer_methods(sizer, choice, 8000)
     assert explicit == Candidate("verlet", 0.01) and seconds == pytest.approx(0.5 * 16)
-    assert implicit == Candidate("bdf2", 0.005, "newton", "", 1e-3) and more == pytest.approx(0.5 * 2 * 8 * 4)
+    assert implicit == Candidate("bdf2", 0.005, "newton", 1e-3) and more == pytest.approx(0.5 * 2 * 8 * 4)
     sizer.trials = [trial("verlet", 0.001, 1000.0, 1.0)]  # a trial of the step's error alone
     assert [method.integrator for _, method in plan_study.finer_methods(sizer, choice, 8000)] == ["bdf2"]

@@ -142,7 +142,7 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
     [
         ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),  # which takes no start for its solves
         ("anderson", {"snes_type": "newtonls"}),  # which solves without an NPC
-        ("ngmres", {"snes_type": "newtontr"}),
+        ("anderson", {"snes_type": "newtontr"}),
     ],
 )
 def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: dict[str, str]):

@@ -156,7 +156,6 @@ def test_the_studies_shipped_are_sound():
         "anderson",
         "lbfgs",
         "chebyshev",
-        "ngmres",
         "fast-msm",
         "paper",
         "fast-msm-kronecker",

@@ -1,7 +1,9 @@
 """Sizing: errors from runs of several sizes, and the cheapest split of an error among cells, time step and solution."""
 
 # ruff: noqa: F811 (fixtures are imported)
+import json
 import math
+import os
 import shlex
 import shutil
 import subprocess
@@ -21,11 +23,11 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import Case
 from msmpetsc.study.distances import surface_error
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import CaseResult
+from msmpetsc.study.scene_lines import overrides, put_into
 from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.answer import SizePlan, Tried
-from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Sizer
 
@@ -79,7 +81,7 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
 
 
 def stepping(integrator: str, step: float, error: float, cost: float) -> Stepping:
-    return Stepping(Candidate(integrator, step, "newton", "", 1e-3), error, cost)
+    return Stepping(Candidate(integrator, step, "newton", 1e-3), error, cost)
 
 
 EULER = [stepping("implicit-euler", 0.01 / 2**k, 0.32 / 2**k, 2.0**k) for k in range(8)]
@@ -432,7 +434,7 @@ def test_the_true_error_of_a_plan_is_what_was_asked_for(tmp_path: Path):
 
 
 PLAN = SizePlan(
-    Choice(Candidate("bdf2", 0.005, "newton", "", 1e-2), 4321, Budget(0.05, 0.03, 0.001), 7.5, Budget(0.6, 0.3, 0.1)),
+    Choice(Candidate("bdf2", 0.005, "newton", 1e-2), 4321, Budget(0.05, 0.03, 0.001), 7.5, Budget(0.6, 0.3, 0.1)),
     met=True, bounds=["the step: planted"],
     tried=[Tried("bdf2", 500, 2.0, 0.2), Tried("verlet", 4000, 9.0, 0.06)],
 )  # fmt: skip
@@ -462,6 +464,82 @@ def test_the_command_tells_the_answer_writes_it_and_draws_it(tmp_path: Path, mon
     assert chart.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_answer_is_one_json_object(tmp_path: Path, monkeypatch, capsys, own_log):
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: print("what was tried") or PLAN)
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    assert main(["plan", str(path), "--surface-error", "0.1", "--json"]) == 0
+    out, err = capsys.readouterr()
+    told = json.loads(out)
+    assert told["met"] and told["choice"]["cells"] == 4321 and told["error"] == pytest.approx(0.081)
+    assert told["command"].startswith("msmpetsc run") and "what was tried" in err
+
+
+def test_an_answer_that_cannot_be_written_is_told_all_the_same(tmp_path: Path, monkeypatch, capsys, own_log):
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: PLAN)
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(["plan", str(path), "--surface-error", "0.1", "--write"]) == 2
+    told = capsys.readouterr()
+    assert 'integrator = "bdf2"' in told.out and path.read_text() == SCENE
+    assert told.err == f"msmpetsc: error: {path} cannot be written: No space left on device\n"
+
+
+COMMENTED = """# A scene of mine
+title = "x"      # for the reader
+
+[time]
+step = 0.02      # [s]
+duration = 1.0
+
+[solver]         # how
+preset = "anderson"
+max_iterations = 5
+"""
+
+
+def test_what_is_written_into_a_scene_keeps_its_comments(tmp_path: Path):
+    path = tmp_path / "scene.toml"
+    path.write_bytes(COMMENTED.replace("\n", "\r\n").encode())
+    put_into(path, Candidate("implicit-euler", 0.005, "newton", 1e-2))
+    expected = COMMENTED.replace("step = 0.02 ", "step = 0.005 ").replace("anderson", "newton")
+    expected = expected.replace("max_iterations = 5", "error = 0.01").replace("\n", "\r\n")
+    assert path.read_bytes().decode() == expected
+    put_into(path, Candidate("verlet", 0.02))
+    told = path.read_text()
+    assert 'integrator = "verlet"' in told and "# A scene of mine" in told and "# how" in told
+
+
+BEFORE = {
+    "bare": "time = { step = 0.02, duration = 1.0 }",
+    "implicit": "time = { step = 0.02, duration = 1.0, integrator = 'implicit-euler' }\n"
+    "solver = { preset = 'anderson', max_iterations = 5 }",
+    "verlet": "time = { step = 0.02, duration = 1.0, integrator = 'verlet', substep = 1e-4 }\nsolver.error = 0.1",
+}
+
+
+@pytest.mark.parametrize(
+    "method",
+    [Candidate("verlet", 0.02), Candidate("implicit-euler", 0.005, "lbfgs", 1e-5)],
+    ids=["explicit", "implicit"],
+)
+@pytest.mark.parametrize("given", BEFORE)
+def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Candidate):
+    """Run with these changes the scene is the same as with the answer written into it."""
+    mesh = 'mesh.source = "beam.obj"\ncages.count = 10\nmaterial = { density = 1, young_modulus = 1 }\n'
+    path = tmp_path / "scene.toml"
+    path.write_text(mesh + BEFORE[given])
+    changed = load_scene(path, overrides(path, method))
+    put_into(path, method)
+    written = load_scene(path)
+    assert (changed.time, changed.solver) == (written.time, written.solver)
+    assert changed.time.step == method.time_step and changed.time.integrator == method.integrator
+
+
 def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path, monkeypatch, capsys, own_log):
     monkeypatch.setattr(plan_command, "size_all", lambda *_: replace(PLAN, met=False))
     path = tmp_path / "scene.toml"
@@ -478,7 +556,9 @@ def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path
         (["--surface-error", "2"], "between 0 and 1"),
         (["--surface-error", "0.1", "--cells", "0"], "--cells must be at least 1"),
         (["--surface-error", "0.1", "--chart", "x.svg"], "*.png"),
-        (["--error", "0.1", "--cells", "100"], "for --surface-error only"),
+        ([], "--surface-error"),
+        (["--surface-error", "0.1", "--frames", "0"], "--frames must be at least 1"),
+        (["--surface-error", "0.1"], "no such scene"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):

@@ -4,7 +4,7 @@ import sys
 
 from mpi4py import MPI
 
-from msmpetsc.cli import failure
+from msmpetsc.app import failure
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 

@@ -56,7 +56,6 @@ MORE = [
     ["--force"],
     ["--force", "--set", "time.duration=0.1"],
     ["--force", "--preset", "lbfgs"],
-    ["--compress"],
 ]
 
 

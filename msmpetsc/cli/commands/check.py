@@ -1,31 +1,110 @@
-"""``msmpetsc check``: are the numbers of a scene still those that ``baseline`` stored."""
+"""``msmpetsc check``: are the numbers of a scene still those that were stored; ``--update`` stores them."""
 
 import argparse
 import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from xml.etree import ElementTree
 
-from msmpetsc.cli.arguments import RUNS_ITSELF, XML_NAMES, refuse_below_one, refuse_other_format, refuse_ranks
-from msmpetsc.cli.commands.baseline import found, stored_beside
+from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, read, row
-from msmpetsc.study.baselines.junit import Checked, write_junit
+from msmpetsc.output.disk import write_whole
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.study.baselines import baseline
+from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, row
 
 SAME, DIFFERENT = 0, 1
+STEPS = 20  # of a scene's numbers, if nothing else is asked for
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A scene that was run and held against its numbers.
+
+    lines   : for each count and number what is wrong with it, nothing for what is as stored
+    seconds : that the run took
+    """
+
+    scene: Path
+    lines: Mapping[str, str]
+    seconds: float
+
+    @property
+    def wrong(self) -> list[str]:
+        """What is not as stored, a line each."""
+        return [line for line in self.lines.values() if line]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run each scene and compare; return the exit status."""
+    """Run each scene, and compare or store its numbers; return the exit status."""
     refuse_ranks("check", RUNS_ITSELF)
-    refuse_below_one(ranks=args.ranks)
+    refuse_below_one(ranks=args.ranks, frames=args.frames, cells=args.cells)
     refuse_other_format("--junit", args.junit, XML_NAMES)
+    refuse_other_format("--baseline", args.baseline, MEASURE_NAMES)
     if args.baseline and len(args.scenes) > 1:
         raise InputError("--baseline names the numbers of one scene: of several, each has its own beside it")
-    files = {scene: args.baseline or stored_beside(scene) for scene in args.scenes}
+    files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
+    if args.update:
+        if args.junit or args.json:
+            raise InputError("--update checks nothing: --junit and --json have no place beside it")
+        for scene, file in files.items():
+            update(scene, file, args)
+        return SAME
+    if args.frames or args.cells or args.set:
+        raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")
+    return check(files, args)
+
+
+# Storing
+
+
+def update(scene: Path, file: Path, args: argparse.Namespace) -> None:
+    """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
+    if file.is_file() and not (args.frames or args.cells or args.set):
+        recipe = Recipe.of(baseline.read(file))
+    else:
+        recipe = Recipe(args.cells, args.frames or STEPS, tuple(args.set))
+    time = load_scene(scene, recipe.changes, by_user=False).time
+    if time.error is not None:
+        raise InputError(
+            f"{scene}: time.error chooses steps by an estimate: how far numbers may be apart then is not known; "
+            "--set time={step=..., duration=...} takes steps of one length"
+        )
+    recipe = Recipe(recipe.cells, min(recipe.steps, time.steps), recipe.changes)
+    numbers = found(scene, recipe, args.ranks)
+    baseline.write(file, numbers)
+    count = len(numbers["counts"]) + len(numbers["numbers"])
+    accuracy = baseline.allowed(recipe.steps, "m")
+    print(f"{file}: {count} numbers after {recipe.steps} steps, positions to {accuracy:.1g}")
+
+
+def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
+    """Run a scene by a recipe; return its numbers. Raises InputError where the run fails."""
+    load_scene(scene, recipe.changes, by_user=False)  # they come with the scene, and name what lies beside it
+    with tempfile.TemporaryDirectory(prefix="msmpetsc-numbers-") as folder:
+        path = Path(folder) / "run.h5"
+        try:
+            baseline.simulate(scene, recipe, path, ranks)
+        except RuntimeError as error:
+            raise InputError(f"{scene}: the run failed: {error}") from None
+        except OSError as error:  # of a full disk, of an mpiexec that is not there
+            raise InputError(f"{error.filename}: {error.strerror}") from None
+        return baseline.summary(path, recipe)
+
+
+# Comparing
+
+
+def check(files: Mapping[Path, Path], args: argparse.Namespace) -> int:
+    """Hold the scenes against the files of their numbers; return the exit status."""
     for scene, file in files.items():
         if not file.is_file():
-            raise InputError(f"nothing is stored of {scene}: msmpetsc baseline {scene} stores {file}")
-    stored = {scene: read(file) for scene, file in files.items()}
+            raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {scene} stores {file}")
+    stored = {scene: baseline.read(file) for scene, file in files.items()}
     if not args.json:
         print(HEAD, flush=True)
     outcomes = [checked(scene, numbers, args) for scene, numbers in stored.items()]
@@ -50,3 +129,17 @@ def checked(scene: Path, stored: Numbers, args: argparse.Namespace) -> Checked:
         limit = nearest_to_limit(numbers, stored)
         print(row(scene.stem, numbers["counts"], limit, outcome.seconds, verdict), flush=True)
     return outcome
+
+
+def write_junit(path: Path, outcomes: list[Checked]) -> None:
+    """Write a suite for each scene, a case for each number, as continuous integration reads. Raises InputError."""
+    root = ElementTree.Element("testsuites", name="msmpetsc check")
+    for outcome in outcomes:
+        counts = {"tests": str(len(outcome.lines)), "failures": str(len(outcome.wrong))}
+        suite = ElementTree.SubElement(root, "testsuite", {"name": str(outcome.scene), "errors": "0"} | counts)
+        suite.set("time", f"{outcome.seconds:.3f}")
+        for name, line in outcome.lines.items():
+            case = ElementTree.SubElement(suite, "testcase", classname=outcome.scene.stem, name=name)
+            if line:
+                ElementTree.SubElement(case, "failure", message=line).text = line
+    write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.cli.arguments import refuse_ranks
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.output.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.output.reader import Result, refuse_deadly

@@ -3,8 +3,8 @@
 import argparse
 from typing import Any
 
+from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.cli.arguments import command_parser
-from msmpetsc.cli.options.values import file_argument, path_argument
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError
 
@@ -27,5 +27,5 @@ def run(args: argparse.Namespace) -> int:
 def complete_files(parser: argparse.ArgumentParser, by: dict[str, Any]) -> None:
     """Complete each argument that is a path by the files that there are."""
     for action in parser._actions:
-        if action.type in (path_argument, file_argument):
+        if action.type in (checked_path, checked_file):
             action.complete = by  # type: ignore[attr-defined]  # where shtab looks for it

@@ -2,7 +2,8 @@
 
 import argparse
 
-from msmpetsc.cli.arguments import refuse_below_one, refuse_ranks
+from msmpetsc.app.checks import refuse_below_one
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.output.export.formats import export
 from msmpetsc.output.reader import refuse_deadly
 

@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from msmpetsc.cli.arguments import refuse_ranks
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, fetch, find
 

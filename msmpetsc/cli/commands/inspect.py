@@ -1,9 +1,10 @@
-"""``msmpetsc inspect``: what a scene would need on so many ranks, without running it there."""
+"""``msmpetsc inspect``: what a scene would need on so many ranks, without running it there.
+
+memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled), or W is made if that is more
+"""
 
 import argparse
 import json
-import shlex
-import signal
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-from msmpetsc.cli.arguments import interrupt, option_names, refuse_below_one, refuse_ranks
-from msmpetsc.cli.running.profile import peak_memory
+from msmpetsc.app.checks import refuse_below_one
+from msmpetsc.app.profile import peak_memory
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
 MOST_CELLS = 1e15  # where limits are looked for
+PROGRAM, FACTOR = 0.29e9, 2.1  # [byte] of a rank without arrays, and times those, as runs of newton show it
+BYTES_OF_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
 GB = 1e9
 SPRINGS = "springs; of a rank, shared ones too"
 WIDTH = 36  # of the first column
@@ -34,15 +38,14 @@ WIDTH = 36  # of the first column
 def run(args: argparse.Namespace) -> int:
     """Inspect a scene; return the exit status."""
     refuse_ranks("inspect", "it counts for --ranks R on one process")
-    refuse_bad_numbers(args)
-    initialise(MPI.COMM_WORLD, list(args.petsc_options))
+    refuse_below_one(ranks=args.ranks)
+    if args.ranks > MOST_RANKS:
+        raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
+    initialise(MPI.COMM_WORLD, [])
     from msmpetsc.model.build import read_bodies
     from msmpetsc.model.partition import partition_of
-    from msmpetsc.solve.options import refuse_early
     from msmpetsc.solve.presets import preset_names
 
-    refuse_early(MPI.COMM_WORLD, option_names("inspect"))
-    signal.signal(signal.SIGTERM, interrupt)
     scene = load_scene(args.scene, args.set, preset_names())
     before = peak_memory()
     bodies = read_bodies(MPI.COMM_WORLD, scene)
@@ -51,32 +54,18 @@ def run(args: argparse.Namespace) -> int:
     cells = partition.cells.sum()
     if cells > scene.cages.max_cells:
         log.warning("run refuses %d cells until cages.max_cells = %d is raised", cells, scene.cages.max_cells)
-    report = {"scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition)}
-    if not args.json:
-        print_counts(args, scene, partition, report)
-        print_budget(scene)
-    if not args.no_times:
-        surfaces = [body.surface for body in bodies if body.surface is not None]
-        report["needs"] = needs_of(args, scene, surfaces, partition, mesh)
-        if not args.json:
-            print_needs(report["needs"])
-    report["limits"] = limits_of(partition)
+    surfaces = [body.surface for body in bodies if body.surface is not None] if scene.output.surface else []
+    report = {
+        "scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition),
+        "memory": over_ranks(memory_of(partition, surfaces, mesh)), "limits": limits_of(partition),
+    }  # fmt: skip
     if args.json:
         print(json.dumps(report, indent=1))
-    else:
-        print_limits(report["limits"], partition)
+        return 0
+    print_counts(args, scene, partition, report)
+    print_budget(scene)
+    print_limits(report["limits"], partition)
     return 0
-
-
-def refuse_bad_numbers(args: argparse.Namespace) -> None:
-    """Raise InputError for numbers that are out of range."""
-    refuse_below_one(ranks=args.ranks, frames=args.frames)
-    if args.ranks > MOST_RANKS:
-        raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
-    if not (args.latency >= 0 and np.isfinite(args.latency)):
-        raise InputError(f"--latency must be no less than 0, not {args.latency:g}")
-    if not args.bandwidth > 0:
-        raise InputError(f"--bandwidth must be more than 0, not {args.bandwidth:g}")
 
 
 def counts_of(scene: Scene, partition: "Partition") -> dict[str, dict[str, float]]:
@@ -113,6 +102,8 @@ def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition",
         print(f"{name:{WIDTH}}{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}")
     positions = f"positions of {scene.stored} frames, file [GB]"
     print(f"{positions:{WIDTH}}{file['all'] / GB:15.3g}")
+    memory = report["memory"]
+    print(f"{'memory [GB]':{WIDTH}}{memory['all'] / GB:15.3g}{memory['mean'] / GB:15.3g}{memory['most'] / GB:15.3g}")
 
 
 def print_budget(scene: Scene) -> None:
@@ -128,45 +119,23 @@ def print_budget(scene: Scene) -> None:
         print(f"  expected of {budget.count} cells and steps of {budget.time_step:g} s, not of what the scene has now")
 
 
-def needs_of(
-    args: argparse.Namespace, scene: Scene, surfaces: Sequence["Surface"], partition: "Partition", mesh: float
-) -> dict[str, Any]:
-    """Return memory [byte] and time of a frame [s], and what they rest on; ``mesh``: bytes that its surfaces took."""
-    from msmpetsc.study.forecast import Network, forecast
+def memory_of(partition: "Partition", surfaces: Sequence["Surface"], mesh: float) -> np.ndarray:
+    """Return the memory (R,) of each rank [byte].
 
-    options, cells = shlex.join(args.petsc_options), partition.cells.sum()
-    try:
-        expected = forecast(
-            file=args.scene, changes=args.set, options=options, scene=scene, surfaces=surfaces, cells=cells,
-            frames=args.frames, again=args.measure_here,
-        )  # fmt: skip
-    except OSError as error:
-        raise InputError(f"{error.filename}: {error.strerror}") from None
-    memory = expected.memory(partition, sum(len(each.points) for each in surfaces) if scene.output.surface else 0, mesh)
-    every, network = scene.output.every, Network(args.latency, args.bandwidth)
-    trials = expected.coarse, expected.fine
-    explicit = scene.time.integrator == "verlet"
-    first, second = (f"{t.iterations if explicit else t.its:.1f} on {t.cells:.0f}" for t in trials)
-    work = f"{expected.iterations(cells):.1f} {'substeps' if explicit else 'outer ones'} a step"
-    work = work if explicit else f"{expected.its(cells):.1f} KSP iterations and {work}"
-    return {
-        "memory": over_ranks(memory),
-        "computing": float(every * expected.computing(partition)),
-        "messages": float(every * expected.messages(partition, network)),
-        "rests on": f"  expected with {work}: the first {args.frames} took {first} cells and {second},\n"
-        f"  on cores, and memory for each, as here; messages of {network.latency:g} s and {network.bandwidth:g} byte/s "
-        "(--latency, --bandwidth)",
-    }
+    surfaces : that are stored
+    mesh     : bytes that reading and preparing them took, on rank 0
+    """
+    from msmpetsc.model.lattice import lattice_bytes
+    from msmpetsc.solve.linear.system import assembly_bytes
+    from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 
-
-def print_needs(needs: dict[str, Any]) -> None:
-    """Print memory and time, and what they rest on."""
-    memory, computing, messages = needs["memory"], needs["computing"], needs["messages"]
-    print(f"{'memory [GB]':{WIDTH}}{memory['all'] / GB:15.3g}{memory['mean'] / GB:15.3g}{memory['most'] / GB:15.3g}")
-    print(
-        f"\ntime of a frame {computing + messages:.3g} s: computing {computing:.3g} s, messages {messages:.3g} s; "
-        f"without writing it\n{needs['rests on']}"
-    )
+    nodes, springs = partition.nodes + partition.ghosts, partition.springs
+    arrays = lattice_bytes(partition.cells, nodes, springs) + nodes * sum(BYTES_OF_NODE.values())
+    arrays += assembly_bytes(nodes, springs, partition.nonzeros)
+    points = sum(len(surface.points) for surface in surfaces)
+    needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / partition.ranks)
+    needed[0] = max(needed[0], mesh)
+    return PROGRAM + needed
 
 
 def limits_of(partition: "Partition") -> dict[str, dict[str, Any]]:

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import astuple
 
-from msmpetsc.cli.arguments import refuse_ranks
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.scene.keys import keys
 
 HEAD = ("key", "unit", "default", "range", "meaning")

@@ -4,7 +4,8 @@ import argparse
 import json
 from pathlib import Path
 
-from msmpetsc.cli.arguments import SCENE_NAMES, refuse_other_format, refuse_ranks
+from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, load, locate

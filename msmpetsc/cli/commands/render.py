@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msmpetsc.cli.arguments import (
+from msmpetsc.app.checks import (
     MOVIE_NAMES,
     PAGE_NAMES,
     PICTURE_NAMES,
@@ -15,8 +15,8 @@ from msmpetsc.cli.arguments import (
     SCENE_NAMES,
     refuse_below_one,
     refuse_other_format,
-    refuse_ranks,
 )
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface

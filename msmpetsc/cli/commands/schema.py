@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from msmpetsc.cli.arguments import refuse_ranks
+from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.scene.keys import json_schema
 
 

@@ -4,7 +4,8 @@ import argparse
 import signal
 from pathlib import Path
 
-from msmpetsc.cli.arguments import RUNS_ITSELF, interrupt, refuse_below_one, refuse_name_of_a_file, refuse_ranks
+from msmpetsc.app.checks import refuse_below_one, refuse_name_of_a_file
+from msmpetsc.cli.ranks import RUNS_ITSELF, interrupt, refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 

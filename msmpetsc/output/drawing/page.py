@@ -36,7 +36,7 @@ from msmpetsc.output.reader import Result
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
 PARTS = files("msmpetsc.output.drawing")
-SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_run.js", "page_begin.js")
+SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_begin.js")
 
 
 def write_page(

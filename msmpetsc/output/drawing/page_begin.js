@@ -2,11 +2,6 @@
 
 let extent;
 async function begin() {
-  if (data.run) showRun(data.run);
-  if (!frames) {
-    for (const id of ["player", "keys", "legend"]) byId(id).hidden = true;
-    return;
-  }
   triangles = await numbersOf("triangles", points);
   fixing = await inflated("fixed");
   all = predicted(await inflated("positions"), points);

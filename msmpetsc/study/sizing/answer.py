@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from msmpetsc.study.plan import Candidate
-from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.sizing.choice import Candidate, Choice
 
 
 @dataclass(frozen=True)

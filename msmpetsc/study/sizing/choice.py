@@ -6,10 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.study.plan import Candidate
+from msmpetsc.scene.values import Integrator
 from msmpetsc.study.sizing.orders import ErrorLaw
 
 STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A way to step a scene; explicit steps have no preset and no error."""
+
+    integrator: Integrator
+    time_step: float  # [s]
+    preset: str = ""
+    step_error: float | None = None
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import Integrator
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
-from msmpetsc.study.plan import Candidate
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
 from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried
 from msmpetsc.study.sizing.bounds import inverted_bound, size_bounds, time_bound
-from msmpetsc.study.sizing.choice import Budget, Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
@@ -340,7 +339,7 @@ class Sizer:
 
     def _method(self, integrator: Integrator, step: float) -> Candidate:
         solves = integrator != "verlet"
-        return Candidate(integrator, step, PRESET if solves else "", "", self.solved if solves else None)
+        return Candidate(integrator, step, PRESET if solves else "", self.solved if solves else None)
 
     def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
         """Return a run, made if it was not yet; None if it fails, which is reported."""

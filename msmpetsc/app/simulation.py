@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.cli.arguments import option_names
-from msmpetsc.cli.failure import ending_together
-from msmpetsc.cli.main import logged_on_root
+from msmpetsc.app.failure import ending_together
+from msmpetsc.app.log import logged_on_root
+from msmpetsc.app.request import FLAGS
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model, Shape, build_model
 from msmpetsc.model.fields import Frame
@@ -108,9 +108,9 @@ class Simulation:
             if frames < 1:
                 raise InputError(f"frames must be at least 1, not {frames}")
             scene = scene.changed({"time.duration": frames * scene.time.step})
-        return self._march(scene)
+        return self._steps(scene)
 
-    def _march(self, scene: Scene) -> Iterator[Frame]:
+    def _steps(self, scene: Scene) -> Iterator[Frame]:
         with ExitStack() as until_the_end:
             with self._at_work():
                 steps = self._begin(scene, until_the_end)
@@ -151,7 +151,7 @@ class Simulation:
         if words:
             until_the_end.enter_context(lent_options(self.comm, words))
         if alone:
-            refuse_early(self.comm, option_names("run"))
+            refuse_early(self.comm, FLAGS)
         choose(self.comm, self.device)
         return alone
 

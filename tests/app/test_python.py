@@ -1,5 +1,7 @@
 """Runs from Python: msmpetsc.run says and writes what the command does, and raises where that returns a status."""
 
+import inspect
+import shlex
 import signal
 from pathlib import Path
 
@@ -10,10 +12,11 @@ from block_scene import block_scene
 from conftest import run
 
 import msmpetsc
-from msmpetsc.cli.main import command_words, main
+from msmpetsc.app.request import OPTIONS, RunRequest
+from msmpetsc.cli.main import main, parsed
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.output.reader import finished
-from msmpetsc.solve.petsc.words import options_of, words_of
+from msmpetsc.solve.petsc.words import options_of
 
 FALL = {"gravity": {"acceleration": [0, 0, -9.81]}, "time": {"step": 0.01, "duration": 0.05}}
 
@@ -36,7 +39,8 @@ def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
     assert main(["run", str(scene), "-o", str(tmp_path / "command.h5"), *words]) == 0
     assert np.array_equal(positions(path), positions(tmp_path / "command.h5"))
     with msmpetsc.open(path) as result:  # what it was is a command that can be pasted
-        assert result.attributes["command"].startswith(f"msmpetsc run {scene} --output={path} --frames=2 --set=")
+        command = result.attributes["command"]
+        assert command.startswith(f"msmpetsc run {scene} --output={path} --preset=newton --frames=2 --set=")
 
 
 def test_quietly(scene: Path, tmp_path: Path, capsys):
@@ -67,8 +71,9 @@ def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):
 
 
 WRONG = {
-    "run has no option 'frame', did you mean 'frames'": {"frame": 3},
-    "--frames: invalid int value": {"frames": 2.5},
+    "--frames must be a whole number": {"frames": 2.5},
+    "--device is cpu or cuda": {"device": "gpu"},
+    "/ is a folder": {"output": "/"},
     "--frames must be at least 1": {"frames": 0},
     "material.dens": {"set": {"material.dens": 1}},
     "PETSc options begin with a dash": {"petsc_options": "ksp_rtol 1e-3"},
@@ -80,7 +85,7 @@ WRONG = {
 @pytest.mark.parametrize("words", WRONG)
 def test_what_cannot_be_meant_raises(scene: Path, tmp_path: Path, words: str):
     with pytest.raises(InputError) as raised:
-        msmpetsc.run(scene, tmp_path / "x.h5", quiet=True, **WRONG[words])
+        msmpetsc.run(scene, **{"output": tmp_path / "x.h5", "quiet": True} | WRONG[words])
     assert words in str(raised.value) and "\n" not in str(raised.value)
     assert not (tmp_path / "x.h5").exists()
 
@@ -105,15 +110,37 @@ def test_an_interrupt_raises_and_the_run_goes_on(scene: Path, tmp_path: Path, mo
     assert len(positions(path)) == 6
 
 
-def test_keywords_are_said_as_words():
-    assert command_words("true_error", 3) == ["--true-error=3"]
-    assert command_words("picture", True) == ["--picture"] and command_words("picture", False) == []
+def test_a_keyword_that_is_none_is_an_error_of_the_program(scene: Path):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frame'"):
+        msmpetsc.run(scene, frame=3)
+
+
+def test_a_request_is_recorded_as_its_command():
     changes = {"pin": [{"region": {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}}], "title": "a b"}
-    assert command_words("set", changes) == [
-        "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
-        '--set=title="a b"',
-    ]
-    assert words_of({"ksp_view": None, "options_left": False}) == ["-ksp_view", "-options_left", "false"]
+    options = {"ksp_view": None, "options_left": False}
+    asked = RunRequest("s.toml", true_error=3, picture=True, set=changes, petsc_options=options)
+    words = shlex.split(asked.command)
+    assert words == [
+        "msmpetsc", "run", "s.toml", "--set=pin=[{region = {box = [[0, 0, 0], [1, 1, 1]], relative = true}}]",
+        '--set=title="a b"', "--picture", "--true-error=3", "-ksp_view", "-options_left", "false",
+    ]  # fmt: skip
+    given = {name: value for name, value in vars(parsed(words[1:])).items() if name in OPTIONS}
+    assert RunRequest(**given).command == asked.command
+
+
+def test_help_shows_all_keywords_with_their_types():
+    parameters = inspect.signature(msmpetsc.run).parameters
+    assert list(parameters) == list(OPTIONS) and parameters["frames"].annotation == int | None
+    assert all(f"{name} " in msmpetsc.run.__doc__ for name in OPTIONS)
+
+
+def test_neither_the_package_nor_a_run_imports_the_command_line(scene: Path, tmp_path: Path):
+    code = f"import sys, msmpetsc; msmpetsc.run({str(scene)!r}, {str(tmp_path / 'x.h5')!r}, frames=1); "
+    code += "print([name for name in sys.modules if name.startswith('msmpetsc.cli')])"
+    done = run(1, "-c", code, timeout=60)
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+    code = "import sys, msmpetsc; msmpetsc.run; print('argparse' in sys.modules)"
+    assert run(1, "-c", code, timeout=60).stdout == "False\n"
 
 
 ON_RANKS = """

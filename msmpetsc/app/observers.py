@@ -21,8 +21,7 @@ from msmpetsc.model.fields import Frame
 from msmpetsc.output.progress import Progress
 from msmpetsc.output.writer import ResultFile
 
-if TYPE_CHECKING:  # what draws is loaded where it is asked for; PETSc must first be given its options
-    from msmpetsc.output.drawing.live import LivePage
+if TYPE_CHECKING:  # PETSc must first be given its options
     from msmpetsc.solve.simulate import Simulation
 
 STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
@@ -65,18 +64,6 @@ class Callback:
         return False
 
 
-class PageWriter:
-    """Keep a page of the run for a browser, on rank 0."""
-
-    def __init__(self, page: "LivePage"):
-        self.page = page
-
-    def after_step(self, frame: Frame | None) -> bool:
-        if frame is not None:
-            self.page.update(frame)
-        return False
-
-
 class ProgressLine:
     """Show how far the run is, on rank 0, where notes are wanted."""
 
@@ -112,8 +99,9 @@ class Interval:
     adapts: bool
 
     @classmethod
-    def parsed(cls, text: str | None) -> "Interval":
-        """Parse "3", "5min", or None. Raises InputError."""
+    def parsed(cls, given: int | str | None) -> "Interval":
+        """Parse 3, "3", "5min", or None. Raises InputError."""
+        text = None if given is None else str(given)
         match = re.fullmatch(r"(\d{1,18})(s|min|h)?", text or "0s", re.ASCII)
         if not match or (text and not int(match[1])):
             raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {text}")

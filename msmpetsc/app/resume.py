@@ -3,12 +3,15 @@
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
 from msmpetsc import __version__
+from msmpetsc.app.checks import RESULT_NAMES, refuse_other_format
+from msmpetsc.app.request import RunRequest
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
@@ -31,10 +34,32 @@ FIXED = ("time.step", "time.integrator", "output.every", "output.surface")  # a 
 OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that may differ without a word
 
 
-def examined(path: Path) -> Earlier:
+def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
+    """Return what is to be resumed, None for a run from the start (collective). Raises InputError."""
+    if request.resume is None:
+        if request.scene is None:
+            raise InputError("a SCENE is needed, or --resume OUT.h5")
+        return None
+    path = Path(request.resume)
+    if request.scene is not None and not comm.bcast(on_root(comm, path.exists)):
+        refuse_other_format("--resume", path, RESULT_NAMES)
+        return None  # the first start of a job that may be started again
+    return comm.bcast(on_root(comm, lambda: _examined(path)))
+
+
+def _examined(path: Path) -> Earlier:
     """Look at the file of an earlier run, on one rank. Raises InputError for what is no result, or a damaged one."""
     refuse_deadly(path)
     return Earlier.read(path)
+
+
+def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
+    """Return the request with what the earlier run was asked for and this one is not. Raises InputError."""
+    if earlier is None:
+        return request
+    words = request.petsc_words
+    true_error = request.true_error or earlier.true_error or None
+    return replace(request, petsc_options=shlex.join([*options_to_keep(earlier, words), *words]), true_error=true_error)
 
 
 def options_to_keep(earlier: Earlier, given: Sequence[str]) -> Iterator[str]:

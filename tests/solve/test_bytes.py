@@ -1,4 +1,4 @@
-"""What a forecast says of memory, against the arrays of a lattice and of the assembly of its matrix."""
+"""The bytes that inspect counts, against the arrays of a lattice and of the assembly of its matrix."""
 
 import tracemalloc
 from pathlib import Path

@@ -1,0 +1,228 @@
+"""What a run can be asked for: the one table of it.
+
+Of its rows are made the keywords of ``msmpetsc.run`` with their types and their help, the options of ``msmpetsc run``,
+and the table of options in README.
+"""
+
+import inspect
+import operator
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, fields
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar, cast
+
+from msmpetsc.app.checks import (
+    MEASURE_NAMES,
+    RESULT_NAMES,
+    checked_file,
+    checked_path,
+    refuse_below_one,
+    refuse_other_format,
+)
+from msmpetsc.errors import InputError
+from msmpetsc.scene.toml import overrides_of, toml_of
+from msmpetsc.solve.petsc.words import words_of
+
+if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
+    from msmpetsc.model.fields import Frame
+    from msmpetsc.scene.schema import Scene
+
+P = ParamSpec("P")
+T = TypeVar("T")
+File = str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class Option:
+    """What is said of a field of the request, and how the command line takes it.
+
+    value   : what stands for its value on the command line; "" for a switch
+    kind    : makes the value of a word
+    choices : all the values there are
+    short   : another name, of one dash
+    python  : whether Python alone takes it, or the command line in another way
+    """
+
+    help: str
+    value: str = ""
+    kind: Callable[[str], Any] = str
+    choices: tuple[str, ...] | None = None
+    short: str = ""
+    python: bool = False
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """A run that is asked for."""
+
+    scene: Annotated[
+        "File | Mapping[str, Any] | Scene | None",
+        Option("scene file (TOML); in Python a Scene, too, or its tables", "SCENE", checked_path),
+    ] = None
+    output: Annotated[
+        File | None,
+        Option("result file, .h5 or .hdf5; out/SCENE.h5 if not given", "OUT.h5", checked_file, short="-o"),
+    ] = None
+    _: KW_ONLY
+    preset: Annotated[str | None, Option("solver preset (see --list-presets)", "NAME")] = None
+    error: Annotated[float | None, Option("relative error at which a step is done", "E", float)] = None
+    device: Annotated[
+        Literal["cpu", "cuda"] | None,
+        Option("where to compute: cuda is -mat_type aijcusparse, a CUDA GPU", choices=("cpu", "cuda")),
+    ] = None
+    frames: Annotated[int | None, Option("stop after N steps", "N", int)] = None
+    set: Annotated[
+        Mapping[str, Any] | Sequence[str],
+        Option("override scene keys: cages.count=3000, obstacle.0.friction=0.5", "KEY=VALUE"),
+    ] = ()
+    picture: Annotated[bool, Option("also draw a few moments: OUT.png")] = False
+    overwrite: Annotated[bool, Option("replace OUT.h5 if it exists")] = False
+    resume: Annotated[
+        File | None,
+        Option(
+            "go on where the run that wrote this file was stopped; with SCENE, start it if there is no such file yet",
+            "OUT.h5",
+            checked_file,
+        ),
+    ] = None
+    force: Annotated[bool, Option("resume with another scene or other options than before")] = False
+    checkpoint_every: Annotated[
+        int | str | None, Option("frames, or 30s, 5min, 2h; default: as takes 1% of the time at most", "N")
+    ] = None
+    gather: Annotated[bool, Option("let rank 0 write for all: where nodes of a cluster do not see one file alike")] = (
+        False
+    )
+    true_error: Annotated[
+        int | None, Option("also solve every N-th step to rounding, and store its true error", "N", int)
+    ] = None
+    trace: Annotated[int | None, Option("follow the iterates of step K (needs --measure)", "K", int)] = None
+    measure: Annotated[
+        File | None, Option("write what the run cost: times, products, memory, machine", "OUT.json", checked_file)
+    ] = None
+    petsc_options: Annotated[
+        str | Mapping[str, Any],
+        Option('PETSc\'s options, for this run alone: "-ksp_rtol 1e-3 -ksp_view", {"ksp_rtol": 1e-3}', python=True),
+    ] = ""
+    quiet: Annotated[bool, Option("no notes and no progress; warnings and errors stay", python=True)] = False
+    on_frame: Annotated[
+        "Callable[[Frame], object] | None",
+        Option("called on all ranks with each frame, once that is written", python=True),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError for what cannot be meant: paths, numbers, and options that contradict each other."""
+        for name, option in OPTIONS.items():
+            value = getattr(self, name)
+            if isinstance(value, str | os.PathLike) and option.kind in (checked_path, checked_file):
+                option.kind(os.fspath(value))
+            if option.kind is int and value is not None:
+                _refuse_other_than_whole(name, value)
+            if option.choices and value not in (None, *option.choices):
+                raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
+        refuse_other_format("-o", self.output, RESULT_NAMES)
+        refuse_other_format("--measure", self.measure, MEASURE_NAMES)
+        refuse_below_one(true_error=self.true_error, trace=self.trace, frames=self.frames)
+        other = self.output is not None and self.resume is not None and Path(self.output) != Path(self.resume)
+        if self.resume and (self.overwrite or other):
+            raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")
+        if self.made and not (self.output or self.resume):
+            raise InputError("a scene that is no file gives its result no name: say output")
+        if self.trace is not None and self.measure is None:
+            raise InputError("--trace needs --measure, the file that it is written to")
+
+    @property
+    def file(self) -> Path | None:
+        """Path of the scene, if that is a file."""
+        return Path(self.scene) if isinstance(self.scene, str | os.PathLike) else None
+
+    @property
+    def made(self) -> tuple[Path, Mapping[str, Any]] | None:
+        """Folder and tables of the scene, if that is no file."""
+        if self.scene is None or isinstance(self.scene, str | os.PathLike):
+            return None
+        if isinstance(self.scene, Mapping):
+            return Path(), self.scene
+        return self.scene.folder, toml_of(self.scene.text)
+
+    @property
+    def path(self) -> Path:
+        """Path of the result file."""
+        named = self.resume or self.output
+        return Path(named) if named else Path("out") / f"{self.file.stem if self.file else ''}.h5"
+
+    @property
+    def measured(self) -> Path | None:
+        """Path of the file of what the run cost."""
+        return Path(self.measure) if self.measure else None
+
+    @property
+    def overrides(self) -> list[str]:
+        """Changes of the scene, as ``--set`` takes them."""
+        given = {"solver.preset": self.preset, "solver.error": self.error}
+        method = overrides_of({key: value for key, value in given.items() if value is not None})
+        return [*method, *(overrides_of(self.set) if isinstance(self.set, Mapping) else self.set)]
+
+    @property
+    def command(self) -> str:
+        """The command that asks for the same, as the result file and ``--measure`` record it."""
+        words = ["msmpetsc", "run", *([str(self.file)] if self.file else [])]
+        for name, option in OPTIONS.items():
+            value = getattr(self, name)
+            if option.python or name == "scene" or not value:
+                continue
+            values = overrides_of(value) if isinstance(value, Mapping) else value
+            several = values if isinstance(values, list | tuple) else [values]
+            words += [flag_of(name)] if value is True else [f"{flag_of(name)}={each}" for each in several]
+        return shlex.join([*words, *self.petsc_words])
+
+    @property
+    def petsc_words(self) -> list[str]:
+        """PETSc's options as words. Raises InputError for what is no option."""
+        return words_of(self.petsc_options)
+
+
+def flag_of(name: str) -> str:
+    """Return the option of the command line for a field: "--true-error"."""
+    return f"--{name.replace('_', '-')}"
+
+
+OPTIONS: dict[str, Option] = {field.name: cast(Any, field.type).__metadata__[0] for field in fields(RunRequest)}
+FLAGS = [flag_of(name) for name, option in OPTIONS.items() if name != "scene" and not option.python]
+
+
+def _refuse_other_than_whole(name: str, value: Any) -> None:
+    """Raise InputError for what is no whole number: Python alone can give it."""
+    try:
+        operator.index(value)
+    except TypeError:
+        raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}") from None
+
+
+def asked_by(request: Callable[P, RunRequest]) -> Callable[[Callable[[Callable[[], RunRequest]], T]], Callable[P, T]]:
+    """Return a decorator for a function of what makes the request.
+
+    Decorated, it takes the fields of the request as its arguments, with their types, and its help tells of each.
+    """
+
+    def decorate(function: Callable[[Callable[[], RunRequest]], T]) -> Callable[P, T]:
+        @wraps(function)
+        def of_fields(*args: P.args, **keywords: P.kwargs) -> T:
+            signature.bind(*args, **keywords)  # or TypeError at once, on all ranks
+            return function(partial(request, *args, **keywords))
+
+        signature = inspect.signature(request)
+        parameters = [each.replace(annotation=_plain(each.annotation)) for each in signature.parameters.values()]
+        told = "\n".join(f"    {name:16} : {option.help}" for name, option in OPTIONS.items())
+        of_fields.__doc__ = f"{function.__doc__}\n{told}\n"
+        of_fields.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # which help() shows
+        return of_fields
+
+    return decorate
+
+
+def _plain(annotation: Any) -> Any:
+    """Return the type of an annotated one."""
+    return getattr(annotation.__origin__, "__forward_arg__", annotation.__origin__)

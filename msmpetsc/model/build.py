@@ -26,7 +26,6 @@ from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
 from msmpetsc.model.reach import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
-from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.contacts import CollisionSurface
 from msmpetsc.model.self_contact.surface import collision_surface
 from msmpetsc.scene.motion import ForceTable
@@ -62,7 +61,7 @@ class Model:
     exchanges: list[Exchange]
     penalties: list[Penalty]
     start: InitialState
-    collision: CollisionSurface | OverlappingSurface | None = None
+    collision: CollisionSurface | None = None
     bodies: tuple[Body, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
@@ -150,7 +149,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
-        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice, shape.topology.cells)
+        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
         if scene.self_contact
         else None,
         reaches=reaches,

@@ -11,8 +11,8 @@ from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 from msmpetsc.model.contact.reflection import Step, slowed
 from msmpetsc.model.loads import Anchor, Load, OwnForce
-from msmpetsc.model.self_contact.contacts import Touch
-from msmpetsc.model.self_contact.kinds import contacts_of, term_of
+from msmpetsc.model.self_contact.contacts import Contacts, Touch
+from msmpetsc.model.self_contact.term import SurfaceContact
 
 
 class Environment:
@@ -28,7 +28,7 @@ class Environment:
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges
-        self.self_contact = contacts_of(self.lattice.table.comm, model.collision) if model.collision else None
+        self.self_contact = Contacts(self.lattice.table.comm, model.collision) if model.collision else None
         self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
@@ -174,7 +174,7 @@ class Environment:
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
             self.self_contact.expect(q, end)
-            surface = term_of(self.self_contact, q, time_step)
+            surface = SurfaceContact(self.self_contact, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
     def touch(self, q: np.ndarray) -> Touch:

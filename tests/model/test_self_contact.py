@@ -11,7 +11,7 @@ import trimesh
 from block_scene import block_scene, play
 from crossings import count_crossings
 from mpi4py import MPI
-from pinch import ARM, HALF, RADIUS, pinch_scene
+from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 
 import msmpetsc
 from msmpetsc.errors import InputError
@@ -247,6 +247,13 @@ def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, capl
     assert 0 < len(surface.triangles) < len(model.surface.triangles)
     assert count_crossings(surface.points, surface.triangles) == 0
     assert count_crossings(model.surface.points, model.surface.triangles) > 0
+
+
+def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
+    path = pinch_scene(tmp_path)
+    trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")
+    with pytest.raises(InputError, match=r"self_contact: .* cut others at rest.*union.*repair"):
+        build_model(COMM, load_scene(path))
 
 
 def test_a_coarser_surface_lies_on_the_body(tmp_path):

@@ -24,7 +24,7 @@ from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.solids import TINY
 
 if TYPE_CHECKING:
-    from msmpetsc.model.self_contact.kinds import StepContact
+    from msmpetsc.model.self_contact.term import SurfaceContact
 
 Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -198,7 +198,7 @@ class Contact:
     surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int, surface: "StepContact | None" = None):
+    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
         self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: np.ndarray) -> float:

@@ -11,7 +11,7 @@ from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
 from msmpetsc.model.contact.reflection import Step, slowed
 from msmpetsc.model.loads import Anchor, Load, OwnForce
-from msmpetsc.model.self_contact.contacts import Contacts, Touch
+from msmpetsc.model.self_contact.contacts import Contacts, NearPairs, Touch
 from msmpetsc.model.self_contact.term import SurfaceContact
 
 
@@ -28,7 +28,8 @@ class Environment:
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges
-        self.self_contact = Contacts(self.lattice.table.comm, model.collision) if model.collision else None
+        self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
+        self._contacts = Contacts(self.self_contact) if self.self_contact else None  # of the last step that was begun
         self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
@@ -173,13 +174,13 @@ class Environment:
         pressing = self._pressing(time, sides)
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
-            self.self_contact.expect(q, end)
-            surface = SurfaceContact(self.self_contact, q, time_step)
+            self._contacts = self.self_contact.step(q, end)
+            surface = SurfaceContact(self._contacts, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts of the surface with itself at q (collective)."""
-        return self.self_contact.touch(q) if self.self_contact else Touch()
+        return self._contacts.touch(q) if self._contacts else Touch()
 
     def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""

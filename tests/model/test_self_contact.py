@@ -19,7 +19,7 @@ from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.fields import Frame
 from msmpetsc.model.self_contact.barrier import Barrier
-from msmpetsc.model.self_contact.contacts import Contacts
+from msmpetsc.model.self_contact.contacts import NearPairs
 from msmpetsc.model.self_contact.term import SMALL, SurfaceContact
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.explicit import explicit
@@ -53,7 +53,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(Contacts(COMM, model.collision), q, T), end
+    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q), q, T), end
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
@@ -166,21 +166,19 @@ def test_on_a_way_that_was_swept_contacts_are_those_looked_for_anew(model, monke
     """So that line searches need no pairs of their own: the arms close by many edges, and meet."""
     assert model.collision is not None
     start, end = model.lattice.nodes.copy(), closed(model)
-    known, looked = Contacts(COMM, model.collision), []
-    known.expect(start, start)
+    known, looked = NearPairs(COMM, model.collision).step(start, start), []
     assert known.free_share(start, end) == 1.0
-    monkeypatch.setattr(known, "_look", looked.append)
+    monkeypatch.setattr(known.near, "look", looked.append)
     for share in (0.0, 0.31, 0.9, 0.99, 0.999, 1.0):
         q = start + share * (end - start)
-        moment, anew = known.at(q), Contacts(COMM, model.collision).at(q)
+        moment, anew = known.at(q), NearPairs(COMM, model.collision).step(q, q).at(q)
         assert moment.count == anew.count
         if moment.count:
             energies = [known.barrier.energy(each.contacts, each.points) for each in (moment, anew)]
             assert energies[0] == pytest.approx(energies[1], rel=1e-12)
     assert moment.count > 0 and not looked
-    known.expect(start, start)  # of another step
     monkeypatch.undo()
-    assert known.at(end).count == moment.count
+    assert known.near.step(start, start).at(end).count == moment.count  # in another step
 
 
 def positions(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

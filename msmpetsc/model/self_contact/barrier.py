@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.self_contact.creases import creases, together
-from msmpetsc.model.self_contact.neighbours import neighbours
+from msmpetsc.model.self_contact.creases import creases, neighbours, together
 
 if TYPE_CHECKING:
     import ipctk

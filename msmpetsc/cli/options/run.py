@@ -47,11 +47,6 @@ def add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checkpoint-every", metavar="N", help="frames, or 30s, 5min, 2h; default: as takes 1%% of the time at most"
     )
-    parser.add_argument(
-        "--gather",
-        action="store_true",
-        help="let rank 0 write for all: where nodes of a cluster do not see one file alike",
-    )
     parser.add_argument("--compress", action="store_true", help="pack the finished OUT.h5: smaller, slower to read")
 
 

@@ -39,7 +39,6 @@ class RunRequest:
     resume: Path | None = None
     force: bool = False
     checkpoint_every: str | None = None
-    gather: bool = False
     compress: bool = False
     true_error: int | None = None
     trace: int | None = None

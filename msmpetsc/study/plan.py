@@ -9,7 +9,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
-from msmpetsc.scene.values import Integrator
+from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import Case, study_cases
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import ReferenceRun, Study, StudyScene, Sweep
@@ -37,7 +37,7 @@ ALTERNATIVES = (
 class Candidate:
     """A way to step the scene; step_error is None for verlet."""
 
-    integrator: Integrator
+    integrator: IntegratorName
     time_step: float  # [s]
     preset: str = ""
     options: str = ""

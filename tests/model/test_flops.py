@@ -82,5 +82,5 @@ class Typed(np.ndarray):
 
 
 def test_a_lattice_has_those_of_its_springs_and_nodes():
-    counts = flops.Flops.of(one_spring(1.0, 1.0, 1.0))
+    counts = flops.Flops.of_lattice(one_spring(1.0, 1.0, 1.0))
     assert (counts.gradient, counts.change, counts.hessian, counts.product) == (22 + 30, 38 + 72, 20, 23 + 18)

@@ -171,14 +171,14 @@ def test_on_a_way_that_was_swept_contacts_are_those_looked_for_anew(model, monke
     monkeypatch.setattr(known.near, "look", looked.append)
     for share in (0.0, 0.31, 0.9, 0.99, 0.999, 1.0):
         q = start + share * (end - start)
-        moment, anew = known.at(q), NearPairs(COMM, model.collision).step(q, q).at(q)
+        moment, anew = known.find(q), NearPairs(COMM, model.collision).step(q, q).find(q)
         assert moment.count == anew.count
         if moment.count:
             energies = [known.barrier.energy(each.contacts, each.points) for each in (moment, anew)]
             assert energies[0] == pytest.approx(energies[1], rel=1e-12)
     assert moment.count > 0 and not looked
     monkeypatch.undo()
-    assert known.near.step(start, start).at(end).count == moment.count  # in another step
+    assert known.near.step(start, start).find(end).count == moment.count  # in another step
 
 
 def positions(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ also beyond the far face: a plate that a node passes within a step pushes it bac
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class Penalty:
     stick: float
     restitution: float | None = None
 
-    def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
+    def state_at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
@@ -59,12 +59,12 @@ class Penalty:
         before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
             that it ends with, under the push that is to be expected then
         """
-        state = self.at(time, sides)
+        state = self.state_at(time, sides)
         if self.friction == 0:
             return state
         start, path = time - time_step, self.obstacle.path
-        nodes, depth, normal = self.at(start, sides).pressed(q)
-        way, stick = like(q, path.at(time) - path.at(start)), self.stick * time_step
+        nodes, depth, normal = self.state_at(start, sides).pressed(q)
+        way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
         if before is not None:
             carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
@@ -273,27 +273,28 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
-def apply_friction(
-    rows: np.ndarray,
-    q: np.ndarray,
-    state: ContactState,
-    carried: np.ndarray,
-    impulse: float,
-    per_mass: np.ndarray,
-    v: np.ndarray,
-) -> None:
-    """Apply Coulomb friction as a change of velocity to the rows that are inside.
+class Movers(NamedTuple):
+    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those that move as rows or
+    (n,) bool, and 1 / mass (n,) [1/kg]."""
+
+    q: np.ndarray
+    v: np.ndarray
+    rows: np.ndarray
+    per_mass: np.ndarray
+
+
+def apply_friction(nodes: Movers, state: ContactState, carried: np.ndarray, impulse: float) -> None:
+    """Apply Coulomb friction as a change of velocity to the nodes that are inside.
 
     v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s], falls by no more than
     the friction's impulse a mass, mu N dt / m, and not below nothing: so what holds does not creep, however long the
     substep.
 
-    rows     : (k,) bool or numbers, of the nodes that move
-    impulse  : mu k dt [kg/s], times the depth the impulse
-    per_mass : (n,) [1/kg]
+    impulse : mu k dt [kg/s], times the depth the impulse
     """
+    q, v, per_mass = nodes.q, nodes.v, nodes.per_mass
     moves = np.zeros(len(q), bool, like=q)
-    moves[rows] = True
+    moves[nodes.rows] = True
     pressed, depth, normal = state.pressed(q)
     own = moves[pressed]
     pressed, depth, normal = pressed[own], depth[own], normal[own]

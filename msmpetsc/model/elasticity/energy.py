@@ -26,13 +26,15 @@ class Elasticity:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.owned, self.flops = lattice.owned, Flops.of(lattice)
+        self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
         on_cpu = on_host(lattice.nodes)
-        self.springs: SpringScatter | SpringGather = (SpringScatter if on_cpu else SpringGather).of(lattice)
+        self.springs: SpringScatter | SpringGather = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         self.cells: CellScatter | CellGather | None = None
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
-            self.cells = (CellScatter if on_cpu else CellGather).of(lattice, RESISTANCE * resistance, ONSET * volume)
+            self.cells = (CellScatter if on_cpu else CellGather).of_lattice(
+                lattice, RESISTANCE * resistance, ONSET * volume
+            )
         self.parts = [part for part in (self.springs, self.cells) if part]
 
     def energy(self, q: np.ndarray) -> float:

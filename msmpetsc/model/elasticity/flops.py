@@ -34,7 +34,7 @@ class Flops:
     product: int
 
     @classmethod
-    def of(cls, lattice: Lattice) -> "Flops":
+    def of_lattice(cls, lattice: Lattice) -> "Flops":
         """Return those of a lattice, M included."""
         springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
         cells = len(lattice.local_cells) if stiffens else 0

@@ -325,7 +325,7 @@ class CellScatter:
     cells_owned: int
 
     @classmethod
-    def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellScatter":
+    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellScatter":
         """Return the cells of a lattice whose arrays are in the memory of the CPU."""
         return cls(lattice.local_cells, resistance, volume, lattice.cells_owned)
 
@@ -384,7 +384,7 @@ class CellGather:
     corner: np.ndarray
 
     @classmethod
-    def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellGather":
+    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellGather":
         """Return the cells of a lattice, in the memory that its nodes are in."""
         nodes, owned = to_host(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, Sweep
+from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
 
@@ -78,11 +78,11 @@ class Way:
     q: np.ndarray
     moved: np.ndarray
     square: float
-    sweep: Sweep | None
+    sweep: SweptPairs | None
 
 
 @dataclass(frozen=True)
-class Moment:
+class ContactsAt:
     """Contacts at positions q (owned, 3) [m].
 
     count    : their number
@@ -168,16 +168,16 @@ class Contacts:
     def __init__(self, near: NearPairs):
         self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
         self.barrier, self.owned = near.barrier, near.owned
-        self._moments: list[Moment] = []
+        self._moments: list[ContactsAt] = []
         self._ways: list[Way] = []
 
-    def at(self, q: np.ndarray) -> Moment:
+    def find(self, q: np.ndarray) -> ContactsAt:
         """Return the contacts at positions q."""
         q = q[: self.owned]
         pairs = self.near.around(q)
         bound = self.near.moved(q, pairs)
         if bound < pairs.clear:
-            return Moment(q)
+            return ContactsAt(q)
         for moment in self._moments:
             if self._is_same(q, moment.q):
                 return moment
@@ -185,7 +185,7 @@ class Contacts:
         near = self._pairs_near(q, points, pairs, bound)
         contacts = self.barrier.contacts(near, points) if self.barrier else None
         count = self.comm.bcast(sum(map(len, contacts or ())))
-        self._moments = [Moment(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
+        self._moments = [ContactsAt(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
     def _pairs_near(self, q: np.ndarray, points: np.ndarray, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
@@ -199,7 +199,7 @@ class Contacts:
             return pairs.candidates
         for way in self._ways:
             share = self._share_of(way, q)
-            near = way.sweep.at(share) if way.sweep and share is not None else None
+            near = way.sweep.pairs_at(share) if way.sweep and share is not None else None
             if share is not None and self.comm.bcast(near is not None):
                 return near
         return self.near.look(q, FARTHEST * self.near.edge).candidates
@@ -225,13 +225,13 @@ class Contacts:
             serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
         return self.comm.bcast(serve)
 
-    def with_points(self, moment: Moment) -> Moment:
+    def with_points(self, moment: ContactsAt) -> ContactsAt:
         """Return the same with the points, which friction asks for."""
-        return Moment(moment.q, moment.count, self.points(moment.q), moment.contacts)
+        return ContactsAt(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts at q."""
-        moment, touch = self.at(q), Touch()
+        moment, touch = self.find(q), Touch()
         if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
             touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))

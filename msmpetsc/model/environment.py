@@ -8,8 +8,9 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.build import Model
+from msmpetsc.model.contact.friction import Movers, apply_friction
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.penalty import Contact, ContactState, Movers, Penalty, apply_friction
+from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty
 from msmpetsc.model.contact.reflection import StepTaken, slowed
 from msmpetsc.model.loads import Anchor, Load, OwnForce
 from msmpetsc.model.self_contact.contacts import Contacts, NearPairs, Touch
@@ -206,7 +207,8 @@ class Environment:
         for p, side in self._pressing(time, sides):
             if p.friction > 0:
                 carried = like(nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin))
-                apply_friction(nodes, p.state_at(time, side), carried, p.friction * p.stiffness * duration)
+                pressed = p.state_at(time, side).pressed(nodes.q)
+                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
     def contact_stiffness_bound(
         self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray

@@ -22,8 +22,7 @@ from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactTable, Start, Time
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.problems import KeyPath
-from msmpetsc.scene.self_contact import only_implicit
-from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion, one_state, only_of_one_step
+from msmpetsc.scene.statics import no_damping, no_functions, no_motion, obstacles_fit, one_state, only_implicit
 from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
 
@@ -103,8 +102,7 @@ class SceneFile(Table):
     _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)
     _starts_at_rest = field_validator("start")(no_motion)
     _start_at_rest = field_validator("body")(no_moving_body)
-    _only_presses = field_validator("obstacle")(no_impact)
-    _of_one_step = field_validator("obstacle")(only_of_one_step)
+    _fits_the_integrator = field_validator("obstacle")(obstacles_fit)
     _is_given = field_validator("force")(no_functions)
     _meets_itself = field_validator("self_contact")(only_implicit)
 

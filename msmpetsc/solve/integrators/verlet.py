@@ -27,7 +27,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.contact.penalty import Movers
+from msmpetsc.model.contact.friction import Movers
 from msmpetsc.model.contact.reflection import StepTaken
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment

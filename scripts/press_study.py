@@ -52,7 +52,7 @@ def row(law: str, share: float, path: Path) -> list[str]:
         height = np.array([result.embedding @ x[:, 2] for x in q])  # of the surface's points [m]
     plate = scene.obstacle[1]
     assert plate.box is not None and plate.stop is not None
-    low = np.array([plate.box[0][2] + Motion.through(plate.path).at(time)[2] for time in times])
+    low = np.array([plate.box[0][2] + Motion.through(plate.path).displacement_at(time)[2] for time in times])
     above = (height.max(axis=1) - low)[times < plate.stop - 1e-9].max()
     inverted = [int((least_volumes(x, cells) <= 0).sum()) for x in q]
     body = nodes[:, 2] < HEIGHT / 2

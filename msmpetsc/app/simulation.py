@@ -14,7 +14,7 @@ from msmpetsc.app.failure import ending_together
 from msmpetsc.app.log import logged_on_root
 from msmpetsc.app.request import FLAGS
 from msmpetsc.errors import InputError
-from msmpetsc.model.build import Model, Shape, build_model
+from msmpetsc.model.build import Geometry, Model, build_model
 from msmpetsc.model.fields import Frame
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import lent_options, start_for_runs, words_of
@@ -77,7 +77,7 @@ class Simulation:
         self.scene = scene_from(scene)
         self.model: Model | None = None
         self._words = words_of(petsc_options)
-        self._shape: Shape | None = None  # that the model was made of
+        self._shape: Geometry | None = None  # that the model was made of
         self._reached = "not begun"  # for people
 
     def __repr__(self) -> str:
@@ -131,7 +131,7 @@ class Simulation:
         alone = self._lend_options(until_the_end)
         simulate.refuse_bad_options(self.comm, scene, Probes())
         if self._shape is None or not self._shape.fits(scene):
-            self._shape = Shape(self.comm, scene)
+            self._shape = Geometry(self.comm, scene)
         self.model = model = build_model(self.comm, scene, self._shape)
         simulation = until_the_end.enter_context(simulate.Simulation(self.comm, scene, model))
         if alone:

@@ -154,7 +154,7 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: st
     before : number of cells of other bodies, which count, too
     """
     axes = _axes(body)
-    slab = Slab.of(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
+    slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
     _refuse_above(max_cells, before + _least_cells(body, grid), grid)
     refuse_beyond_memory(body.comm, before + _least_cells(body, grid))
     corners = _slab_triangles(body, grid, axes)

@@ -28,7 +28,7 @@ class Slab:
     planes: int
 
     @classmethod
-    def of(cls, rank: int, size: int, planes: int) -> "Slab":
+    def of_rank(cls, rank: int, size: int, planes: int) -> "Slab":
         """Return the slab of a rank among ``size`` of them."""
         used = min(size, planes)
         return cls(planes * min(rank, used) // used, planes * min(rank + 1, used) // used, planes)

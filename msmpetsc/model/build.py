@@ -26,7 +26,6 @@ from msmpetsc.model.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.model.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
 from msmpetsc.model.reach import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.model.region import Finder, cell_materials
-from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.contacts import CollisionSurface
 from msmpetsc.model.self_contact.surface import collision_surface
 from msmpetsc.scene.motion import ForceTable
@@ -62,7 +61,7 @@ class Model:
     exchanges: list[Exchange]
     penalties: list[Penalty]
     start: InitialState
-    collision: CollisionSurface | OverlappingSurface | None = None
+    collision: CollisionSurface | None = None
     bodies: tuple[Body, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
@@ -81,7 +80,7 @@ class Model:
         return surfaces_of(self.lattice.table.comm, self.obstacles, np.array([body.bounds for body in self.bodies]))
 
 
-class Shape:
+class Geometry:
     """What meshes and cages alone decide, which runs of other materials, loads and times may share.
 
     bodies, cages, topology : surfaces, valid cells, and the nodes and springs that these make
@@ -120,12 +119,12 @@ class Shape:
         return None if self.cages.share is None else distance_outside(lattice, self.nearest(lattice))
 
 
-def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Model:
+def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> Model:
     """Build everything of a scene but its solver (collective). Raises InputError on all ranks.
 
     shape : of the scene's meshes and cages, where it is known already
     """
-    shape = shape or Shape(comm, scene)
+    shape = shape or Geometry(comm, scene)
     bodies, cages = shape.bodies, shape.cages
     finder = Finder(bodies, cages, scene.folder)
     lattice = _lattice(scene, shape, finder)
@@ -150,7 +149,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Shape | None = None) -> Mod
         penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
-        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice, shape.topology.cells)
+        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
         if scene.self_contact
         else None,
         reaches=reaches,
@@ -245,7 +244,7 @@ def fill_cages(bodies: Sequence[Body], scene: Scene) -> Cages:
     return fill(bodies, cell_size, cages.method, cages.max_cells, cages.boundary)
 
 
-def _lattice(scene: Scene, shape: Shape, finder: Finder) -> Lattice:
+def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
     material = scene.material
     return build_lattice(
         shape.cages,
@@ -284,7 +283,7 @@ def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> li
         where, force = masks[table.key][: lattice.owned], table.table
         if isinstance(force.total, ForceTable):
             share = spread_by_mass(comm, (1.0,), where, lattice.mass)
-            loads.append(Load(share, force.start, force.stop, LoadTable.of(force.total)))
+            loads.append(Load(share, force.start, force.stop, LoadTable.of_scene(force.total)))
         else:
             loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads

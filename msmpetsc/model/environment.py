@@ -1,5 +1,6 @@
 """What acts on a body from outside at a time: loads, anchors, obstacles."""
 
+from dataclasses import replace
 from functools import reduce
 from itertools import compress
 
@@ -7,12 +8,13 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.build import Model
+from msmpetsc.model.contact.friction import Movers, apply_friction
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty, apply_friction
-from msmpetsc.model.contact.reflection import Step, slowed
+from msmpetsc.model.contact.penalty import Contact, ContactState, Penalty
+from msmpetsc.model.contact.reflection import StepTaken, slowed
 from msmpetsc.model.loads import Anchor, Load, OwnForce
-from msmpetsc.model.self_contact.contacts import Touch
-from msmpetsc.model.self_contact.kinds import contacts_of, term_of
+from msmpetsc.model.self_contact.contacts import Contacts, NearPairs, Touch
+from msmpetsc.model.self_contact.term import SurfaceContact
 
 
 class Environment:
@@ -28,7 +30,8 @@ class Environment:
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges
-        self.self_contact = contacts_of(self.lattice.table.comm, model.collision) if model.collision else None
+        self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
+        self._contacts = Contacts(self.self_contact) if self.self_contact else None  # of the last step that was begun
         self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
         self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
@@ -54,7 +57,7 @@ class Environment:
         """
         owned = self.lattice.owned
         for number, force in enumerate(self.own_forces):
-            self._own[number] = like(q, force.at(to_host(q[:owned]), to_host(v[:owned]), time))
+            self._own[number] = like(q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time))
 
     def load(self, time: float) -> np.ndarray:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
@@ -101,7 +104,7 @@ class Environment:
         if not anchors:
             return None
         for anchor in anchors:
-            target = self.lattice.nodes + like(q, anchor.path.at(time))
+            target = self.lattice.nodes + like(q, anchor.path.displacement_at(time))
             q = np.where(anchor.where[:, None], target, q)
         return q
 
@@ -110,8 +113,12 @@ class Environment:
 
         def at(time: float) -> list:
             loads = [load.state_at(time) for load in self.pulling]
-            anchors = [anchor.holds_at(time) and tuple(anchor.path.at(time)) for anchor in self.anchors]
-            return [*loads, *anchors, *(o.acts_at(time) and tuple(o.path.at(time)) for o in self.obstacles)]
+            anchors = [anchor.holds_at(time) and tuple(anchor.path.displacement_at(time)) for anchor in self.anchors]
+            return [
+                *loads,
+                *anchors,
+                *(o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles),
+            ]
 
         return at(begin) == at(end)
 
@@ -173,13 +180,13 @@ class Environment:
         pressing = self._pressing(time, sides)
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:
-            self.self_contact.expect(q, end)
-            surface = term_of(self.self_contact, q, time_step)
+            self._contacts = self.self_contact.step(q, end)
+            surface = SurfaceContact(self._contacts, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts of the surface with itself at q (collective)."""
-        return self.self_contact.touch(q) if self.self_contact else Touch()
+        return self._contacts.touch(q) if self._contacts else Touch()
 
     def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
@@ -187,30 +194,21 @@ class Environment:
         return Contact(states, self.lattice.owned) if states else None
 
     def _states(self, time: float, sides: np.ndarray | None) -> list[ContactState]:
-        return [p.at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
+        return [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def apply_friction(
-        self,
-        q: np.ndarray,
-        v: np.ndarray,
-        rows: np.ndarray,
-        per_mass: np.ndarray,
-        time: float,
-        duration: float,
-        begin: float,
-        end: float,
-        sides: np.ndarray,
+        self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: np.ndarray
     ) -> None:
-        """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to v (owned, 3) [m/s].
+        """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to this rank's nodes.
 
-        q, rows, per_mass : (owned, 3) [m]; the nodes that move; (owned,) [1/kg]
-        begin, end        : the substep [s] in which an obstacle carries along what it holds
+        substep : its begin and end [s], between which an obstacle carries along what it holds
         """
+        begin, end = substep
         for p, side in self._pressing(time, sides):
             if p.friction > 0:
-                path = p.obstacle.path
-                carried = like(q, (path.at(end) - path.at(begin)) / (end - begin))
-                apply_friction(rows, q, p.at(time, side), carried, p.friction * p.stiffness * duration, per_mass, v)
+                carried = like(nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin))
+                pressed = p.state_at(time, side).pressed(nodes.q)
+                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
     def contact_stiffness_bound(
         self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray
@@ -223,7 +221,7 @@ class Environment:
         stiffness = np.zeros(len(q), like=q)
         for p, side in zip(self.penalties, sides[self.pressing], strict=True):
             if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
-                way = p.obstacle.path.at(time) - p.obstacle.path.at(start)
+                way = p.obstacle.path.displacement_between(start, time)
                 reach = 2 * (speed * (time - start) + np.linalg.norm(way))
                 inside, _ = p.obstacle.depths(q, start)
                 stiffness += p.stiffness * ((inside > -reach) | (side > 0))
@@ -236,15 +234,15 @@ class Environment:
         """
         power = 0.0
         for p, side in self._pressing(time, sides):
-            way = p.obstacle.path.at(end) - p.obstacle.path.at(begin)
+            way = p.obstacle.path.displacement_between(begin, end)
             if way.any():
-                _, depth, normal = p.at(time, side).pressed(q)
+                _, depth, normal = p.state_at(time, side).pressed(q)
                 power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
         return power
 
     def energy_of_new_obstacles(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
         """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
-        new = [p.at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
     def friction_work_bound(
@@ -264,11 +262,11 @@ class Environment:
         for row, p in enumerate(self.penalties):
             if not p.obstacle.acts_at(time):
                 continue
-            way = float(np.linalg.norm(p.obstacle.path.at(time) - p.obstacle.path.at(time - time_step)))
+            way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time)))
             if p.friction > 0 and way > 0:
                 for (q, sides), when in ((before, time - time_step), (after, time)):
                     side = (self.no_sides if sides is None else sides)[row, : len(q)]
-                    inside, _ = p.at(when, side).depths(q)
+                    inside, _ = p.state_at(when, side).depths(q)
                     work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
         return work
 
@@ -289,7 +287,7 @@ class Environment:
             for (q, sides), when in ((before, time - time_step), (after, time)):
                 side = (self.no_sides if sides is None else sides)[row, : len(q)]
                 acts = p.obstacle.acts_at(when)
-                depths.append(np.maximum(p.at(when, side).depths(q)[0], 0) if acts else np.zeros_like(change))
+                depths.append(np.maximum(p.state_at(when, side).depths(q)[0], 0) if acts else np.zeros_like(change))
             change += p.stiffness * np.abs(depths[1] - depths[0])
         return change
 
@@ -298,36 +296,36 @@ class Environment:
         return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
 
     def strike(
-        self, q: np.ndarray, q_previous: np.ndarray, step: tuple[float, float, np.ndarray], held: np.ndarray
+        self, q: np.ndarray, q_previous: np.ndarray, step: StepTaken, held: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
 
         The arrays are the very same if nothing is struck.
 
-        step : the time [s] that it ended at, its length [s], and the sides (o, l)
+        step : with the sides (o, l) of all obstacles
         held : (l,) bool, the nodes that do not give way
         """
-        time, time_step, sides = step
         free, work = ~held[:, None], 0.0
+        sides = self.no_sides if step.sides is None else step.sides
         for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):
-            after, before = exchange.exchanged(q, q_previous, Step(time, time_step, side))
+            after, before = exchange.exchanged(q, q_previous, replace(step, sides=side))
             if after is not q:
                 after, before = np.where(free, after, q), np.where(free, before, q_previous)
-                work += self._impulse_work(exchange.obstacle, (after - before) - (q - q_previous), time, time_step)
+                work += self._impulse_work(exchange.obstacle, (after - before) - (q - q_previous), step)
                 q, q_previous = after, before
         for p, side in zip(self.penalties, sides[self.pressing], strict=True):
             if p.restitution is not None:
-                before = slowed(p.obstacle, p.restitution, q, q_previous, Step(time, time_step, side))
+                before = slowed(p.obstacle, p.restitution, q, q_previous, replace(step, sides=side))
                 if before is not q_previous:
                     before = np.where(free, before, q_previous)
-                    work += self._impulse_work(p.obstacle, q_previous - before, time, time_step)
+                    work += self._impulse_work(p.obstacle, q_previous - before, step)
                     q_previous = before
         return q, q_previous, work
 
-    def _impulse_work(self, obstacle: Obstacle, change: np.ndarray, time: float, time_step: float) -> float:
+    def _impulse_work(self, obstacle: Obstacle, change: np.ndarray, step: StepTaken) -> float:
         """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""
         if not obstacle.path.leads_away:
             return 0.0
-        way = obstacle.path.at(time) - obstacle.path.at(time - time_step)
+        way = obstacle.path.displacement_between(step.time - step.length, step.time)
         mass = self.lattice.mass
-        return float(to_host(mass @ change[: len(mass)]) @ way) / time_step**2
+        return float(to_host(mass @ change[: len(mass)]) @ way) / step.length**2

@@ -84,9 +84,7 @@ class Frame:
     steps: Annotated[int, _number("i8", "1", "time steps taken")] = 0
     time_error: Annotated[float, _number("f8", "1", "estimated relative error of the motion so far")] = math.nan
     self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
-    self_distance: Annotated[
-        float, _number("f8", "m", "least distance of a contact with itself, negative for a depth")
-    ] = math.nan
+    self_distance: Annotated[float, _number("f8", "m", "least distance of a contact with itself")] = math.nan
     self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
 
     def __repr__(self) -> str:

@@ -46,9 +46,13 @@ class Motion:
         """Whether the motion leaves where it starts."""
         return len(self.times) > 1
 
-    def at(self, time: float) -> np.ndarray:
+    def displacement_at(self, time: float) -> np.ndarray:
         """Return the displacement (3,) [m] at a time [s]; after the last time it is that of the last."""
         return interpolated(time, self.times, self.displacements)
+
+    def displacement_between(self, begin: float, end: float) -> np.ndarray:
+        """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
+        return self.displacement_at(end) - self.displacement_at(begin)
 
 
 @dataclass(frozen=True)
@@ -76,13 +80,13 @@ class LoadTable:
     totals: np.ndarray
 
     @classmethod
-    def of(cls, total: Vector | ForceTable) -> "LoadTable":
+    def of_scene(cls, total: Vector | ForceTable) -> "LoadTable":
         """Return the table of a scene's force; of one that is always the same a table of one time."""
         if isinstance(total, ForceTable):
             return cls(np.array(total.times), np.array(total.values))
         return cls(np.zeros(1), np.array([total]))
 
-    def at(self, time: float) -> np.ndarray:
+    def total_at(self, time: float) -> np.ndarray:
         """Return the total force (3,) [N] at a time [s]; before the first and after the last time that of those."""
         return interpolated(time, self.times, self.totals)
 
@@ -105,12 +109,12 @@ class Load:
 
     def force_at(self, time: float) -> np.ndarray:
         """Return the force (owned, 3) [N] that acts at a time [s]."""
-        return self.force if self.table is None else self.force * like(self.force, self.table.at(time))
+        return self.force if self.table is None else self.force * like(self.force, self.table.total_at(time))
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
         """Return what tells the force at a time from that at another: whether it acts, and of a table the total."""
         acts = self.acts_at(time)
-        return tuple(self.table.at(time).tolist()) if acts and self.table is not None else acts
+        return tuple(self.table.total_at(time).tolist()) if acts and self.table is not None else acts
 
     @property
     def events(self) -> list[float]:
@@ -149,7 +153,7 @@ class OwnForce:
         """Times [s] at which the force begins or ends."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
-    def at(self, q: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
+    def force_at(self, q: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
         """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""
         force = np.zeros((len(q), 3))
         if not len(self.rows):

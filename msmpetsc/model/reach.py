@@ -94,14 +94,14 @@ def _leads_alike(a: Anchor, b: Anchor) -> bool:
     return same and np.array_equal(a.path.displacements, b.path.displacements) and a.stop == b.stop
 
 
-def _warn_of_overruled(reach: Reach, pinned: int, led: int) -> None:
+def _warn_of_overruled(reach: Reach, pinned: int, prescribed: int) -> None:
     """Warn that some of an anchor's nodes are pinned, or led another way by earlier anchors; raise if all are."""
     why = [f"{pinned} {'is' if pinned == 1 else 'are'} pinned"] if pinned else []
-    why += [f"{led} {'is' if led == 1 else 'are'} led by an anchor before it"] if led else []
+    why += [f"{prescribed} {'is' if prescribed == 1 else 'are'} led by an anchor before it"] if prescribed else []
     if not why:
         return
     text = f"{reach.key}: of the {_nodes(reach.nodes)} in its region {' and '.join(why)}"
-    if pinned + led == reach.nodes:
+    if pinned + prescribed == reach.nodes:
         raise InputError(f"{text}: it leads none")
     log.warning("%s, which it does not lead", text)
 

@@ -33,7 +33,7 @@ class SurfaceGaps:
     body: np.ndarray
     reach: float
 
-    def at(self, points: np.ndarray) -> np.ndarray:
+    def distances(self, points: np.ndarray) -> np.ndarray:
         """Return the distance (v,) [m] of points (v, 3) to the nearest triangle in front of each that faces it.
 
         It is infinite beyond the reach. What was near at rest does not count: the other side of a crease.
@@ -88,7 +88,7 @@ def gaps_to_obstacles(
     gaps = np.full(len(points), np.inf)
     for number, obstacle in enumerate(obstacles):
         if within(time, obstacle.start, obstacle.stop):
-            seen_from_it = points - Motion.through(obstacle.path).at(time)
+            seen_from_it = points - Motion.through(obstacle.path).displacement_at(time)
             own = _gaps(obstacle, seen_from_it) if number not in solids else _gaps_to(solids[number], seen_from_it)
             gaps = np.minimum(gaps, own)
     return gaps

@@ -3,9 +3,11 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.geometry.surface import Surface
+from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.model.build import Model
 from msmpetsc.output.writer import ResultFile
+
+NOTHING = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))  # what ranks but the first have of surfaces
 
 
 def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
@@ -28,13 +30,13 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     if comm.bcast(bool(model.solids)):
         for name, rows in obstacle_rows(model.solids).items():
             file.write(f"obstacle/{name}", rows)
-    surface, embedding = model.surface, model.embedding
+    surface, embedding = model.surface or NOTHING, model.embedding
     if embedding is None:
         return
     if several:
         file.write("surface/body", model.body_of_point.astype("i4"))
-    file.write("surface/points", np.empty((0, 3)) if surface is None else surface.points)
-    file.write("surface/triangles", np.empty((0, 3), np.int64) if surface is None else surface.triangles)
+    file.write("surface/points", surface.points)
+    file.write("surface/triangles", surface.triangles)
     offset = comm.exscan(len(embedding.indices)) or 0
     indptr = embedding.indptr[1:] + offset
     file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
@@ -44,11 +46,7 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
 
 def obstacle_rows(solids: dict[int, Surface]) -> dict[str, np.ndarray]:
     """Return what stands in the file of the surfaces of obstacles, all of them on rank 0."""
-    starts = np.cumsum([0, *(len(solid.points) for solid in solids.values())])
-    triangles = [solid.triangles + start for solid, start in zip(solids.values(), starts[:-1], strict=True)]
+    whole = joined([*solids.values()]) or NOTHING
     counts = [len(solid.triangles) for solid in solids.values()]
-    return {
-        "points": np.concatenate([np.empty((0, 3)), *(solid.points for solid in solids.values())]),
-        "triangles": np.concatenate([np.empty((0, 3), np.int64), *triangles]),
-        "number": np.repeat(np.array([*solids], "i4"), counts),
-    }
+    number = np.repeat(np.array([*solids], "i4"), counts)
+    return {"points": whole.points, "triangles": whole.triangles, "number": number}

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from pydantic import Field, ValidationInfo
 
-from msmpetsc.scene.body import Mesh, OwnMaterial, PartTable, refuse_unlike
+from msmpetsc.scene.body import MeshTable, OwnMaterial, PartTable, refuse_unlike
 from msmpetsc.scene.motion import AnchorTable, Force, Pin, Start
 from msmpetsc.scene.problems import KeyPath, rule
 from msmpetsc.scene.statics import refuse_functions, refuse_motion
@@ -17,7 +17,7 @@ OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of 
 class BodyTable(Table):
     """One of several bodies. Regions of its tables are of this body alone."""
 
-    mesh: Mesh = Field(description="its closed surface")
+    mesh: MeshTable = Field(description="its closed surface")
     material: OwnMaterial | None = Field(None, description="what it is made of, where that is not the scene's material")
     part: ListOf[PartTable] = Field((), description="cells of it of another material")
     start: Start | None = Field(None, description="how it is at time 0; as the scene's start says if absent")

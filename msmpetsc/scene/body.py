@@ -56,14 +56,14 @@ def _step(value: Any) -> str | dict[str, Any]:
     return value
 
 
-Step = Annotated[str | dict[str, Any], BeforeValidator(_step)]
+PrepareStep = Annotated[str | dict[str, Any], BeforeValidator(_step)]
 
 
-class Mesh(Table):
+class MeshTable(Table):
     """The closed surface."""
 
     source: FileName = Field(description="registry name, or path beside or below this file")
-    prepare: ListOf[Step] = Field(
+    prepare: ListOf[PrepareStep] = Field(
         (),
         description="steps in this order: merge, largest_part, union, repair, orient, "
         "{ simplify = triangles [-] }, { rotate = { axis = [x, y, z] [-], degrees = angle [degrees] } }",

@@ -22,7 +22,7 @@ from msmpetsc.scene.statics import STATIC, no_wait
 from msmpetsc.scene.values import (
     Direction,
     FunctionName,
-    Integrator,
+    IntegratorName,
     ListOf,
     NotNegative,
     Positive,
@@ -47,7 +47,7 @@ class Time(Table):
     model_config = ConfigDict(json_schema_extra=_wanted_in_motion)
     step: Positive = Field(description="time step; required but of statics that stay the same if absent [s]")
     duration: Positive = Field(description="simulated time; required but of statics that stay the same if absent [s]")
-    integrator: Integrator = Field(
+    integrator: IntegratorName = Field(
         "implicit-euler",
         description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
         "state of equilibrium",

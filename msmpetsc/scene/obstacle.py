@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from msmpetsc.scene.body import Mesh
+from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.motion import PATH, Path3
 from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import Box, FunctionName, NotNegative, Positive, Table, UnitVector, Vector, after_start
@@ -29,7 +29,7 @@ class ObstacleTable(Table):
     box: Box | None = Field(None, description="two corners of the box, each coordinate of the first the lower [m]")
     center: Vector | None = Field(None, description="of the sphere [m]")
     radius: Positive | None = Field(None, description="of the sphere [m]")
-    mesh: Mesh | None = Field(None, description="a closed surface, of which the inside is meant")
+    mesh: MeshTable | None = Field(None, description="a closed surface, of which the inside is meant")
     function: FunctionName | None = Field(
         None, description="name of a signed distance to a surface, registered in Python or installed"
     )

@@ -18,20 +18,19 @@ from msmpetsc.scene.bodies import (
     of_all_bodies,
     tables_of,
 )
-from msmpetsc.scene.body import CagesTable, Material, Mesh, PartTable
+from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactTable, Start, Time
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.problems import KeyPath
-from msmpetsc.scene.self_contact import only_implicit
-from msmpetsc.scene.statics import no_damping, no_functions, no_impact, no_motion, one_state, only_of_one_step
+from msmpetsc.scene.statics import no_damping, no_functions, no_motion, obstacles_fit, one_state, only_implicit
 from msmpetsc.scene.toml import overrides_of, toml_of
-from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, Preset, Table
+from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
 
 
 class Solver(Table):
     """How a step is solved."""
 
-    preset: Preset = Field("newton", min_length=1, description="named set of PETSc options")
+    preset: PresetName = Field("newton", min_length=1, description="named set of PETSc options")
     error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
     max_iterations: Count | None = Field(None, description="outer iterations allowed in a step [-]")
 
@@ -52,7 +51,7 @@ class Output(Table):
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
 
 
-class Budget(Table):
+class BudgetTable(Table):
     """The surface error that a plan expects: rms over surface and time, of the largest displacement."""
 
     target: Positive = Field(description="asked for [-]")
@@ -79,7 +78,7 @@ class SceneFile(Table):
 
     one_of = ("mesh", "body")
     title: str = Field("", description="for the reader")
-    mesh: Mesh | None = Field(None, description="the closed surface of the one body")
+    mesh: MeshTable | None = Field(None, description="the closed surface of the one body")
     cages: CagesTable = Field(description="the cells that fill it")
     material: Material = Field(description="what it is made of")
     time: Time = Field(description="time step and duration")
@@ -95,7 +94,7 @@ class SceneFile(Table):
     solver: Solver = Field(Solver.model_validate({}), description="how a step is solved")
     safety: Safety = Field(Safety.model_validate({}), description="what is done about a step that fails")
     output: Output = Field(Output.model_validate({}), description="what is stored")
-    budget: Budget | None = Field(None, description="the surface error that `plan` expects; for the reader")
+    budget: BudgetTable | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
     _of_one_kind = field_validator("body", "part")(as_the_material)
@@ -103,8 +102,7 @@ class SceneFile(Table):
     _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)
     _starts_at_rest = field_validator("start")(no_motion)
     _start_at_rest = field_validator("body")(no_moving_body)
-    _only_presses = field_validator("obstacle")(no_impact)
-    _of_one_step = field_validator("obstacle")(only_of_one_step)
+    _fits_the_integrator = field_validator("obstacle")(obstacles_fit)
     _is_given = field_validator("force")(no_functions)
     _meets_itself = field_validator("self_contact")(only_implicit)
 
@@ -124,7 +122,7 @@ class SceneFile(Table):
         return 1 + (-(-step // every) if step == self.time.steps else step // every)
 
     @property
-    def meshes(self) -> dict[KeyPath, Mesh]:
+    def meshes(self) -> dict[KeyPath, MeshTable]:
         """The surface of each body, by the path of its key."""
         if self.mesh is not None:
             return {("mesh",): self.mesh}

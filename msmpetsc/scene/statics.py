@@ -1,4 +1,5 @@
-"""Rules of a scene whose integrator is "static": what has no meaning where nothing moves is refused, or not wanted."""
+"""Rules of a scene that depend on its integrator: in statics, where nothing moves, much has no meaning; exchange and a
+surface that meets itself want implicit steps."""
 
 from collections.abc import Iterator
 from typing import Any, Final
@@ -8,6 +9,7 @@ from pydantic import ValidationInfo
 from msmpetsc.scene.problems import rule
 
 STATIC: Final = "static"  # time.integrator
+IMPLICIT = ("implicit-euler", "bdf2")
 OF_TIME = ("path", "times", "start", "stop")  # keys of what comes, goes or moves
 
 
@@ -68,29 +70,26 @@ def refuse_motion(start: Any, info: ValidationInfo, whose: str = "") -> None:
         raise rule(words, "time")
 
 
-def only_of_one_step(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
-    """Refuse the paper's exchange where a step looks further back (a validator of ``obstacle``)."""
-    if getattr(info.data.get("time"), "integrator", None) == "bdf2":
-        for number, obstacle in enumerate(obstacles):
-            if obstacle.response == "exchange":
-                raise rule(
-                    f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
-                    'one step; "reflect" and "penalty" go',
-                    "time",
-                )
-    return obstacles
+def obstacles_fit(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
+    """Refuse obstacles that do not go with the integrator (a validator of ``obstacle``).
 
-
-def no_impact(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
-    """Refuse obstacles that anything bounces off, or that rub (a validator of ``obstacle``)."""
-    for number, obstacle in enumerate(obstacles if _is_static(info) else ()):
-        if obstacle.response != "penalty":
+    The paper's exchange sets nodes back, which a step of BDF2 would see; in statics nothing bounces or rubs.
+    """
+    integrator = getattr(info.data.get("time"), "integrator", None)
+    for number, obstacle in enumerate(obstacles):
+        if integrator == "bdf2" and obstacle.response == "exchange":
+            raise rule(
+                f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
+                'one step; "reflect" and "penalty" go',
+                "time",
+            )
+        if integrator == STATIC and obstacle.response != "penalty":
             raise rule(
                 f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: nothing '
                 'strikes it; response = "penalty" presses',
                 "time",
             )
-        if obstacle.friction:
+        if integrator == STATIC and obstacle.friction:
             raise rule(
                 f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on the '
                 'way there; time.until = "rest" ends a run in motion there',
@@ -114,3 +113,21 @@ def refuse_functions(forces: Any, info: ValidationInfo, whose: str = "") -> None
                 "the state before, which is not at rest under it",
                 "time",
             )
+
+
+def only_implicit(cls: Any, table: Any, info: ValidationInfo) -> Any:
+    """Refuse integrators that take other steps than implicit ones, and obstacles that set nodes back (a validator of
+    ``self_contact``)."""
+    if table is None:
+        return table
+    integrator = getattr(info.data.get("time"), "integrator", IMPLICIT[0])
+    if integrator not in IMPLICIT:
+        raise rule(f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"', "time")
+    for number, obstacle in enumerate(info.data.get("obstacle", ())):
+        if obstacle.response == "exchange":
+            raise rule(
+                f'may not go with response = "exchange", as obstacle.{number} has it: that moves nodes past each '
+                'other; "reflect" and "penalty" press',
+                "obstacle",
+            )
+    return table

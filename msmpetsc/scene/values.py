@@ -91,8 +91,8 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
 
 FileName = Annotated[str, Field(min_length=1, max_length=1000), AfterValidator(_printable)]
 FunctionName = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_printable)]
-Integrator = Literal["implicit-euler", "bdf2", "verlet", "static"]
-Preset = Annotated[str, AfterValidator(_known_preset)]
+IntegratorName = Literal["implicit-euler", "bdf2", "verlet", "static"]
+PresetName = Annotated[str, AfterValidator(_known_preset)]
 Box = Annotated[tuple[Vector, Vector], Strict(False), AfterValidator(_has_a_volume)]
 Painted = Annotated[str | tuple[int, ...], BeforeValidator(_painted)]
 

@@ -16,7 +16,7 @@ from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
-from msmpetsc.model.self_contact.kinds import RunContacts
+from msmpetsc.model.self_contact.contacts import NearPairs
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -224,7 +224,7 @@ class Simulation:
         for part in self._remembering():
             part.restore(checkpoint)
 
-    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest | RunContacts]:
+    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest | NearPairs]:
         parts = (self.rest, self.environment.self_contact)
         return [self.balance, self.recovery, self.monitors, self.cost, *(part for part in parts if part)]
 

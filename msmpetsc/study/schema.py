@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.problems import problem_lines, rule
 from msmpetsc.scene.reading import OF_STUDIES, read_toml
-from msmpetsc.scene.values import Count, FileName, Integrator, ListOf, Positive, Preset, Table
+from msmpetsc.scene.values import Count, FileName, IntegratorName, ListOf, Positive, PresetName, Table
 from msmpetsc.solve.petsc.words import unsafe_word
 
 Error = Annotated[float, Field(gt=0, lt=1)]
@@ -56,7 +56,7 @@ class ReferenceRun(Table):
     With cells of its own, many more than the cases have, it stands for the body itself, and surfaces are compared.
     """
 
-    integrator: Integrator = Field(default="verlet", description="how it is stepped")
+    integrator: IntegratorName = Field(default="verlet", description="how it is stepped")
     step: Positive | None = Field(default=None, description="implicit-euler: time step [s]")
     substep: Positive | None = Field(
         default=None, description="verlet: longest substep [s]; the stability limit's if absent"
@@ -65,7 +65,7 @@ class ReferenceRun(Table):
         default=None,
         description="number of its own valid cells: then surfaces are compared; the case's own lattice if absent [-]",
     )
-    preset: Preset = Field(default="newton", description="implicit-euler: solver preset")
+    preset: PresetName = Field(default="newton", description="implicit-euler: solver preset")
     error: Error = Field(default=1e-6, description="implicit-euler: relative error of a step [-]")
     timeout: Positive = Field(default=600.0, description="longest run [s]")
 
@@ -117,8 +117,8 @@ class Sweep(Table):
     """Cases of every choice from each list, for every scene. An empty list leaves what the scene has."""
 
     scenes: ListOf[str] = Field(default=(), description="names of the scenes; all if absent")
-    integrators: ListOf[Integrator] = Field(default=("implicit-euler",), description="how they are stepped")
-    presets: ListOf[Preset] = Field(default=(), description="implicit-euler: solver presets")
+    integrators: ListOf[IntegratorName] = Field(default=("implicit-euler",), description="how they are stepped")
+    presets: ListOf[PresetName] = Field(default=(), description="implicit-euler: solver presets")
     options: ListOf[Options] = Field(default=("",), description='PETSc options, each one string: "-pc_type icc"')
     cells: ListOf[Count] = Field(default=(), description="numbers of valid cells [-]")
     time_steps: ListOf[Positive] = Field(
@@ -148,8 +148,8 @@ class Method(Table):
     """A way to step and solve the scenes of maps."""
 
     label: str = Field(min_length=1, description="what maps call it")
-    integrator: Integrator = Field(default="implicit-euler", description="how it is stepped")
-    preset: Preset = Field(default="newton", description="solver preset; of no use to verlet")
+    integrator: IntegratorName = Field(default="implicit-euler", description="how it is stepped")
+    preset: PresetName = Field(default="newton", description="solver preset; of no use to verlet")
     error: Error | None = Field(
         default=None, description="relative error of a step aimed at; the preset's if absent [-]"
     )

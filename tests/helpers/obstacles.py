@@ -3,7 +3,7 @@
 import numpy as np
 
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.solids import Ball, Faces
+from msmpetsc.model.contact.solids import BallSolid, Faces
 from msmpetsc.model.loads import Motion
 
 STILL = Motion.through(())
@@ -19,4 +19,4 @@ def box(low: list[float], high: list[float], path: Motion = STILL, **times: floa
 
 
 def sphere(center: list[float], radius: float, path: Motion = STILL, **times: float) -> Obstacle:
-    return Obstacle(Ball(np.array(center, float), radius), path, **times)
+    return Obstacle(BallSolid(np.array(center, float), radius), path, **times)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from obstacles import box, plane, sphere
 
 from msmpetsc.model.contact.penalty import Contact, Penalty
-from msmpetsc.model.contact.reflection import Exchange, Step
+from msmpetsc.model.contact.reflection import Exchange, StepTaken
 from msmpetsc.model.loads import Motion
 from msmpetsc.scene.motion import Keyframe
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -425,19 +425,21 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
     floor = plane([0, 0, 0], [0, 0, 1], path)
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
     for e in (1.0, 0.5, 0.0):
-        after, after_before = Exchange(floor, e).exchanged(q, before, Step(0.5, T))  # the plane is at 0.25
+        after, after_before = Exchange(floor, e).exchanged(q, before, StepTaken(0.5, T))  # the plane is at 0.25
         v, v_plane = -0.3, 0.5
         np.testing.assert_allclose((after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)])
         np.testing.assert_array_equal((after[1], after_before[1]), (q[1], before[1]))
     leaving = q + np.array([0, 0, 0.06])  # 0.9 m/s up, faster than the plane: is not held back
-    np.testing.assert_array_equal(Exchange(floor, 1.0).exchanged(leaving[:1], before[:1], Step(0.5, T))[0], leaving[:1])
+    np.testing.assert_array_equal(
+        Exchange(floor, 1.0).exchanged(leaving[:1], before[:1], StepTaken(0.5, T))[0], leaving[:1]
+    )
 
 
 def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
     cube = box([0, 0, 0], [1, 1, 1])
     q = np.array([[0.1, 0.5, 0.4], [0.5, 0.95, 0.5], [0.5, 0.5, -0.1]])
     before = q + np.array([[-0.2, 0.05, 0], [0, 0.1, 0.1], [0, 0, -0.1]])
-    after, after_before = Exchange(cube, 1.0).exchanged(q, before, Step(1.0, T))
+    after, after_before = Exchange(cube, 1.0).exchanged(q, before, StepTaken(1.0, T))
     v = q - before
     np.testing.assert_allclose(after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15)
 
@@ -445,13 +447,15 @@ def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
 def test_an_obstacle_acts_from_start_to_before_stop():
     floor = plane([0, 0, 0], [0, 0, 1], start=1.0, stop=2.0)
     q, before = np.array([[0.0, 0, -0.1]]), np.array([[0.0, 0, 0.1]])
-    moved = [(Exchange(floor, 1.0).exchanged(q, before, Step(time, T))[0] != q).any() for time in (0.9, 1.0, 1.9, 2.0)]
+    moved = [
+        (Exchange(floor, 1.0).exchanged(q, before, StepTaken(time, T))[0] != q).any() for time in (0.9, 1.0, 1.9, 2.0)
+    ]
     assert moved == [False, True, True, False]
 
 
 def test_a_path_stays_at_its_last_place():
     path = Motion.through([Keyframe(time=1.0, by=(2, 0, 0)), Keyframe(time=3.0, by=(2, 4, 0))])
-    places = [path.at(time).tolist() for time in (0, 0.5, 1, 1.5, 3, 99)]
+    places = [path.displacement_at(time).tolist() for time in (0, 0.5, 1, 1.5, 3, 99)]
     assert places == [[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0], [2, 4, 0], [2, 4, 0]]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lattices import one_spring
 
-from msmpetsc.model.elasticity import flops, springs
+from msmpetsc.model.elasticity import energy, springs
 
 COUNTED = "spring_pull", "spring_change", "spring_block", "block_product"
 
@@ -52,7 +52,7 @@ def numbers(*shape: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["gradient", "change", "hessian"])
 def test_operations_of_a_spring(counting: ModuleType, name: str, stiffens: int):
     q, ends, r, k = numbers(2, 3), np.array([[0, 1]]), numbers(1), numbers(1)
-    spring, law = (q, ends, r, k, Number(0.5 * stiffens)), getattr(flops, name.upper())
+    spring, law = (q, ends, r, k, Number(0.5 * stiffens)), getattr(energy, name.upper())
     if name == "gradient":
         counting.add_elastic_gradient.py_func(*spring, numbers(2, 3))
         twice = 3  # f (p_a - p_b), which a compiler keeps
@@ -70,7 +70,7 @@ def test_operations_of_a_product(counting: ModuleType):
     v = numbers(2, 3).view(Typed)
     counting.add_elastic_product.py_func(np.array([[0, 1]]), numbers(1, 4), v, numbers(2, 3))
     sums = 3  # of the first end, once for all its springs
-    assert Number.made - sums == flops.PRODUCT
+    assert Number.made - sums == energy.PRODUCT
 
 
 class Typed(np.ndarray):
@@ -82,5 +82,5 @@ class Typed(np.ndarray):
 
 
 def test_a_lattice_has_those_of_its_springs_and_nodes():
-    counts = flops.Flops.of(one_spring(1.0, 1.0, 1.0))
+    counts = energy.Flops.of_lattice(one_spring(1.0, 1.0, 1.0))
     assert (counts.gradient, counts.change, counts.hessian, counts.product) == (22 + 30, 38 + 72, 20, 23 + 18)

@@ -13,7 +13,7 @@ from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.reflection import Exchange, Step
+from msmpetsc.model.contact.reflection import Exchange, StepTaken
 from msmpetsc.model.contact.solids import Faces
 from msmpetsc.model.lattice import build_lattice
 from msmpetsc.model.loads import Load, Motion, spread_by_mass
@@ -109,7 +109,7 @@ STILL = Motion.through(())
 
 def exchanged(q, q_previous, point, normal, e):
     """At a plane at rest."""
-    return Exchange(Obstacle(Faces(point[None], normal[None]), STILL), e).exchanged(q, q_previous, Step(1.0, 0.1))
+    return Exchange(Obstacle(Faces(point[None], normal[None]), STILL), e).exchanged(q, q_previous, StepTaken(1.0, 0.1))
 
 
 def test_an_exchange_reverses_only_what_goes_into_the_plane():

@@ -11,21 +11,21 @@ import trimesh
 from block_scene import block_scene, play
 from crossings import count_crossings
 from mpi4py import MPI
-from pinch import ARM, HALF, RADIUS, pinch_scene
+from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 
-import msmpetsc
 from msmpetsc.errors import InputError
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.fields import Frame
 from msmpetsc.model.self_contact.barrier import Barrier
-from msmpetsc.model.self_contact.contacts import Contacts
+from msmpetsc.model.self_contact.contacts import NearPairs
 from msmpetsc.model.self_contact.term import SMALL, SurfaceContact
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.linear.explicit import explicit
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
 COMM = MPI.COMM_SELF
 GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
@@ -53,7 +53,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(Contacts(COMM, model.collision), q, T), end
+    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q), q, T), end
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
@@ -166,49 +166,34 @@ def test_on_a_way_that_was_swept_contacts_are_those_looked_for_anew(model, monke
     """So that line searches need no pairs of their own: the arms close by many edges, and meet."""
     assert model.collision is not None
     start, end = model.lattice.nodes.copy(), closed(model)
-    known, looked = Contacts(COMM, model.collision), []
-    known.expect(start, start)
+    known, looked = NearPairs(COMM, model.collision).step(start, start), []
     assert known.free_share(start, end) == 1.0
-    monkeypatch.setattr(known, "_look", looked.append)
+    monkeypatch.setattr(known.near, "look", looked.append)
     for share in (0.0, 0.31, 0.9, 0.99, 0.999, 1.0):
         q = start + share * (end - start)
-        moment, anew = known.at(q), Contacts(COMM, model.collision).at(q)
+        moment, anew = known.find(q), NearPairs(COMM, model.collision).step(q, q).find(q)
         assert moment.count == anew.count
         if moment.count:
             energies = [known.barrier.energy(each.contacts, each.points) for each in (moment, anew)]
             assert energies[0] == pytest.approx(energies[1], rel=1e-12)
     assert moment.count > 0 and not looked
-    known.expect(start, start)  # of another step
     monkeypatch.undo()
-    assert known.at(end).count == moment.count
-
-
-def positions(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Surface of each frame (T, v, 3) in full precision, its triangles, and the least distances [m]."""
-    with msmpetsc.open(path) as run:
-        surface = np.array([run.embedding @ q for q in run.frames.position[:]])
-        return surface, run.surface.triangles[:], run.frames.self_distance[:]
+    assert known.near.step(start, start).find(end).count == moment.count  # in another step
 
 
 STIFFENING = {"young_modulus": 1e5, "density": 1000, "law": "stiffening"}  # or the arms' ends turn inside out
 
 
-def test_arms_that_close_do_not_cross_on_three_ranks_as_on_one(tmp_path, msmpetsc):
-    scene = pinch_scene(tmp_path, material=STIFFENING, solver={"preset": "newton", "error": 1e-7})
-    without = tmp_path / "without.toml"
-    text = scene.read_text()
-    without.write_text(text[: text.index("[self_contact]")])
-    runs = {"one.h5": (1, scene), "three.h5": (3, scene), "without.h5": (1, without)}
-    for name, (ranks, path) in runs.items():
-        done = msmpetsc(ranks, "run", path, "-o", tmp_path / name, "--frames", 11)
-        assert done.returncode == 0, done.stderr
-    surface, triangles, distance = positions(tmp_path / "one.h5")
-    assert sum(count_crossings(points, triangles) for points in surface) == 0
-    assert 0 < np.nanmin(distance) < 1e-3
-    crossing, triangles, distance = positions(tmp_path / "without.h5")
-    assert count_crossings(crossing[-1], triangles) > 0 and np.isnan(distance).all()
-    others = positions(tmp_path / "three.h5")[0]
-    assert np.abs(others - surface).max() < 1e-5 * np.abs(surface - surface[0]).max()
+def test_arms_that_close_do_not_cross(tmp_path):
+    path = pinch_scene(tmp_path, material=STIFFENING, time={"step": 0.01, "duration": 0.11})
+    model, frames = play(path)
+    triangles = model.surface.triangles
+    assert sum(count_crossings(frame.surface, triangles) for frame in frames) == 0
+    assert 0 < np.nanmin([frame.self_distance for frame in frames]) < 1e-3
+    text = path.read_text()
+    path.write_text(text[: text.index("[self_contact]")])
+    without = play(path)[1]
+    assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(without[-1].self_distance)
 
 
 def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
@@ -247,6 +232,13 @@ def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, capl
     assert 0 < len(surface.triangles) < len(model.surface.triangles)
     assert count_crossings(surface.points, surface.triangles) == 0
     assert count_crossings(model.surface.points, model.surface.triangles) > 0
+
+
+def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
+    path = pinch_scene(tmp_path)
+    trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")
+    with pytest.raises(InputError, match=r"self_contact: .* cut others at rest.*union.*repair"):
+        build_model(COMM, load_scene(path))
 
 
 def test_a_coarser_surface_lies_on_the_body(tmp_path):
@@ -308,9 +300,10 @@ def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: 
         load_scene(path, (override,))
 
 
-def test_presets_of_a_are_refused(tmp_path, msmpetsc):
-    done = msmpetsc(1, "run", pinch_scene(tmp_path), "-o", tmp_path / "out.h5", "--preset", "anderson")
-    assert done.returncode == 2 and "self_contact is for newton's presets, not anderson" in done.stderr
+def test_presets_of_a_are_refused(tmp_path):
+    scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
+    with pytest.raises(InputError, match="self_contact is for newton's presets, not anderson"):
+        refuse_bad_options(COMM, scene, Probes())
 
 
 def sliding(folder: Path, angle: float) -> Path:

@@ -8,7 +8,7 @@ from block_scene import G, block_scene, play
 from obstacles import sphere
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.contact.reflection import Exchange, Step
+from msmpetsc.model.contact.reflection import Exchange, StepTaken
 from msmpetsc.scene.reading import load_scene
 
 FLAT = 1e5  # [m]: over the block's 0.5 m it sinks by 3e-7 m, and a depth is rounded to 1e-11 m
@@ -37,7 +37,7 @@ def test_a_node_is_turned_back_along_the_radius():
     """What of its velocity goes to the centre becomes -e times itself; what goes along the sphere stays."""
     ball, q = sphere([1.0, 2.0, 3.0], 0.5), np.array([[1.0, 2.3, 3.3], [1.0, 2.5, 3.5], [1.0, 2.2, 3.1]])
     q_previous = q + np.array([[0.1, 0.2, 0.4], [0.1, 0.2, 0.4], [0, -0.1, -0.05]])  # in, outside, on its way out
-    after, before = Exchange(ball, 0.5).exchanged(q, q_previous, Step(1.0, 0.1))
+    after, before = Exchange(ball, 0.5).exchanged(q, q_previous, StepTaken(1.0, 0.1))
     normal = np.array([0, 1, 1]) / np.sqrt(2)
     speed = (q - q_previous)[0] @ normal
     assert speed < 0

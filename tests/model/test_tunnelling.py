@@ -17,7 +17,7 @@ from obstacles import box
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.model.contact.penalty import Contact, Penalty
-from msmpetsc.model.contact.reflection import Exchange, Step
+from msmpetsc.model.contact.reflection import Exchange, StepTaken
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.loads import Motion
 from msmpetsc.scene.motion import Keyframe
@@ -106,7 +106,7 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
 
 def test_a_node_that_jumps_over_a_thin_plate_is_reflected_to_where_it_came_from():
     q, before = np.array([[0.1, 0, -0.4], [6.0, 0, -0.4]]), np.array([[0.0, 0, 0.1], [6.0, 0, 0.1]])
-    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, Step(1.0, 0.1))
+    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, StepTaken(1.0, 0.1))
     np.testing.assert_allclose(after, [[0.1, 0, 0.1], [6, 0, -0.4]])
     np.testing.assert_allclose(after - after_before, [[0.1, 0, 0.25], [0, 0, -0.5]])
 

@@ -103,7 +103,7 @@ HALF = TRIANGLES.max() + 1
 def test_parts_that_came_near_each_other(bodies: int, gap: float):
     """All points of the two sides that face each other, and none beside, behind or above."""
     body = np.repeat([0, bodies - 1], HALF)
-    gaps = SurfaceGaps(two_blocks(0.05), PAIR, body, REACH).at(two_blocks(gap))
+    gaps = SurfaceGaps(two_blocks(0.05), PAIR, body, REACH).distances(two_blocks(gap))
     height = two_blocks(gap)[:, 2]
     facing = (abs(height - SIDE) < 1e-9) | (abs(height - SIDE - gap) < 1e-9)
     inner = facing & (abs(two_blocks(gap)[:, :2] - SIDE / 2) < 0.49 * SIDE).all(axis=1)
@@ -113,10 +113,10 @@ def test_parts_that_came_near_each_other(bodies: int, gap: float):
 
 def test_what_was_near_at_rest_is_a_crease_of_one_body_and_a_meeting_of_two():
     rest = two_blocks(GAP)
-    assert np.isinf(SurfaceGaps(rest, PAIR, np.zeros(2 * HALF, int), REACH).at(rest)).all()
-    assert np.isfinite(SurfaceGaps(rest, PAIR, np.repeat([0, 1], HALF), REACH).at(rest)).sum() > 50
+    assert np.isinf(SurfaceGaps(rest, PAIR, np.zeros(2 * HALF, int), REACH).distances(rest)).all()
+    assert np.isfinite(SurfaceGaps(rest, PAIR, np.repeat([0, 1], HALF), REACH).distances(rest)).sum() > 50
 
 
 def test_a_block_that_is_pressed_flat_does_not_touch_itself():
     rest, flat = (block([0, 0, 0], [SIDE, SIDE, height]).vertices for height in (0.5 * SIDE, GAP))
-    assert np.isinf(SurfaceGaps(rest, TRIANGLES, np.zeros(HALF, int), REACH).at(flat)).all()
+    assert np.isinf(SurfaceGaps(rest, TRIANGLES, np.zeros(HALF, int), REACH).distances(flat)).all()

@@ -29,7 +29,7 @@ def check_random_grids(shapes: list[tuple[int, int, int]], seeds: int) -> None:
         for seed in range(seeds):
             rng = np.random.default_rng(seed)
             boundary = rng.random(shape) < rng.uniform(0.3, 0.85)
-            slab = Slab.of(comm.rank, comm.size, shape[0])
+            slab = Slab.of_rank(comm.rank, comm.size, shape[0])
             cells = np.argwhere(boundary)
             assert (Slab.owner(np.arange(slab.first, slab.last), comm.size, shape[0]) == comm.rank).all()
             own = cells[(cells[:, 0] >= slab.first) & (cells[:, 0] < slab.last)]

@@ -14,10 +14,10 @@ from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.model.contact.distance import DistanceSolid, FunctionSolid
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.solids import Ball, Faces, Solid
+from msmpetsc.model.contact.solids import BallSolid, Faces, Solid
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import Motion
-from msmpetsc.scene.body import Mesh
+from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.schema import Scene
 
@@ -53,7 +53,7 @@ def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: np.ndarra
     return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in solids.items()}) or {}
 
 
-def obstacle_surface(mesh: Mesh, key: str, folder: Path) -> Surface:
+def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
     """Return the surface of an obstacle that is a mesh. Raises InputError if it is not closed."""
     try:
         surface = prepare(load(mesh.source, folder), mesh.prepare, mesh.size, mesh.base)
@@ -81,7 +81,7 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Soli
     if table.box is not None:
         return Faces.of_box(*np.array(table.box))
     if table.center is not None:
-        return Ball(np.array(table.center), table.radius or 0.0)
+        return BallSolid(np.array(table.center), table.radius or 0.0)
     return Faces(np.array([table.point]), np.array([table.normal]))
 
 

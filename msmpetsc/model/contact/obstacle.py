@@ -39,7 +39,7 @@ class Obstacle:
 
     def seen_from(self, q: np.ndarray, time: float) -> np.ndarray:
         """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
-        return q - like(q, self.path.at(time)) if self.path.leads_away else q
+        return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
 
     def depths(self, q: np.ndarray, time: float, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).

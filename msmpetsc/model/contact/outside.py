@@ -51,11 +51,3 @@ def _drawn_in(surface: Surface, points: np.ndarray) -> np.ndarray:
 def distance_outside(lattice: Lattice, nearest: np.ndarray) -> np.ndarray:
     """Return how far each node (l,) sticks out of its body at rest [m], from the nearest points (l, 3) of that."""
     return np.linalg.norm(lattice.nodes - nearest, axis=1)
-
-
-def depth_below(surface: Surface, points: np.ndarray) -> np.ndarray:
-    """Return how deep points (n, 3) lie below a surface (n,) [m], negative outside."""
-    import igl  # for scenes with obstacles
-
-    distance = np.sqrt(igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0])
-    return np.where(is_inside(surface, points), distance, -distance)

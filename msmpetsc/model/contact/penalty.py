@@ -1,10 +1,7 @@
 """Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
-and Coulomb friction on those that were.
+and Coulomb friction (contact.friction) on those that were.
 
-A node at depth d > 0 has the energy 1/2 k d^2. Friction opposes the slip u, the way along the surface during the
-step, with mu N once |u| passes a small e; N is the push on the node at the step's start, so that friction has a
-potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020,
-Incremental Potential Contact, Eq. 12 to 15). Both are convex for one face, and so is what a step minimises.
+A node at depth d > 0 has the energy 1/2 k d^2. It is convex for one face, and so is what a step minimises.
 
 With the push of the start friction is of first order in the step's length. A step of BDF2 takes what the two last
 states lead to, N_(n+1) = 2 N_n - N_(n-1), and u = tau v_(n+1), the velocity that it ends with: of second order.
@@ -20,11 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msmpetsc.backend.arrays import like
+from msmpetsc.model.contact.friction import Friction, Pressed, squares
 from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.solids import TINY
 
 if TYPE_CHECKING:
-    from msmpetsc.model.self_contact.kinds import StepContact
+    from msmpetsc.model.self_contact.term import SurfaceContact
 
 Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -42,7 +39,7 @@ class Penalty:
     stick: float
     restitution: float | None = None
 
-    def at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
+    def state_at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
@@ -59,12 +56,12 @@ class Penalty:
         before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
             that it ends with, under the push that is to be expected then
         """
-        state = self.at(time, sides)
+        state = self.state_at(time, sides)
         if self.friction == 0:
             return state
         start, path = time - time_step, self.obstacle.path
-        nodes, depth, normal = self.at(start, sides).pressed(q)
-        way, stick = like(q, path.at(time) - path.at(start)), self.stick * time_step
+        nodes, depth, normal = self.state_at(start, sides).pressed(q)
+        way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
         if before is not None:
             carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
@@ -82,74 +79,6 @@ class Penalty:
         """
         coming, _ = self.obstacle.depths(q, time, sides)
         return np.clip(coming[nodes], 0, 2 * depth)
-
-
-@dataclass(frozen=True)
-class Friction:
-    """Friction of one step.
-
-    nodes   : (a,) those in contact; normal (a, 3) of the faces
-    carried : (a, 3) where they are if they do not slip [m]
-    limit   : (a,) mu N [N]
-    stick   : e [m]
-    """
-
-    nodes: np.ndarray
-    normal: np.ndarray
-    carried: np.ndarray
-    limit: np.ndarray
-    stick: float
-
-    def slip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the slip u (a, 3) and its length (a,) [m]."""
-        moved = q[self.nodes] - self.carried
-        u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
-        return u, np.linalg.norm(u, axis=1)
-
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """Return mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
-        (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
-        moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
-        longer = (moved * (u + u_0)).sum(axis=1) / np.maximum(length + length_0, np.finfo(float).tiny)
-        low, low_0 = np.minimum(length, e), np.minimum(length_0, e)
-        beyond = np.maximum(length, e) - np.maximum(length_0, e)
-        within = np.where(np.maximum(length, length_0) < e, longer, low - low_0)
-        beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
-        return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
-
-    def slope(self, u: np.ndarray) -> np.ndarray:
-        """Return f'(u) / u, (a,) [1/m]."""
-        return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
-
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
-        """Add the friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
-        u, length = self.slip(q)
-        gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
-
-    def all_secant(self) -> np.ndarray:
-        """Return what ``blocks`` takes for all nodes to have their secants, (a,) bool."""
-        return self.limit >= 0
-
-    def passes_kink(self, q: np.ndarray, base: np.ndarray) -> np.ndarray:
-        """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""
-        (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
-        return ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
-
-    def blocks(self, q: np.ndarray, true: bool, secant: np.ndarray | None = None) -> np.ndarray:
-        """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
-
-        The second part is not positive; unless ``true``, or where ``secant`` (a,), it is left out. What is then left
-        is no less than the Hessian, and as f is concave in u^2, its parabola nowhere lies below the potential.
-        """
-        u, length = self.slip(q)
-        slope = self.slope(length)
-        blocks = slope[:, None, None] * (like(q, np.eye(3)) - _squares(self.normal))
-        if true:
-            direction = u / np.maximum(length, np.finfo(float).tiny)[:, None]
-            curvature = np.where(length < self.stick, 2 * (1 - length / self.stick) / self.stick, 0.0)
-            less = curvature - slope if secant is None else np.where(secant, 0.0, curvature - slope)
-            blocks += less[:, None, None] * _squares(direction)
-        return self.limit[:, None, None] * blocks
 
 
 @dataclass(frozen=True)
@@ -171,7 +100,7 @@ class ContactState:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
         return self.obstacle.depths(q, self.time, self.sides)
 
-    def pressed(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pressed(self, q: np.ndarray) -> Pressed:
         """Return which of the positions (n, 3) are pressed, rows (a,), how deep (a,) [m] and the normals (a, 3)."""
         depths, face = self.depths(q)
         rows = np.flatnonzero(depths > 0)
@@ -198,7 +127,7 @@ class Contact:
     surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int, surface: "StepContact | None" = None):
+    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
         self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: np.ndarray) -> float:
@@ -254,7 +183,7 @@ class Contact:
         """
         for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
             rows, _, normal = state.pressed(q[: self.owned])
-            yield rows, state.stiffness * _squares(normal)
+            yield rows, state.stiffness * squares(normal)
             if state.friction:
                 yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
@@ -266,38 +195,3 @@ class Contact:
             if state.friction:
                 bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
         return bound + self.surface.bound(q) if self.surface else bound
-
-
-def _squares(vectors: np.ndarray) -> np.ndarray:
-    """Return v v^T of each of the vectors (a, 3), (a, 3, 3)."""
-    return vectors[:, :, None] * vectors[:, None, :]
-
-
-def apply_friction(
-    rows: np.ndarray,
-    q: np.ndarray,
-    state: ContactState,
-    carried: np.ndarray,
-    impulse: float,
-    per_mass: np.ndarray,
-    v: np.ndarray,
-) -> None:
-    """Apply Coulomb friction as a change of velocity to the rows that are inside.
-
-    v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s], falls by no more than
-    the friction's impulse a mass, mu N dt / m, and not below nothing: so what holds does not creep, however long the
-    substep.
-
-    rows     : (k,) bool or numbers, of the nodes that move
-    impulse  : mu k dt [kg/s], times the depth the impulse
-    per_mass : (n,) [1/kg]
-    """
-    moves = np.zeros(len(q), bool, like=q)
-    moves[rows] = True
-    pressed, depth, normal = state.pressed(q)
-    own = moves[pressed]
-    pressed, depth, normal = pressed[own], depth[own], normal[own]
-    slip = v[pressed] - carried
-    slip -= (slip * normal).sum(axis=1)[:, None] * normal
-    speed = np.maximum(np.linalg.norm(slip, axis=1), TINY)
-    v[pressed] -= np.minimum(1.0, impulse * depth * per_mass[pressed] / speed)[:, None] * slip

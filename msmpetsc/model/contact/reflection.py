@@ -18,9 +18,9 @@ from msmpetsc.model.contact.obstacle import Obstacle
 
 
 @dataclass(frozen=True)
-class Step:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in contact (Obstacle.sides);
-    None: as the way of each tells."""
+class StepTaken:
+    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in contact (Obstacle.sides),
+    of several obstacles (o, n); None: as the way of each tells."""
 
     time: float
     length: float
@@ -34,7 +34,7 @@ class Exchange:
     obstacle: Obstacle
     restitution: float
 
-    def exchanged(self, q: np.ndarray, q_previous: np.ndarray, step: Step) -> tuple[np.ndarray, np.ndarray]:
+    def exchanged(self, q: np.ndarray, q_previous: np.ndarray, step: StepTaken) -> tuple[np.ndarray, np.ndarray]:
         """Return q_n and q_(n-1) after contact; (n, 3) [m] each.
 
         Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
@@ -50,7 +50,9 @@ class Exchange:
         return q, q_previous
 
 
-def slowed(obstacle: Obstacle, restitution: float, q: np.ndarray, q_previous: np.ndarray, step: Step) -> np.ndarray:
+def slowed(
+    obstacle: Obstacle, restitution: float, q: np.ndarray, q_previous: np.ndarray, step: StepTaken
+) -> np.ndarray:
     """Return q_(n-1) (n, 3) [m] by which nodes that came to a face in this step have e times their velocity into it."""
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
@@ -62,7 +64,9 @@ def slowed(obstacle: Obstacle, restitution: float, q: np.ndarray, q_previous: np
     return q_previous
 
 
-def striking(obstacle: Obstacle, q: np.ndarray, q_previous: np.ndarray, step: Step) -> tuple[np.ndarray, np.ndarray]:
+def striking(
+    obstacle: Obstacle, q: np.ndarray, q_previous: np.ndarray, step: StepTaken
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes (k,) on or behind the faces of their sides, and the part (k, 3) [m] of their way in the step
     that goes on into it, as seen from the obstacle; nothing where that is not there."""
     time, path = step.time, obstacle.path
@@ -79,5 +83,5 @@ def striking(obstacle: Obstacle, q: np.ndarray, q_previous: np.ndarray, step: St
     normal = obstacle.normals_at(q[rows], time, face[rows])
     v = q[rows] - q_previous[rows]
     if path.leads_away:
-        v = v - like(v, path.at(time) - path.at(time - step.length))
+        v = v - like(v, path.displacement_between(time - step.length, time))
     return rows, np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal

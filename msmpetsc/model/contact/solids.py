@@ -109,7 +109,7 @@ class Faces:
 
 
 @dataclass(frozen=True)
-class Ball:
+class BallSolid:
     """A ball: center (3,) and radius [m]. At its very center there is no normal."""
 
     center: np.ndarray
@@ -132,7 +132,7 @@ class Ball:
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
         return -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
 
-    def sent(self, send: Send) -> "Ball":
+    def sent(self, send: Send) -> "BallSolid":
         """As of every Solid."""
         return replace(self, center=send(self.center))
 

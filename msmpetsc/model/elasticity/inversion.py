@@ -311,8 +311,8 @@ def vector_of(role, vectors):
 
 
 @dataclass(frozen=True)
-class CellScatter:
-    """The cells of a rank one after another, those that it owns first: how a CPU sums them.
+class Cells:
+    """The cells of a rank that resist.
 
     cells      : (c, 8) local corner nodes; the first ``cells_owned`` belong to this rank
     resistance : K (c,) [J]
@@ -320,14 +320,9 @@ class CellScatter:
     """
 
     cells: np.ndarray
+    cells_owned: int
     resistance: np.ndarray
     volume: float
-    cells_owned: int
-
-    @classmethod
-    def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellScatter":
-        """Return the cells of a lattice whose arrays are in the memory of the CPU."""
-        return cls(lattice.local_cells, resistance, volume, lattice.cells_owned)
 
     @property
     def _owned(self) -> tuple[np.ndarray, np.ndarray, float]:
@@ -345,6 +340,16 @@ class CellScatter:
     def change(self, q: np.ndarray, base: np.ndarray) -> float:
         """Return the energy at q less that at base [J], of the cells that this rank owns."""
         return resistance_change(q, base, *self._owned)
+
+
+@dataclass(frozen=True)
+class CellScatter(Cells):
+    """The cells one after another, those that the rank owns first: how a CPU sums them."""
+
+    @classmethod
+    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellScatter":
+        """Return the cells of a lattice whose arrays are in the memory of the CPU."""
+        return cls(lattice.local_cells, lattice.cells_owned, resistance, volume)
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add the gradient [N] to ``gradient`` (l, 3)."""
@@ -366,25 +371,18 @@ class CellScatter:
 
 
 @dataclass(frozen=True)
-class CellGather:
+class CellGather(Cells):
     """The cells around each owned node, a column of the arrays for each: how a GPU sums them.
 
-    cells      : (c, 8) local corner nodes; the first ``cells_owned`` belong to this rank
-    resistance : K (c,) [J]
-    volume     : J_0 h^3 [m^3]
-    around     : (8, owned) int32, which of the cells, -1 past the last
-    corner     : (8, owned) u1, which of its corners the node is
+    around : (8, owned) int32, which of the cells, -1 past the last
+    corner : (8, owned) u1, which of its corners the node is
     """
 
-    cells: np.ndarray
-    cells_owned: int
-    resistance: np.ndarray
-    volume: float
     around: np.ndarray
     corner: np.ndarray
 
     @classmethod
-    def of(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellGather":
+    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellGather":
         """Return the cells of a lattice, in the memory that its nodes are in."""
         nodes, owned = to_host(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")
@@ -395,19 +393,6 @@ class CellGather:
         around[slot, node], corner[slot, node] = by_node // 8, by_node % 8
         resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
-
-    @property
-    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
-        return self.cells, self.resistance, self.volume
-
-    def energy(self, q: np.ndarray) -> float:
-        """Return the energy [J] of the cells that this rank owns."""
-        return resistance_energy(q, self.cells[: self.cells_owned], self.resistance, self.volume)
-
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
-        """Return the energy at q less that at base [J], of the cells that this rank owns."""
-        return resistance_change(q, base, self.cells[: self.cells_owned], self.resistance, self.volume)
 
     def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
         """Add the gradient [N] to the owned rows of ``gradient``."""

@@ -116,7 +116,7 @@ class SpringScatter:
     springs_owned: int
 
     @classmethod
-    def of(cls, lattice: Lattice) -> "SpringScatter":
+    def of_lattice(cls, lattice: Lattice) -> "SpringScatter":
         """Return the springs of a lattice whose arrays are in the memory of the CPU."""
         return cls(lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening, lattice.springs_owned)
 
@@ -344,7 +344,7 @@ class SpringGather:
     stiffening: float
 
     @classmethod
-    def of(cls, lattice: Lattice) -> "SpringGather":
+    def of_lattice(cls, lattice: Lattice) -> "SpringGather":
         """Return the springs of a lattice, in the memory that its nodes are in."""
         springs, owned = to_host(lattice.springs), lattice.owned
         ends = np.concatenate([springs, springs[:, ::-1]])

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.self_contact.creases import creases, together
-from msmpetsc.model.self_contact.neighbours import neighbours
+from msmpetsc.model.self_contact.creases import creases, neighbours, together
 
 if TYPE_CHECKING:
     import ipctk
@@ -49,13 +48,13 @@ class BarrierLaw:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class SweptPairs:
     """Pairs that come near on the first of so many pieces, all as long, of a straight way of the points."""
 
     whole: int
     pieces: "list[ipctk.Candidates]"
 
-    def at(self, share: float) -> "ipctk.Candidates | None":
+    def pairs_at(self, share: float) -> "ipctk.Candidates | None":
         """Return those at a share of the way; None beyond the pieces."""
         piece = max(int(np.ceil(share * self.whole)) - 1, 0)
         return self.pieces[piece] if piece < len(self.pieces) else None
@@ -166,7 +165,7 @@ class Barrier:
         end = start + moved - moved.mean(axis=0)
         return _kept(self._share(start, end, candidates, self.folded))
 
-    def sweep(self, start: np.ndarray, moved: np.ndarray, aside: float) -> tuple[float, "Sweep"]:
+    def sweep(self, start: np.ndarray, moved: np.ndarray, aside: float) -> tuple[float, "SweptPairs"]:
         """Return the same of any way, and the pairs that come near on it, up to where points meet.
 
         aside : [m], as far as points may be from the way and have no other pairs
@@ -180,8 +179,8 @@ class Barrier:
             if self._share(begin, end, pieces[-1], self.folded) < 1:  # or a tenth as far apart: pairs that pass
                 share = self._share(begin, end, self._near_way(begin, end, 0.0), self.folded)
                 if share < 1:
-                    return KEPT * (piece + share) / whole, Sweep(whole, pieces)
-        return (1.0 if whole <= PIECES else PIECES / whole), Sweep(whole, pieces)
+                    return KEPT * (piece + share) / whole, SweptPairs(whole, pieces)
+        return (1.0 if whole <= PIECES else PIECES / whole), SweptPairs(whole, pieces)
 
     def _near_way(self, begin: np.ndarray, end: np.ndarray, reach: float) -> "ipctk.Candidates":
         """Return the pairs whose boxes meet on a way, each wider by ``reach`` [m]."""

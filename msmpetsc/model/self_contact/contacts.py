@@ -2,7 +2,8 @@
 
 Pairs of its parts that may meet are looked for where a step begins, and again where a point has moved farther than was
 allowed for then; a common translation is no such move. Where none of them can come near, positions of nodes tell that
-without a single point's being computed.
+without a single point's being computed. Pairs outlive a step (``NearPairs``); contacts at positions and pairs on ways
+are known for as long as it lasts (``Contacts``).
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, Sweep
+from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
 
@@ -77,11 +78,11 @@ class Way:
     q: np.ndarray
     moved: np.ndarray
     square: float
-    sweep: Sweep | None
+    sweep: SweptPairs | None
 
 
 @dataclass(frozen=True)
-class Moment:
+class ContactsAt:
     """Contacts at positions q (owned, 3) [m].
 
     count    : their number
@@ -95,8 +96,8 @@ class Moment:
     contacts: "ContactSets | None" = None
 
 
-class Contacts:
-    """Contacts of one run. All methods are collective; positions are (owned or more, 3) [m].
+class NearPairs:
+    """Pairs that may meet, as a run knows them. All methods are collective; positions are (owned or more, 3) [m].
 
     barrier : on rank 0
     edge    : mean length of the surface's edges at rest [m]
@@ -107,23 +108,20 @@ class Contacts:
         self.owned, surface = collision.points.weights.shape[1], collision.surface
         self.barrier: Barrier | None = on_root(comm, lambda: _barrier(surface, self.law) if surface else None)
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
-        self._pairs: Pairs | None = None
-        self._moments: list[Moment] = []
-        self._ways: list[Way] = []  # of this step
+        self._newest: Pairs | None = None
 
-    def expect(self, q: np.ndarray, end: np.ndarray) -> None:
-        """Make ready for a step from q to about ``end``: look for pairs anew unless the known ones serve.
+    def step(self, q: np.ndarray, end: np.ndarray) -> "Contacts":
+        """Return the contacts of a step from q to about ``end``; pairs are looked for unless the known ones serve."""
+        pairs = self._newest
+        if not (pairs and max(self.moved(q, pairs), self.moved(end, pairs)) <= pairs.reach):
+            self.look(q, AHEAD * self._farthest(end, q))
+        return Contacts(self)
 
-        What ways of the last step have told is forgotten: a resumed run does not have it.
-        """
-        if self._ways:
-            self._ways.clear()
-            self._moments.clear()
-        if self._pairs and max(self._moved(q, self._pairs), self._moved(end, self._pairs)) <= self._pairs.reach:
-            return
-        self._look(q, AHEAD * self._farthest(end, q))
+    def around(self, q: np.ndarray) -> Pairs:
+        """Return the newest pairs; those at q if there are none yet."""
+        return self._newest or self.look(q, self.law.distance)
 
-    def _look(self, q: np.ndarray, reach: float) -> Pairs:
+    def look(self, q: np.ndarray, reach: float) -> Pairs:
         """Look for pairs at q."""
         points, reach = self.points(q), min(max(reach, self.law.distance), FARTHEST * self.edge)
         candidates, ways = None, (0.0, 0.0)
@@ -131,11 +129,10 @@ class Contacts:
             candidates = self.barrier.candidates(points, reach)
             ways = self.barrier.clear_reach(candidates, points, reach)
         apart, clear = self.comm.bcast(ways)
-        self._moments.clear()
-        self._pairs = Pairs(q[: self.owned].copy(), reach, apart, clear, points, candidates)
-        return self._pairs
+        self._newest = Pairs(q[: self.owned].copy(), reach, apart, clear, points, candidates)
+        return self._newest
 
-    def _moved(self, q: np.ndarray, pairs: Pairs) -> float:
+    def moved(self, q: np.ndarray, pairs: Pairs) -> float:
         """Return no less than how far any point at q is from where the pairs were looked for [m]."""
         return self._farthest(q, pairs.q)
 
@@ -149,24 +146,49 @@ class Contacts:
             ends = most
         return self.points.spread * 0.5 * float(np.linalg.norm(ends[:3] + ends[3:]))
 
-    def at(self, q: np.ndarray) -> Moment:
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store where pairs were looked for: in their order contacts are summed."""
+        pairs = self._newest
+        rows = np.zeros((self.owned, 3)) if pairs is None else pairs.q
+        checkpoint.keep({"pairs_q": rows}, {"pairs_reach": pairs.reach if pairs else 0.0})
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint."""
+        self._newest, reach = None, checkpoint.number("pairs_reach", 0.0, 0)
+        if reach > 0:
+            self.look(checkpoint.row("pairs_q"), reach)
+
+
+class Contacts:
+    """Contacts in a step. All methods are collective; positions are (owned or more, 3) [m].
+
+    What is found at positions and on ways is known for as long as the step lasts: a resumed run does not have it.
+    """
+
+    def __init__(self, near: NearPairs):
+        self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
+        self.barrier, self.owned = near.barrier, near.owned
+        self._moments: list[ContactsAt] = []
+        self._ways: list[Way] = []
+
+    def find(self, q: np.ndarray) -> ContactsAt:
         """Return the contacts at positions q."""
         q = q[: self.owned]
-        pairs = self._pairs or self._look(q, self.law.distance)
-        bound = self._moved(q, pairs)
+        pairs = self.near.around(q)
+        bound = self.near.moved(q, pairs)
         if bound < pairs.clear:
-            return Moment(q)
+            return ContactsAt(q)
         for moment in self._moments:
             if self._is_same(q, moment.q):
                 return moment
         points = self.points(q)
-        near = self._near(q, points, pairs, bound)
+        near = self._pairs_near(q, points, pairs, bound)
         contacts = self.barrier.contacts(near, points) if self.barrier else None
         count = self.comm.bcast(sum(map(len, contacts or ())))
-        self._moments = [Moment(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
+        self._moments = [ContactsAt(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def _near(self, q: np.ndarray, points: np.ndarray, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
+    def _pairs_near(self, q: np.ndarray, points: np.ndarray, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
         """Return the pairs that may be near at q, besides those in creases, on rank 0.
 
         bound : no point is farther from where ``pairs`` were looked for [m]
@@ -177,10 +199,10 @@ class Contacts:
             return pairs.candidates
         for way in self._ways:
             share = self._share_of(way, q)
-            near = way.sweep.at(share) if way.sweep and share is not None else None
+            near = way.sweep.pairs_at(share) if way.sweep and share is not None else None
             if share is not None and self.comm.bcast(near is not None):
                 return near
-        return self._look(q, FARTHEST * self.edge).candidates
+        return self.near.look(q, FARTHEST * self.near.edge).candidates
 
     def _share_of(self, way: Way, q: np.ndarray) -> float | None:
         """Return the share of a way that positions q are at; None where they are not on it."""
@@ -203,25 +225,13 @@ class Contacts:
             serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
         return self.comm.bcast(serve)
 
-    def with_points(self, moment: Moment) -> Moment:
+    def with_points(self, moment: ContactsAt) -> ContactsAt:
         """Return the same with the points, which friction asks for."""
-        return Moment(moment.q, moment.count, self.points(moment.q), moment.contacts)
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store where pairs were looked for: in their order contacts are summed."""
-        pairs = self._pairs
-        rows = np.zeros((self.owned, 3)) if pairs is None else pairs.q
-        checkpoint.keep({"pairs_q": rows}, {"pairs_reach": pairs.reach if pairs else 0.0})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self._pairs, reach = None, checkpoint.number("pairs_reach", 0.0, 0)
-        if reach > 0:
-            self._look(checkpoint.row("pairs_q"), reach)
+        return ContactsAt(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts at q."""
-        moment, touch = self.at(q), Touch()
+        moment, touch = self.find(q), Touch()
         if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
             touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
@@ -230,8 +240,8 @@ class Contacts:
     def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
         q, end = q[: self.owned], end[: self.owned]
-        pairs = self._pairs or self._look(q, self.law.distance)
-        farthest = max(self._moved(q, pairs), self._moved(end, pairs))
+        pairs = self.near.around(q)
+        farthest = max(self.near.moved(q, pairs), self.near.moved(end, pairs))
         if farthest < pairs.clear:
             return 1.0
         start, moved, share = self.points(q), self.points(end - q), 1.0

@@ -6,22 +6,21 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
+from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.barrier import BarrierLaw, crossings
-from msmpetsc.model.self_contact.cell_contacts import OverlappingSurface
 from msmpetsc.model.self_contact.contacts import CollisionSurface
-from msmpetsc.model.self_contact.overlapping import overlapping_surface
 from msmpetsc.model.self_contact.points import SurfacePoints
 from msmpetsc.scene.motion import SelfContactTable
 from msmpetsc.scene.schema import Scene
 
 NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
 STICK = 1e-2  # longest sides a second: friction holds but for a creep below this, as an obstacle's does
-MOST_CUT = 0.1  # of all triangles: with more of them out little would keep the rest apart
+MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
 FEWEST = 20  # triangles of a body
 HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off
 PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (model.material)
@@ -34,19 +33,15 @@ def collision_surface(
     bodies: Sequence[Body],
     cages: Cages,
     lattice: Lattice,
-    around: np.ndarray,
-) -> CollisionSurface | OverlappingSurface:
-    """Return the surface of all bodies that meets itself (collective); one that is only pushed out of the body's cells
-    where more than a tenth of it cuts itself.
+) -> CollisionSurface:
+    """Return the surface of all bodies that meets itself (collective).
 
-    around : (c, 8) local corner nodes of the cells around the nodes of this rank
+    Raises InputError on all ranks where more than a tenth of its triangles cut others at rest.
     """
     prepared = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table))
-    surfaces, off, overlaps = prepared or ([], 0.0, False)
+    surfaces, off = prepared or ([], 0.0)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
-    if comm.bcast(overlaps):
-        return overlapping_surface(comm, surfaces, bodies, SurfacePoints(comm, lattice, embedding), lattice, around)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
     distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), comm.bcast(off))
     stiffness = _stiffness(comm, lattice, distance, scene.time.step)
@@ -66,10 +61,9 @@ def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: flo
     return distance**2 * layer
 
 
-def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float, bool]:
+def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:
     """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
-    that cut others, and the median distance [m] of their own points from them; whether too many do, so that all are
-    there."""
+    that cut others, and the median distance [m] of their own points from them. Raises InputError where too many do."""
     off = 0.0
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)
@@ -79,20 +73,16 @@ def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surf
     assert whole is not None
     cut = crossings(whole)
     if len(cut) == 0:
-        return bodies, off, False
+        return bodies, off
     at = ", ".join(f"{c:.4g}" for c in whole.points[whole.triangles[cut[0]]].mean(axis=0))
     what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at ({at}) m"
     if len(cut) > MOST_CUT * len(whole.triangles):
-        log.warning(
-            "%s, too many to do without: its points are pushed out of other parts' cells instead, so it may cross by a "
-            'part of a cell, and nothing rubs; mesh.prepare = ["union"] or "repair" may mend the mesh', what
-        )  # fmt: skip
-        return bodies, off, True
+        raise InputError(f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh')
     log.warning("%s: they are left out, and may be crossed", what)
     of_body = np.split(
         ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
     )
-    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off, False
+    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off
 
 
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.model.self_contact.contacts import Contacts, Moment
+from msmpetsc.model.self_contact.contacts import Contacts, ContactsAt
 from msmpetsc.model.self_contact.friction import SurfaceFriction
 from msmpetsc.model.self_contact.points import Carried
 
@@ -69,18 +69,18 @@ class SurfaceContact:
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
-        self._hessians: dict[bool, tuple[Moment, SurfaceHessian]] = {}  # with and without their negative parts
+        self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
         if start is not None and contacts.law.friction > 0:
-            self._start_friction(contacts.at(start), contacts.law.stick * time_step)
+            self._start_friction(contacts.find(start), contacts.law.stick * time_step)
 
-    def _start_friction(self, moment: Moment, stick: float) -> None:
+    def _start_friction(self, moment: ContactsAt, stick: float) -> None:
         self.rubs, barrier = moment.count > 0, self.contacts.barrier
         if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
             self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
 
-    def _acting(self, q: np.ndarray) -> Moment | None:
+    def _acting(self, q: np.ndarray) -> ContactsAt | None:
         """Return the contacts at q, with the points where there is friction; None where nothing acts."""
-        moment = self.contacts.at(q)
+        moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
         return moment if moment.points is not None else self.contacts.with_points(moment)
@@ -102,7 +102,7 @@ class SurfaceContact:
             return sum(0.5 * self._work(moment, moved) for moment in (before, after))
         return self._energy(after) - self._energy(before)
 
-    def _work(self, moment: Moment | None, moved: np.ndarray) -> float:
+    def _work(self, moment: ContactsAt | None, moved: np.ndarray) -> float:
         """Return the gradient times a move of the points (p, 3) [m], on rank 0 [J]."""
         forces = self._forces(moment) if moment else None
         if forces is None:
@@ -110,7 +110,7 @@ class SurfaceContact:
         touched, gradient = forces
         return float(np.vdot(gradient, moved[touched]))
 
-    def _energy(self, moment: Moment | None) -> float:
+    def _energy(self, moment: ContactsAt | None) -> float:
         barrier, energy = self.contacts.barrier, 0.0
         if moment is None or barrier is None or moment.points is None:
             return 0.0
@@ -127,7 +127,7 @@ class SurfaceContact:
         at, weights = self.contacts.points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces[at]
 
-    def _forces(self, moment: Moment) -> tuple[np.ndarray, np.ndarray] | None:
+    def _forces(self, moment: ContactsAt) -> tuple[np.ndarray, np.ndarray] | None:
         """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
@@ -165,7 +165,7 @@ class SurfaceContact:
         at, weights = kept.carried
         return self.contacts.points.spread * (np.abs(weights).T @ sums[at])
 
-    def _curvature(self, moment: Moment, projected: bool) -> tuple[np.ndarray, csr_array] | None:
+    def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[np.ndarray, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:

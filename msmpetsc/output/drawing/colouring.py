@@ -150,7 +150,7 @@ def _contact(subject: Subject, _: Result | None) -> Colouring:
         points = subject.surface(index)
         gaps = gaps_to_obstacles(scene.obstacle, subject.solids, points, float(subject.times[index]))
         if surface is not None:
-            gaps = np.minimum(gaps, surface.at(points))
+            gaps = np.minimum(gaps, surface.distances(points))
         return reach - np.clip(gaps, 0, reach)
 
     return Colouring(f"gap to {' and '.join(touched)}", "m", values, below=reach)

@@ -190,7 +190,7 @@ def _obstacles(
     for obstacle in scene.obstacle:
         if not within(time, obstacle.start, obstacle.stop):
             continue
-        by = Motion.through(obstacle.path).at(time)
+        by = Motion.through(obstacle.path).displacement_at(time)
         if obstacle.shape == "box":
             glass += _box(np.array(obstacle.box) + by, bodies)
             continue
@@ -214,7 +214,7 @@ def _shapes(scene: SceneFile, time: float, bodies: np.ndarray, solids: Mapping[i
     for number, obstacle in enumerate(scene.obstacle):
         surface = solids.get(number)
         if surface is not None and len(surface.points) and within(time, obstacle.start, obstacle.stop):
-            by = Motion.through(obstacle.path).at(time)
+            by = Motion.through(obstacle.path).displacement_at(time)
             seen = _box(bounds_of(surface) + by, bodies)
             shapes += [Shape(number, by, surface, corners) for corners in seen]
     return shapes
@@ -279,7 +279,7 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
     arrows = []
     for table in scene.tables("force"):
         force = table.table
-        total = LoadTable.of(force.total or (0.0, 0.0, 0.0)).at(time)  # a function has no one direction
+        total = LoadTable.of_scene(force.total or (0.0, 0.0, 0.0)).total_at(time)  # a function has no one direction
         if within(time, force.start, force.stop) and any(total) and (where := rest.find(table)).any():
             tail = position[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))

@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.contact.reflection import StepTaken
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
@@ -94,7 +95,7 @@ class ImplicitEuler:
             y = q + self._carried(time_step) / time_step * (q - state.q_previous)
         result, sides = self._solve(state, y, time, time_step)
         after, before, work = self.environment.strike(
-            result.position, result.previous, (time, time_step, sides), self.stepper.lattice.pinned
+            result.position, result.previous, StepTaken(time, time_step, sides), self.stepper.lattice.pinned
         )
         return replace(result, work=work), State(after, before, sides=sides)
 
@@ -221,7 +222,7 @@ class Bdf2(ImplicitEuler):
         previous = result.position - self.time_step * v_1
         a = 0.5 * (3 * v_1 - 4 * v + v_0) * self.time_step  # times t^2
         _, before, work = self.environment.strike(
-            result.position, previous, (time, self.time_step, sides), self.stepper.lattice.pinned
+            result.position, previous, StepTaken(time, self.time_step, sides), self.stepper.lattice.pinned
         )
         its, products = its + result.ksp_its, products + result.products
         result = replace(result, previous=previous, ksp_its=its, products=products, work=work)

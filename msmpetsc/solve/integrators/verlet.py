@@ -27,6 +27,8 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
 from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.contact.friction import Movers
+from msmpetsc.model.contact.reflection import StepTaken
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.motion import Time
@@ -252,9 +254,8 @@ class Verlet:
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self._damp(0.5 * duration)
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)
-        self.environment.apply_friction(
-            self.q, self.v, self.free, self.per_mass, time, duration, begin, end, self.sides
-        )
+        nodes = Movers(self.q, self.v, self.free, self.per_mass)
+        self.environment.apply_friction(nodes, time, duration, (begin, end), self.sides)
 
     def _damp(self, duration: float) -> None:
         """Slow the free nodes down as damping by the mass does in this time [s]."""
@@ -284,7 +285,9 @@ class Verlet:
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
-        after, before, work = self.environment.strike(self.q, self.before, (end, end - begin, self.sides), self.fixed)
+        after, before, work = self.environment.strike(
+            self.q, self.before, StepTaken(end, end - begin, self.sides), self.fixed
+        )
         self.work += work
         if before is not self.before:
             struck = np.flatnonzero((before != self.before).any(axis=1))

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.model.contact.penalty import Contact, Secants
 from msmpetsc.model.elasticity.energy import Elasticity, Hessian
-from msmpetsc.model.self_contact.kinds import ContactHessian
+from msmpetsc.model.self_contact.term import SurfaceHessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
@@ -110,7 +110,7 @@ class TrueHessian(Viewable):
         self.v = np.zeros_like(lattice.nodes)  # pinned nodes stay zero
         self.product = np.empty_like(lattice.nodes)
         self.elastic: Hessian | None = None  # until it is linearised
-        self.surface: ContactHessian | None = None
+        self.surface: SurfaceHessian | None = None
         self.products = 0
 
     def linearise(

@@ -9,7 +9,7 @@ from pathlib import Path
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
-from msmpetsc.scene.values import Integrator
+from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
 from msmpetsc.study.runner import Bench
@@ -23,7 +23,7 @@ PRESET = "newton"  # which itself chooses how its linear systems are preconditio
 COARSER = 2  # times: the edge of a cell from one lattice to the next, so an eighth of the cells
 COARSEST = (2.0, 5 / 3, 4 / 3)  # times that it is done, the first that can be run
 FINEST = 2  # times finer than the scene's: the finest cells that are chosen
-IMPLICIT: tuple[Integrator, ...] = ("bdf2", "implicit-euler")
+IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
 HALVINGS = 6  # of the scene's step
 REFINED = 3  # times that explicit substeps are halved, at most
 FINE = 4  # times the cells: of a choice less fine than that its distance from a coarser lattice tells nothing
@@ -172,7 +172,7 @@ class Sizer:
         return error_law(sizes, apart, STEP_ORDERS).error(sizes[-1])
 
     def _others(
-        self, integrator: Integrator, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
+        self, integrator: IntegratorName, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
     ) -> list[Stepping]:
         """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
         others: list[Stepping] = []
@@ -337,7 +337,7 @@ class Sizer:
         """Return a method with its steps solved as those of the trials are."""
         return replace(method, step_error=self.solved if method.step_error else None)
 
-    def _method(self, integrator: Integrator, step: float) -> Candidate:
+    def _method(self, integrator: IntegratorName, step: float) -> Candidate:
         solves = integrator != "verlet"
         return Candidate(integrator, step, PRESET if solves else "", self.solved if solves else None)
 

@@ -166,15 +166,15 @@ class Resumed:
             if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
                 yield f"-{name}: {_shown(was.get(name))} in {earlier.path}, {_shown(options.get(name))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
-            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE)
+            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
         attributes["scene_file"] = attributes["scene_file"] or earlier.texts["scene_file"]
-        return ResultFile(earlier.path, comm, attributes, Begin.COPY)
+        return ResultFile(earlier.path, comm, attributes, Begin.COPY, gathers)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
         """Raise InputError where the mesh makes another lattice than it did (collective)."""

@@ -212,9 +212,9 @@ def open_output(comm: MPI.Intracomm, plan: RunPlan) -> ResultFile:
     """Open the file to write into: a new one, or that of the run that goes on (collective)."""
     request = plan.request
     if plan.resumed:
-        return plan.resumed.file(comm, plan.attributes)
+        return plan.resumed.file(comm, plan.attributes, request.gather)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
-    return ResultFile(request.path, comm, plan.attributes, begin)
+    return ResultFile(request.path, comm, plan.attributes, begin, request.gather)
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

@@ -144,6 +144,15 @@ def refuse_small_disk(path: Path, planned: int) -> None:
         raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
 
 
+def copy_sparse(source: int, path: Path) -> None:
+    """Copy the file of a descriptor to a new name; zeros, which frames to come are, take no room."""
+    with open(path, "xb") as copy:
+        for start in range(0, size := os.fstat(source).st_size, 2**20):
+            if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
+                os.pwrite(copy.fileno(), piece, start)
+        copy.truncate(size)
+
+
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
     """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""

@@ -1,9 +1,17 @@
-"""Rows on their way, in pieces, between the ranks, each of which has its own, and a file that rank 0 has open."""
+"""Rows on their way between the ranks, each of which has its own, and a file that rank 0 has open.
+
+Rank 0 takes or gives them in pieces. Or each rank writes its own straight to their bytes: a frame's are known from the
+start, for its chunks lie where HDF5 put them when the file was laid out, uncompressed, and stay there (output.layout).
+That needs nothing of h5py, and as nothing is collective no rank waits for another that has failed.
+"""
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from mpi4py import MPI
 
@@ -71,3 +79,48 @@ def scatter_rows(
                 rows[part] = piece
         start += count
     return failure
+
+
+def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
+    """Return a descriptor of the file on each rank, or None on all if they do not see the same file (collective)."""
+    descriptor, identity = None, None
+    try:
+        descriptor = os.open(path, os.O_WRONLY)
+        status = os.fstat(descriptor)
+        identity = status.st_ino, status.st_size
+    except OSError:
+        pass
+    if len(set(comm.allgather(identity))) == 1 and identity:
+        return descriptor
+    if descriptor is not None:
+        os.close(descriptor)
+    return None
+
+
+def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
+    """Return where in the file [byte] the chunks of dataset[index] begin, in the order of its rows."""
+    starts = range(0, dataset.shape[1], dataset.chunks[1])
+    rest = (0,) * (dataset.ndim - 2)
+    return [dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts]
+
+
+def write_bytes(file: int, rows: np.ndarray, start: int, chunk: int, offsets: Sequence[int]) -> None:
+    """Write rows (n, ...), contiguous, to their bytes in a file. Raises OSError.
+
+    start   : number of the first of them in its dataset
+    chunk   : rows of a chunk
+    offsets : where the chunks begin [byte]
+    """
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    done = 0
+    while done < len(rows):
+        number, within = divmod(start + done, chunk)
+        count = min(chunk - within, len(rows) - done)
+        _write_all(file, rows[done : done + count].data.cast("B"), offsets[number] + within * row_bytes)
+        done += count
+
+
+def _write_all(file: int, data: memoryview, offset: int) -> None:
+    while data:
+        written = os.pwrite(file, data, offset)
+        data, offset = data[written:], offset + written

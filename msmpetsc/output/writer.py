@@ -1,6 +1,7 @@
 """The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
-Rank 0 has it open, and writes the rows of all ranks, in pieces (output.transfer).
+Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank writes its own
+where it can reach the file (output.transfer). The file is the same.
 
 All metadata is on disk before the first frame and does not change while frames are written (output.layout). A frame is
 its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
@@ -15,6 +16,7 @@ then either. Else it writes a new one, takes the frames over, and renames it whe
 """
 
 import os
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from enum import Enum
@@ -33,6 +35,7 @@ from msmpetsc.output.disk import (
     Lock,
     Storage,
     bytes_taken,
+    copy_sparse,
     plain_errors,
     refuse_no_file,
     refuse_small_disk,
@@ -46,7 +49,7 @@ from msmpetsc.output.reader import (
     open_result,
     plain_damage,
 )
-from msmpetsc.output.transfer import gather_rows
+from msmpetsc.output.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
 
 class Begin(Enum):
@@ -68,18 +71,28 @@ class ResultFile:
     finished : number of frames that it holds
     """
 
-    def __init__(self, path: str | Path, comm: MPI.Comm, attributes: dict[str, Any], begin: Begin = Begin.NEW):
+    def __init__(
+        self,
+        path: str | Path,
+        comm: MPI.Comm,
+        attributes: dict[str, Any],
+        begin: Begin = Begin.NEW,
+        gathers: bool = False,
+    ):
         """Open the file.
 
         attributes : who makes it and how; format and format_version are added
+        gathers    : rank 0 writes frames for all ranks, even where each can reach the file
         """
         self.path = Path(path)
         self._planned = self.finished = 0
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
-        self._comm, self._begin = comm, begin
+        self._comm, self._begin, self._gathers = comm, begin, gathers
         self._file: h5py.File | None = None  # open on rank 0 only
         self._storage: Storage | None = None  # that it is written to
         self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
+        self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
+        self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
         self._lock: Lock | None = None  # held on rank 0 only
         self._copied: int | None = None  # most frames to take over, all if None
         self._layout = Layout()
@@ -156,8 +169,11 @@ class ResultFile:
         with self._together():
             if self._file is not None:
                 self._publish(self._file)
+                self._same = os.open(self.path, os.O_RDONLY)
                 names = FRAME_FIELDS.keys() - {"time", "position", "surface"}
                 self._numbers = {name: self._file[f"frames/{name}"] for name in names}
+        if self._comm.size > 1 and not self._gathers:
+            self._direct = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
@@ -199,6 +215,7 @@ class ResultFile:
                 self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
                 self._flush(self._file)
+                self._refuse_removed()
 
     def close(self, trim: bool = True) -> None:
         """Close the file; a second call does nothing.
@@ -278,7 +295,25 @@ class ResultFile:
             self._refuse_to_replace()
             os.replace(self._part, self.path)
 
+    def _refuse_removed(self) -> None:
+        """Raise InputError where no name leads to the file any more; what it holds gets one again."""
+        if self._same is None or os.fstat(self._same).st_nlink:
+            return
+        copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy_sparse(self._same, copy)
+        if not self.path.exists():
+            copy = copy.rename(self.path)
+        command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
+        raise InputError(
+            f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}"
+        )
+
     def _finish(self, trim: bool) -> None:
+        for descriptor in (self._direct, self._same):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._direct = self._same = None
         file, self._file, self._numbers = self._file, None, {}
         if file is None:
             return
@@ -328,6 +363,9 @@ class ResultFile:
     ) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)
+        if self._direct is not None and index is not None:
+            self._write_directly(self._direct, rows, counts, name, index)
+            return
         file: Any = self._file  # on rank 0, which alone stores
 
         def store(start: int, piece: np.ndarray) -> None:
@@ -336,3 +374,13 @@ class ResultFile:
 
         with self._together():
             gather_rows(self._comm, rows, counts, store)
+
+    def _write_directly(self, descriptor: int, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
+        chunk, offsets = 0, []
+        with self._together():
+            if self._file is not None:
+                dataset = self._file[name]
+                chunk, offsets = dataset.chunks[1], chunk_offsets(dataset, index)
+        chunk, offsets = self._comm.bcast((chunk, offsets))
+        with self._together():
+            write_bytes(descriptor, rows, sum(counts[: self._comm.rank]), chunk, offsets)

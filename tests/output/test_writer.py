@@ -85,10 +85,11 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
 
 
 def test_who_writes_does_not_show_in_the_file(tmp_path):
-    """The ranks' rows begin and end within chunks: the same bytes."""
-    for ranks in (1, 3):
-        run_on_ranks(ranks, "all", tmp_path / f"{ranks}.h5")
-    assert (tmp_path / "3.h5").read_bytes() == (tmp_path / "1.h5").read_bytes()
+    """Rank 0 for all, or each its own rows, which begin and end within chunks: the same bytes."""
+    for ranks, action in ((1, "all"), (3, "all"), (3, "gathered")):
+        run_on_ranks(ranks, action, tmp_path / f"{ranks} {action}.h5")
+    one, *others = [path.read_bytes() for path in sorted(tmp_path.glob("*.h5"))]
+    assert len(others) == 2 and all(other == one for other in others)
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
@@ -293,9 +294,10 @@ def test_refused_on_all_ranks_together(tmp_path):
     assert run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2  # a folder that is a file
 
 
-def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path):
+@pytest.mark.parametrize("action", ["full", "full for one"])
+def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, action):
     path = tmp_path / "x.h5"
-    assert run_on_ranks(3, "full", path) == f"refused: {path} cannot be written: No space left on device\n" * 3
+    assert run_on_ranks(3, action, path) == f"refused: {path} cannot be written: No space left on device\n" * 3
     with open_result(path) as file:
         assert finished(file) == 2 and len(file["frames/position"]) == STEPS + 1  # left as it was: room to go on
         assert_holds(file, 2, None)

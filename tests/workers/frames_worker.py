@@ -1,5 +1,6 @@
 """Writes result files for test_frames.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
 
+import os
 import sys
 
 import h5py
@@ -38,10 +39,10 @@ def share(rows: int) -> slice:
     return slice(cuts[rank], cuts[rank + 1]) if rank < len(cuts) - 1 else slice(rows, rows)
 
 
-def write_all(path: str) -> None:
+def write_all(path: str, gathers: bool = False) -> None:
     transfer.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24  # several pieces and several chunks a rank
     nodes, points = share(NODES), share(POINTS)
-    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}) as file:
+    with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers) as file:
         file.write("lattice/nodes", positions(0, NODES)[nodes])
         file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
         file.write("lattice/pinned", np.zeros(0, int))
@@ -76,11 +77,19 @@ def refuse(path: str) -> None:
         sys.stdout.write(f"refused: {error}\n")
 
 
-def fill_disk(path: str) -> None:
-    """The disk is full at the third frame, when the other ranks are already sending."""
+def fill_disk(path: str, gathers: bool = True) -> None:
+    """The disk is full at the third frame, when the other ranks are already sending; or, not gathered, for one of them
+    in the midst of its rows."""
     transfer.PIECE_BYTES = 100
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__
+
+    def half(file: int, data: memoryview, place: int) -> int:
+        if MPI.COMM_WORLD.rank != 1:
+            return write(file, data, place)
+        if len(data) < 100:
+            raise OSError(28, "No space left on device")
+        return write(file, data[:100], place)
 
     def full(dataset, key, value):
         if dataset.name == "/frames/position":
@@ -88,11 +97,13 @@ def fill_disk(path: str) -> None:
         store(dataset, key, value)
 
     try:
-        with ResultFile(path, MPI.COMM_WORLD, {}) as file:
+        with ResultFile(path, MPI.COMM_WORLD, {}, gathers=gathers) as file:
             file.start_frames(STEPS + 1, nodes.stop - nodes.start)
             for index in range(STEPS + 1):
-                if index == 2:
+                if index == 2 and gathers:
                     h5py.Dataset.__setitem__ = full
+                elif index == 2:
+                    write, os.pwrite = os.pwrite, half
                 file.append(frame(index, nodes, None))
     except InputError as error:
         sys.stdout.write(f"refused: {error}\n")
@@ -101,7 +112,9 @@ def fill_disk(path: str) -> None:
 if __name__ == "__main__":
     {
         "all": write_all,
+        "gathered": lambda path: write_all(path, gathers=True),
         "forever": write_forever,
         "refuse": refuse,
         "full": fill_disk,
+        "full for one": lambda path: fill_disk(path, gathers=False),
     }[sys.argv[1]](sys.argv[2])

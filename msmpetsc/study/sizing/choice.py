@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.scene.values import Integrator
+from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.sizing.orders import ErrorLaw
 
 STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: what is more is the noise of a clock
@@ -16,7 +16,7 @@ STEEPEST = 1.6  # power of the cells that the cost of a step goes by, at most: w
 class Candidate:
     """A way to step a scene; explicit steps have no preset and no error."""
 
-    integrator: Integrator
+    integrator: IntegratorName
     time_step: float  # [s]
     preset: str = ""
     step_error: float | None = None

@@ -123,6 +123,7 @@ def test_the_cheapest_names_all_within_its_noise():
     assert [row["label"] for row in winners(rows, STEP, 1e-2)] == ["newton", "pipecg", "anderson"]
     assert [row["label"] for row in winners(rows, STEP, 1e-3)] == ["anderson", "lbfgs"]
     assert winners(rows, STEP, 1e-6) == []
+    assert [row["label"] for row in winners(rows[:1], STEP, 1e-2)] == ["newton"], "nothing is within its noise"
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
     assert step[1] == (

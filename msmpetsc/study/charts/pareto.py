@@ -144,12 +144,11 @@ def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]
     reached = reached[reached[measure.error] <= level]
     if reached.empty:
         return []
+    reached = reached.assign(**spread(reached, measure.cost))
     first = reached[measure.cost].idxmin()
-    ends = spread(reached, measure.cost)
-    best = records(reached.assign(least=ends["least"], greatest=ends["greatest"]).loc[[first]])
+    best = records(reached.loc[[first]])
     if is_repeated(reached.loc[[first]]):
-        near = within_noise(reached, first, measure.cost)
-        best += records(near.assign(least=ends["least"], greatest=ends["greatest"]))
+        best += records(within_noise(reached, first, measure.cost))
     return best
 
 

@@ -290,9 +290,9 @@ def draw(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     import matplotlib.ticker
     from matplotlib.figure import Figure
 
-    from msmpetsc.study.charts.style import COLORS, FAINT, RC
+    from msmpetsc.study.charts.plot import COLORS, FAINT, GRID
 
-    with matplotlib.rc_context(RC):  # type: ignore[arg-type]  # of names that it knows
+    with matplotlib.rc_context({"axes.grid": True, "axes.axisbelow": True, "grid.color": GRID, "savefig.dpi": 150}):
         figure = Figure(figsize=(10, 1.9 + 0.5 * len(rows)), layout="constrained")
         axes = figure.subplots()
         for kind, color in (("CPU", FAINT), ("GPU", "black")):

@@ -4,8 +4,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-from matplotlib.ticker import EngFormatter
-
+PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 GAP = "\N{NO-BREAK SPACE}"  # a unit stays with its number
 
 
@@ -19,11 +18,18 @@ def _or_nothing(word: Callable[[Any], str]) -> Callable[[Any], str]:
     return worded
 
 
+def prefixed(value: float, unit: str = "") -> str:
+    """Return a number to three digits with the prefix of its unit: 34100 Pa -> 34.1 kPa."""
+    power = int(f"{value:.2e}".partition("e")[2]) // 3 * 3
+    power = min(max(power, min(PREFIXES)), max(PREFIXES))
+    gap = GAP if unit else ""
+    return f"{value / 10**power:.3g}{gap}{PREFIXES[power]}{unit}"
+
+
 @_or_nothing
 def seconds(value: float) -> str:
     """Return a time with its prefix: 0.0341 -> 34.1 ms; no kiloseconds."""
-    rounded = float(f"{value:.3g}")
-    return EngFormatter("s", sep=GAP)(rounded) if rounded < 1000 else f"{rounded:,.0f}{GAP}s"
+    return prefixed(value, "s") if value < 999.5 else f"{float(f'{value:.3g}'):,.0f}{GAP}s"
 
 
 @_or_nothing
@@ -42,7 +48,7 @@ def count(value: float) -> str:
 @_or_nothing
 def size(value: float) -> str:
     """Return bytes with their prefix: 2.5e8 -> 250 MB."""
-    return EngFormatter("B", sep=GAP)(float(f"{value:.3g}"))
+    return prefixed(value, "B")
 
 
 @_or_nothing

@@ -16,7 +16,6 @@ import pytest
 import small_result
 from ball_result import write_ball
 from conftest import ROOT
-from matplotlib.figure import Figure
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
@@ -31,7 +30,7 @@ from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.study.baselines import baseline
-from msmpetsc.study.charts.style import Chart, save_png
+from msmpetsc.study.charts.plot import Chart, curve_styles, save_png
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
 from msmpetsc.study.scene_lines import put_into
@@ -73,7 +72,7 @@ def page(result: Path, path: Path) -> None:
 
 
 def chart(path: Path) -> None:
-    save_png(Chart(path.stem, "sizes", "a title", "", Figure()), path.parent)
+    save_png(Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"])), path.parent)
 
 
 def writers(sources: Path) -> dict[str, Writer]:
@@ -106,7 +105,7 @@ def writers(sources: Path) -> dict[str, Writer]:
         "report.html": Writer(
             "study/report.py", lambda path: write_report(path.parent), lambda path: write_table(path.parent, [])
         ),
-        "chart.png": Writer("study/charts/style.py", chart),
+        "chart.png": Writer("study/charts/plot.py", chart),
     }
     table |= {f"y{end}": Writer("output/export/formats.py", partial(export, bar)) for end in FORMATS}
     table |= {f"z{end}": Writer("output/drawing/sheet.py", partial(contact_sheet, ball)) for end in PICTURE_NAMES}
@@ -177,7 +176,6 @@ ALLOWED = {
     "output/layout.py": "the same",
     "cli/commands/new.py": "under the name that the one way gave",
     "output/export/gltf.py": "the same",
-    "study/charts/style.py": "the same, and into memory",
     "study/table.py": "into memory",
     "geometry/step_cache.py": "a cache: what fails is not kept",
     "backend/launcher.py": "a cache",

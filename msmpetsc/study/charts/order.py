@@ -4,23 +4,21 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.style import (
+from msmpetsc.study.charts.plot import (
+    DASH,
     ERROR,
     FAINT,
+    PLAIN,
     SECONDS,
     Chart,
+    CurveStyle,
     Numbers,
+    Panel,
     Styles,
-    around,
-    legend_below,
-    log_axes,
-    log_ticks,
-    new_figure,
-    title_axes,
+    channel,
+    log_axis,
 )
 from msmpetsc.study.table import grouped, measured, succeeded
 
@@ -35,6 +33,7 @@ CAPTION = (
     "acts; overtones lose theirs sooner than the slowest vibration, whose closed form is dashed."
 )
 CLOSED = "(1 + ω²t²)^(\N{MINUS SIGN}n), implicit Euler, slowest vibration"
+X_LABEL = "time step"
 NUMBERS: Numbers = {
     "time step": (formatting.seconds, "step"),
     "steps": (formatting.count, "steps"),
@@ -73,44 +72,29 @@ def order_charts(table: "DataFrame", styles: Styles, study: dict) -> list[Chart]
 def order_chart(scene: str, rows: "DataFrame", styles: Styles, frequency: float | None) -> Chart:
     """Return the error in the left panel, the energy in the right one, where it was measured."""
     slopes = {label: order(group) for label, group in grouped(rows, "label").items()}
-    handles = {_legend(label, slope): styles[label].handle() for label, slope in slopes.items()}
-    with_energy = len(measured(rows, "energy_left")) > 0
-    if with_energy and frequency:
-        handles[CLOSED] = Line2D([], [], color=FAINT, linestyle="--")
-    figure, axes = new_figure(1 + with_energy, list(handles))
-    chart = Chart(f"order_{scene}", KIND, f"{KIND}: {scene}", CAPTION, figure)
-    draw_error(chart, axes[0], measured(rows, "trajectory_error"), styles)
-    if with_energy:
-        draw_energy(chart, axes[1], measured(rows, "energy_left"), styles=styles, frequency=frequency)
-    legend_below(figure, handles)
-    chart.findings["Order in the time step"] = [
-        f"{label}: the error goes as the step to the power {slope:.2f}." for label, slope in slopes.items() if slope
-    ]
+    names = {label: f"{label}: slope {slope:.2f}" if slope else label for label, slope in slopes.items()}
+    rows = rows.assign(curve=rows["label"].map(names))
+    shown, left = measured(rows, "trajectory_error"), measured(rows, "energy_left")
+    own = {name: styles[label] for label, name in names.items()}
+    if len(left) and frequency:
+        own[CLOSED] = CurveStyle(FAINT, DASH)
+    chart = Chart(f"order_{scene}", KIND, f"{KIND}: {scene}", CAPTION, own)
+    x, y = log_axis(X_LABEL, shown["step"], SECONDS), log_axis("trajectory error", shown["trajectory_error"], ERROR)
+    draw_methods(chart.panel("error of the motion", x, y), shown, "trajectory_error")
+    if len(left):
+        draw_energy(chart, left, frequency)
     return chart
 
 
-def _legend(label: str, slope: float | None) -> str:
-    return label if slope is None else f"{label}: slope {slope:.2f}"
-
-
-def draw_error(chart: Chart, axes: Axes, rows: "DataFrame", styles: Styles) -> None:
-    """Draw the error of the motion over the step."""
-    title_axes(axes, "error of the motion", "time step", "trajectory error")
-    log_axes(axes, rows["step"], rows["trajectory_error"], (SECONDS, ERROR))
-    draw_methods(chart, axes, rows, column="trajectory_error", styles=styles)
-
-
-def draw_energy(chart: Chart, axes: Axes, rows: "DataFrame", *, styles: Styles, frequency: float | None) -> None:
+def draw_energy(chart: Chart, rows: "DataFrame", frequency: float | None) -> None:
     """Draw the energy that is left over the step."""
-    title_axes(axes, "energy left at the end", "time step", "energy left / energy at the start")
-    axes.set_xscale("log")
-    axes.set_xlim(around(rows["step"]))
-    log_ticks(axes.xaxis, around(rows["step"]), SECONDS)
-    axes.set_ylim(0, 1.15 * min(2, max(1, rows["energy_left"].max())))
-    draw_methods(chart, axes, rows, column="energy_left", styles=styles)
+    top = 1.15 * min(2, max(1, rows["energy_left"].max()))
+    y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
+    panel = chart.panel("energy left at the end", log_axis(X_LABEL, rows["step"], SECONDS), y)
     euler = rows[rows["integrator"] == "implicit-euler"]
     if frequency and len(euler):
-        axes.plot(*closed_form(euler, frequency), "--", color=FAINT, zorder=2)
+        panel.line(*closed_form(euler, frequency), strokeDash=[6, 4])
+    draw_methods(panel, rows, "energy_left")
 
 
 def closed_form(rows: "DataFrame", frequency: float) -> tuple[np.ndarray, np.ndarray]:
@@ -124,7 +108,7 @@ def closed_form(rows: "DataFrame", frequency: float) -> tuple[np.ndarray, np.nda
     return t, (1 + (2 * math.pi * frequency * t) ** 2) ** (-end / t)
 
 
-def draw_methods(chart: Chart, axes: Axes, rows: "DataFrame", *, column: str, styles: Styles) -> None:
+def draw_methods(panel: Panel, rows: "DataFrame", column: str) -> None:
     """Draw a curve for each method."""
-    for label, group in grouped(rows, "label").items():
-        chart.curve(axes, group.sort_values("step", kind="stable"), ("step", column), styles[label], numbers=NUMBERS)
+    for group in grouped(rows, "label").values():
+        panel.curve(group.sort_values("step", kind="stable"), ("step", column), NUMBERS, "curve")

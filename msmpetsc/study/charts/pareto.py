@@ -7,30 +7,13 @@ of the lattice: explicit and implicit runs of any time step can be compared by i
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
+from typing import TYPE_CHECKING
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.style import (
-    ERROR,
-    FAINT,
-    INK,
-    SECONDS,
-    Chart,
-    CurveStyle,
-    Numbers,
-    Styles,
-    legend_below,
-    log_axes,
-    new_figure,
-    title_axes,
-)
+from msmpetsc.study.charts.plot import ERROR, INK, RING, SECONDS, Chart, CurveStyle, Numbers, Panel, Styles, log_axis
 from msmpetsc.study.table import (
     ONCE_NOTE,
     Row,
-    failed,
     grouped,
     is_repeated,
     measured,
@@ -105,7 +88,6 @@ TRAJECTORY = ErrorMeasure(
     y_label="computing time a simulated second",
     unit="a simulated second",
 )
-MEASURES = {measure.name: measure for measure in (STEP, TRAJECTORY)}
 
 
 # What is best
@@ -144,12 +126,11 @@ def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]
     reached = reached[reached[measure.error] <= level]
     if reached.empty:
         return []
+    reached = reached.assign(**spread(reached, measure.cost))
     first = reached[measure.cost].idxmin()
-    ends = spread(reached, measure.cost)
-    best = records(reached.assign(least=ends["least"], greatest=ends["greatest"]).loc[[first]])
+    best = records(reached.loc[[first]])
     if is_repeated(reached.loc[[first]]):
-        near = within_noise(reached, first, measure.cost)
-        best += records(near.assign(least=ends["least"], greatest=ends["greatest"]))
+        best += records(within_noise(reached, first, measure.cost))
     return best
 
 
@@ -166,9 +147,7 @@ def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
             name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{formatting.plain(cells)}"
             title = f"{KIND}: {scene}, {formatting.count(cells)} cells" if cells > 0 else f"{KIND}: {scene}"
             chart = pareto_chart(name, title, group, styles)
-            if chart:
-                chart.failed = records(failed(rows))
-                charts.append(chart)
+            charts += [chart] if chart else []
     return charts
 
 
@@ -179,16 +158,12 @@ def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Ch
     if not panels:
         return None
     labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
-    handles = {label: styles[label].handle() for label in labels}
-    handles[FRONT] = Line2D([], [], color=FAINT, marker="o", markersize=10, markerfacecolor="none", markeredgecolor=INK)
-    figure, all_axes = new_figure(len(panels), list(handles))
-    chart = Chart(name, KIND, title, CAPTION, figure)
-    for axes, (measure, shown) in zip(all_axes, panels, strict=True):
-        draw_panel(chart, axes, shown, measure=measure, styles=styles)
-        chart.cheapest[measure.name] = best = [winners(shown, measure, level) for level in LEVELS]
-        lines = [cheapest_line(measure, level, rows) for level, rows in zip(LEVELS, best, strict=True)]
+    legend = {label: styles[label] for label in labels} | {FRONT: CurveStyle(INK, RING)}
+    chart = Chart(name, KIND, title, CAPTION, legend)
+    for measure, shown in panels:
+        draw_panel(chart, shown, measure)
+        lines = [cheapest_line(measure, level, winners(shown, measure, level)) for level in LEVELS]
         chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
-    legend_below(figure, handles)
     return chart
 
 
@@ -198,43 +173,29 @@ def common_time_step(rows: "DataFrame") -> "DataFrame":
     return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
-def draw_panel(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, styles: Styles) -> None:
+def draw_panel(chart: Chart, rows: "DataFrame", measure: ErrorMeasure) -> None:
     """Draw a panel: the front first, the methods over it."""
     step = formatting.seconds(rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
-    title_axes(axes, f"over the {measure.name}{at_step}", measure.x_label, measure.y_label)
-    ends = reach(rows, measure.cost)
-    log_axes(axes, rows[measure.error], ends.to_numpy().ravel(), (ERROR, SECONDS))
-    draw_front(axes, front_rows(rows, measure), measure)
-    for label, group in grouped(rows.join(spread(rows, measure.cost)), "label").items():
-        draw_method(chart, axes, group, measure=measure, style=styles[label])
+    x = log_axis(measure.x_label, rows[measure.error], ERROR)
+    y = log_axis(measure.y_label, reach(rows, measure.cost).to_numpy().ravel(), SECONDS)
+    panel = chart.panel(f"over the {measure.name}{at_step}", x, y)
+    front = front_rows(rows, measure)
+    (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
+    errors, costs = list(front[measure.error]), list(front[measure.cost])
+    panel.line([errors[0], *errors, right], [top, *costs, costs[-1]], interpolate="step-after", strokeWidth=1.2)
+    for group in grouped(rows.join(spread(rows, measure.cost)), "label").values():
+        draw_method(panel, group, measure)
+    panel.rings(front, measure.columns)
 
 
-def draw_method(chart: Chart, axes: Axes, rows: "DataFrame", *, measure: ErrorMeasure, style: CurveStyle) -> None:
+def draw_method(panel: Panel, rows: "DataFrame", measure: ErrorMeasure) -> None:
     """Draw a line through a method's own best points, and its other ones small and hollow."""
     best = front_rows(rows, measure)
-    axes.plot(best[measure.error], best[measure.cost], color=style.color, linewidth=1.6, zorder=3)
-    chart.whiskers(axes, rows, measure.columns, style)
-    chart.mark(axes, best, measure.columns, style, numbers=measure.numbers)
-    beaten = rows.drop(best.index)
-    hollow: dict[str, Any] = {"markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.color}
-    chart.mark(axes, beaten, measure.columns, style, numbers=measure.numbers, **hollow)
-
-
-def draw_front(axes: Axes, rows: "DataFrame", measure: ErrorMeasure) -> None:
-    """Draw a grey stair through the front, and a ring around each of its points."""
-    x, y = list(rows[measure.error]), list(rows[measure.cost])
-    right, top = axes.get_xlim()[1], axes.get_ylim()[1]
-    stair = [x[0], *x, right], [top, *y, y[-1]]
-    axes.plot(*stair, drawstyle="steps-post", color=FAINT, linewidth=1.2, zorder=2)
-    ring: dict[str, Any] = {
-        "markersize": 12,
-        "markerfacecolor": "none",
-        "markeredgecolor": INK,
-        "markeredgewidth": 1.1,
-        "zorder": 5,
-    }
-    axes.plot(x, y, "o", clip_on=False, **ring)
+    color = panel.styles[rows["label"].iloc[0]].color
+    panel.whiskers(rows, measure.columns, color)
+    panel.curve(best, measure.columns, measure.numbers)
+    panel.mark(rows.drop(best.index), measure.columns, measure.numbers, fill="white", stroke=color, size=35)
 
 
 # In words

@@ -1,31 +1,24 @@
 """The error of the surface over what it costs: of a study's lattices and steps, and of the trials of a plan."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import matplotlib.style
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
+from typing import TYPE_CHECKING
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.pareto import front
-from msmpetsc.study.charts.style import (
+from msmpetsc.study.charts.plot import (
+    DASH,
     ERROR,
     FAINT,
-    INK,
-    RC,
     SECONDS,
     Chart,
+    CurveStyle,
     Numbers,
     Styles,
     curve_styles,
-    legend_below,
-    log_axes,
-    new_figure,
+    log_axis,
     save_png,
-    title_axes,
 )
-from msmpetsc.study.table import failed, grouped, measured, records, succeeded
+from msmpetsc.study.table import grouped, measured, records, succeeded
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -47,7 +40,8 @@ NUMBERS: Numbers = {
     "time step": (formatting.seconds, "time_step"),
     "error asked for": (formatting.error, "error"),
 }
-RING: dict[str, Any] = {"markersize": 13, "markerfacecolor": "none", "markeredgecolor": INK, "markeredgewidth": 1.2}
+
+NUMBERS_OF_TRIALS = {name: NUMBERS[name] for name in (SURFACE_ERROR, COST, "cells")}
 
 
 def size_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
@@ -56,25 +50,20 @@ def size_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
     for scene, rows in grouped(table, "scene").items():
         shown = measured(succeeded(rows), *COLUMNS)
         if len(shown):
-            chart = size_chart(scene, shown, styles)
-            chart.failed = records(failed(rows))
-            charts.append(chart)
+            charts.append(size_chart(scene, shown, styles))
     return charts
 
 
 def size_chart(scene: str, rows: "DataFrame", styles: Styles) -> Chart:
     """Return a curve a way to step, over its numbers of cells; what nothing else beats is ringed."""
-    labels = list(dict.fromkeys(rows["label"]))
-    figure, (axes,) = new_figure(1, labels)
-    chart = Chart(f"size_{scene}", KIND, f"{KIND}: {scene}", CAPTION, figure)
-    title_axes(axes, scene, COST, SURFACE_ERROR)
-    log_axes(axes, rows["time_second"], rows["surface_error"], (SECONDS, ERROR))
-    for label, group in grouped(rows, "label").items():
-        chart.curve(axes, group.sort_values("cells", kind="stable"), COLUMNS, styles[label], numbers=NUMBERS)
-    best = rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))]
-    axes.plot(best["time_second"], best["surface_error"], "o", zorder=5, **RING)
-    legend_below(figure, {label: styles[label].handle() for label in labels})
-    least = {label: records(group.nsmallest(1, "surface_error"))[0] for label, group in grouped(rows, "label").items()}
+    x, y = log_axis(COST, rows["time_second"], SECONDS), log_axis(SURFACE_ERROR, rows["surface_error"], ERROR)
+    groups = grouped(rows, "label")
+    chart = Chart(f"size_{scene}", KIND, f"{KIND}: {scene}", CAPTION, {label: styles[label] for label in groups})
+    panel = chart.panel(scene, x, y)
+    for group in groups.values():
+        panel.curve(group.sort_values("cells", kind="stable"), COLUMNS, NUMBERS)
+    panel.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], COLUMNS)
+    least = {label: records(group.nsmallest(1, "surface_error"))[0] for label, group in groups.items()}
     chart.findings["The smallest surface error"] = [
         f"{label}: {formatting.error(row['surface_error'])} with {formatting.count(row['cells'])} cells."
         for label, row in least.items()
@@ -82,31 +71,21 @@ def size_chart(scene: str, rows: "DataFrame", styles: Styles) -> Chart:
     return chart
 
 
-# A plan
-
-
 def plan_picture(plan: "SizePlan", target: float, path: Path) -> None:
     """Write a PNG of the trials' expected errors over their costs, by integrator; the choice is ringed."""
+    from pandas import DataFrame
+
     choice = plan.choice
-    styles = curve_styles(sorted({trial.method for trial in plan.tried}))
-    with matplotlib.style.context(["default", RC]):
-        figure, (axes,) = new_figure(1, list(styles))
-        chart = Chart(path.stem, KIND, f"{KIND}: the trials of a plan", "", figure)
-        title_axes(axes, "tried, and ringed what is chosen", COST, f"{SURFACE_ERROR}, estimated")
-        points = [(trial.cost, trial.error) for trial in plan.tried] + [(choice.cost, choice.budget.total)]
-        costs, errors = zip(*points, strict=True)
-        log_axes(axes, costs, [*errors, target], (SECONDS, ERROR))
-        for trial in plan.tried:
-            style = styles[trial.method]
-            axes.plot(trial.cost, trial.error, style.marker, color=style.color, markersize=style.size, clip_on=False)
-            _say(axes, f" {formatting.count(trial.cells)}", trial.cost, trial.error)
-        axes.plot(choice.cost, choice.budget.total, "o", zorder=5, clip_on=False, **RING)
-        axes.axhline(target, color=FAINT, linestyle="--", zorder=2)
-        handles = {name: style.handle("none") for name, style in styles.items()}
-        handles["asked for"] = Line2D([], [], color=FAINT, linestyle="--")
-        legend_below(figure, handles)
-        save_png(chart, path.parent)
-
-
-def _say(axes: Axes, text: str, x: float, y: float) -> None:
-    axes.annotate(text, (x, y), fontsize=7, color=FAINT, xytext=(3, 3), textcoords="offset points")
+    tried = [(trial.method, trial.cost, trial.error, trial.cells) for trial in plan.tried]
+    rows = DataFrame(tried, columns=["label", *COLUMNS, "cells"]).assign(command="")
+    chosen = DataFrame([(choice.cost, choice.budget.total)], columns=list(COLUMNS))
+    x = log_axis(COST, [*rows["time_second"], choice.cost], SECONDS)
+    y = log_axis(f"{SURFACE_ERROR}, estimated", [*rows["surface_error"], *chosen["surface_error"], target], ERROR)
+    styles = curve_styles(sorted(set(rows["label"]))) | {"asked for": CurveStyle(FAINT, DASH)}
+    chart = Chart(path.stem, KIND, f"{KIND}: the trials of a plan", "", styles)
+    panel = chart.panel("tried, and ringed what is chosen", x, y)
+    panel.line(x["scale"]["domain"], [target, target], strokeDash=[6, 4])
+    panel.mark(rows, COLUMNS, NUMBERS_OF_TRIALS)
+    panel.text(rows, COLUMNS, [formatting.count(cells) for cells in rows["cells"]])
+    panel.rings(chosen, COLUMNS)
+    save_png(chart, path.parent)

@@ -1,25 +1,17 @@
 """Stability: what becomes of each method over two axes, a panel a method, or with named cases, a column a method."""
 
+import json
 import math
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import EngFormatter
-
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.style import INK, WIDTH, Chart, CurveStyle, Numbers, set_padding
+from msmpetsc.study.charts.plot import INK, Chart, CurveStyle, Numbers, Panel, channel, tips
 from msmpetsc.study.metrics import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
 KIND = "Stability"
 CAPTION = (
@@ -37,10 +29,8 @@ SYMBOLS = {
     "not recovered": "S", "inverted": "I",
 }  # fmt: skip
 DARK = {"crashed", "timeout", "not finite", "energy", "diverged"}  # their symbols are white
-GOOD = ("ok", "slow")
 COLUMNS = 6  # panels side by side
-CELL = 0.33  # [in]: height
-FONT = 8  # [points] of symbols and ticks
+CELL = 24  # [px]: height
 NUMBERS: Numbers = {
     "outcome": (formatting.plain, "outcome"),
     "steps done": (formatting.count, "steps"),
@@ -86,7 +76,7 @@ def worded(value: float, unit: str) -> str:
     """Return a number of an axis: 10 ms, 20%, 100 kPa."""
     if unit == "%":
         return f"{100 * value:.3g}%"
-    return formatting.seconds(value) if unit == "s" else EngFormatter(unit, sep=formatting.GAP if unit else "")(value)
+    return formatting.seconds(value) if unit == "s" else formatting.prefixed(value, unit)
 
 
 def scale(rows: "DataFrame", column: str, axis: dict) -> Scale:
@@ -114,60 +104,86 @@ def stability_charts(table: "DataFrame", study: dict) -> list[Chart]:
 def stability_chart(name: str, rows: "DataFrame", settings: dict) -> Chart:
     """Return the chart of a map; ``settings``: its table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
-    rows = rows.assign(i=rows["x"].map(x.values.index) + 0.5, j=rows["y"].map(y.values.index) + 0.5)
+    rows = rows.assign(i=rows["x"].map(x.values.index), j=rows["y"].map(y.values.index))
     by_label = grouped(rows, "label")
-    of_cases = set(x.values) == set(by_label)
-    panels = {"": rows} if of_cases else by_label
-    figure, all_axes = panels_of(len(panels), (len(x.values), len(y.values)), of_cases)
-    chart = Chart(f"stability_{name}", KIND, settings.get("title") or name, CAPTION, figure)
-    for index, (axes, (label, group)) in enumerate(zip(all_axes, panels.items(), strict=True)):
-        axes.set_title(label, loc="left", fontsize=10)
-        draw_cells(chart, axes, group, x=x, y=y, of_cases=of_cases)
-        if not of_cases:
-            draw_limit(axes, group, x, y)
-        decorate(axes, x, y, of_cases=of_cases, left=index % COLUMNS == 0, low=index + COLUMNS >= len(panels))
-    has_limit = not of_cases and any(line.get_label() == LIMIT for axes in all_axes for line in axes.lines)
-    add_legend(figure, set(rows["outcome"]), has_limit)
-    if of_cases:
-        chart.findings["By case"] = [case_line(y.text(name), group) for name, group in grouped(rows, "y").items()]
-    else:
-        chart.findings["By method"] = [method_line(label, group, x, y) for label, group in by_label.items()]
+    legend = {
+        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
+        for outcome in reversed(OUTCOMES)
+        if outcome in set(rows["outcome"])
+    }
+    title, height = settings.get("title") or name, CELL * len(y.values)
+    chart = Chart(f"stability_{name}", KIND, title, CAPTION, legend, columns=COLUMNS, gap=35, height=height)
+    if set(x.values) == set(by_label):
+        panel = chart.panel("", *axes_of_cases(x, y))
+        draw_cells(panel, rows, {"case": (y.text, "y")})
+        write_symbols(panel, rows)
+        return chart
+    for index, (label, group) in enumerate(by_label.items()):
+        is_low = index + COLUMNS >= len(by_label)
+        panel = chart.panel(label, axis(x, shown=is_low, labelAngle=-90), axis(y, shown=index % COLUMNS == 0))
+        draw_cells(panel, group, {x.name: (x.text, "x"), y.name: (y.text, "y")})
+        if draw_limit(panel, group, x, y):
+            legend[LIMIT] = CurveStyle(INK, "M-1.7,-.15H1.7V.15H-1.7Z")
+        write_symbols(panel, group)
     return chart
 
 
-def panels_of(count: int, cells: tuple[int, int], of_cases: bool) -> tuple[Figure, Sequence[Axes]]:
-    """Return axes for the panels, line by line, and room for a legend below."""
-    columns = 1 if of_cases else min(count, COLUMNS)
-    lines = -(-count // columns)
-    height = max(cells[1] * CELL, 1.2)
-    figure = Figure(figsize=(WIDTH, lines * (height + 0.55) + 1.35), layout="constrained")
-    set_padding(figure, w_pad=0.05, h_pad=0.06, wspace=0.01)
-    axes = list(figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel())
-    for unused in axes[count:]:
-        unused.remove()
-    return figure, axes[:count]
+def axis(scale: Scale, shown: bool = True, **look: Any) -> dict[str, Any]:
+    """Return an axis whose cells are 1 wide, around 0, 1, 2; its values are written if shown."""
+    count = len(scale.values)
+    words = f"{json.dumps(scale.texts)}[datum.value]"
+    made = channel(scale.name if shown else "", words, range(count), domain=[-0.5, count - 0.5])
+    made["axis"] |= {"grid": False, "domain": False, "ticks": False, "labels": shown} | look
+    return made
 
 
-def draw_cells(chart: Chart, axes: Axes, rows: "DataFrame", *, x: Scale, y: Scale, of_cases: bool) -> None:
-    """Draw the cells of a panel, their symbols, and what tells their numbers."""
-    known = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["x", "y"], keep="last")
-    cells = known.assign(value=known["outcome"].map(OUTCOMES.index)).pivot(index="y", columns="x", values="value")
-    values = cells.reindex(index=y.values, columns=x.values).to_numpy(float)
-    palette = ListedColormap([COLORS[name] for name in OUTCOMES])
-    axes.pcolormesh(values, cmap=palette, vmin=-0.5, vmax=len(OUTCOMES) - 0.5, edgecolors="white", linewidth=1)
-    for row in records(known):
-        color = "white" if row["outcome"] in DARK else INK
-        behind: dict[str, Any] = {
-            "facecolor": COLORS[row["outcome"]],
-            "edgecolor": "none",
-            "pad": 0.8,
-        }  # no line runs through it
-        center: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 5}
-        axes.text(row["i"], row["j"], symbol(row), color=color, fontsize=FONT, bbox=behind, **center)
-    y_name = y.name if y.name != "y" else "case"
-    numbers: Numbers = {} if of_cases else {x.name: (x.text, "x")}
-    numbers |= {y_name: (y.text, "y")} | NUMBERS
-    chart.mark(axes, known, ("i", "j"), CurveStyle(INK, "s"), numbers=numbers, markersize=CELL * 72 * 0.9, alpha=0)
+def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the axes of named cases, the first at the top, with the methods above them."""
+    broken = [text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts]
+    room = 4 + 14 * (max(map(len, broken)) - 1)
+    across, down = axis(x, orient="top", labelOverlap=False, labelPadding=room), axis(y)
+    across["axis"]["labelExpr"] = f"{json.dumps(broken)}[datum.value]"
+    down["scale"]["reverse"] = True
+    return across | {"title": ""}, down | {"title": ""}
+
+
+def draw_cells(panel: Panel, rows: "DataFrame", numbers: Numbers) -> None:
+    """Draw the cells of a panel, which tell their numbers."""
+    known = known_of(rows)
+    values = [
+        {
+            "x": row["i"] - 0.47, "x2": row["i"] + 0.47, "y": row["j"] - 0.46, "y2": row["j"] + 0.46,
+            "color": COLORS[row["outcome"]], "tip": tip,
+        }
+        for row, tip in zip(records(known), tips(known, numbers | NUMBERS), strict=True)
+    ]  # fmt: skip
+    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
+    panel.draw(values, {"type": "rect"}, fill=color_of("color"), description={"field": "tip"}, **ends)
+
+
+def write_symbols(panel: Panel, rows: "DataFrame") -> None:
+    """Write the symbols of the cells, over the line of the limit, which does not run through them."""
+    texts = [
+        {
+            "x": row["i"], "y": row["j"], "text": symbol(row),
+            "behind": COLORS[row["outcome"]], "color": "white" if row["outcome"] in DARK else INK,
+        }
+        for row in records(known_of(rows))
+    ]  # fmt: skip
+    look, text = {"type": "text", "fontSize": 10.5}, {"text": {"field": "text"}}
+    halo = {"stroke": color_of("behind"), "strokeWidth": {"value": 5}}
+    panel.draw(texts, look, **text, **halo)
+    panel.draw(texts, look, **text, color=color_of("color"))
+
+
+def known_of(rows: "DataFrame") -> "DataFrame":
+    """Return the rows of the cells whose outcome is known, each once."""
+    return rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["x", "y"], keep="last")
+
+
+def color_of(column: str) -> dict[str, Any]:
+    """Return the channel of colours that stand in a column."""
+    return {"field": column, "type": "nominal", "scale": None}
 
 
 def symbol(row: Row) -> str:
@@ -178,78 +194,20 @@ def symbol(row: Row) -> str:
     return f"{count:.0f}" if count < 1000 else f"{count / 1000:.{1 if count < 9950 else 0}f}k"
 
 
-def draw_limit(axes: Axes, rows: "DataFrame", x: Scale, y: Scale) -> None:
-    """Draw the explicit limit across the axis of time steps, for each value of the other axis, where it is known."""
+def draw_limit(panel: Panel, rows: "DataFrame", x: Scale, y: Scale) -> bool:
+    """Draw the explicit limit across the axis of time steps, for each value of the other axis; tell if it is known."""
     if "time.step" not in (x.key, y.key):
-        return
+        return False
     steps, across, column = (x, y, "y") if x.key == "time.step" else (y, x, "x")
+    along, other = ("x", "y") if steps is x else ("y", "x")
     limits = rows[rows["explicit_limit"] > 0].groupby(column)["explicit_limit"].median()
-    points: tuple[list[float], list[float]] = [], []
-    for index, value in enumerate(across.values):
-        at = steps.at(limits[value]) if value in limits else None
-        points[0].extend([math.nan if at is None else at + 0.5] * 2 + [math.nan])
-        points[1].extend([index, index + 1, math.nan])
-    if all(map(math.isnan, points[0])):
-        return
-    if steps is y:
-        points = points[1], points[0]
-    axes.plot(*points, color="white", linewidth=3.4, solid_capstyle="butt", zorder=3)
-    axes.plot(*points, color=INK, linewidth=1.6, solid_capstyle="butt", zorder=3, label=LIMIT)
-
-
-def decorate(axes: Axes, x: Scale, y: Scale, *, of_cases: bool, left: bool, low: bool) -> None:
-    """Put ticks at the middle of each cell, names at the outer panels alone."""
-    axes.grid(False)
-    axes.tick_params(length=0, labelsize=10 if of_cases else FONT, labelleft=left, labelbottom=low)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    texts = [text.replace("-", "-\n") if len(text) > 12 else text for text in x.texts] if of_cases else x.texts
-    axes.set_xticks([index + 0.5 for index in range(len(x.values))], texts, rotation=0 if of_cases else 90)
-    axes.set_yticks([index + 0.5 for index in range(len(y.values))], y.texts)
-    if of_cases:
-        axes.invert_yaxis()
-        axes.xaxis.tick_top()
-    else:
-        axes.set_xlabel(x.name if low else "", fontsize=9)
-        axes.set_ylabel(y.name if left else "", fontsize=9)
-
-
-def add_legend(figure: Figure, outcomes: set[str], limit: bool) -> None:
-    """Name the outcomes that there are, best first."""
-    names = [name for name in reversed(OUTCOMES) if name in outcomes]
-    handles: list[Patch | Line2D] = [
-        Patch(facecolor=COLORS[name], label=f"{SYMBOLS.get(name, '12')}  {name}: {MEANING[name]}") for name in names
+    places = [(index, steps.at(limits[value])) for index, value in enumerate(across.values) if value in limits]
+    lines = [
+        {along: at, f"{along}2": at, other: index - 0.5, f"{other}2": index + 0.5}
+        for index, at in places
+        if at is not None
     ]
-    handles += [Line2D([], [], color=INK, linewidth=2, label=LIMIT)] if limit else []
-    figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8.5, handlelength=1.4, columnspacing=1.4)
-
-
-def method_line(label: str, rows: "DataFrame", x: Scale, y: Scale) -> str:
-    """Say how a method did, and where it failed."""
-    counts = Counter(rows["outcome"])
-    good = sum(counts[name] for name in GOOD)
-    parts = [f"all {len(rows)} ok" if good == len(rows) else f"{good} of {len(rows)} ok"]
-    if counts["slow"]:
-        parts[0] += f", {counts['slow']} of them slowly"
-    for name in OUTCOMES:
-        if counts[name] and name not in GOOD:
-            lost = rows[rows["outcome"] == name]
-            ranges = f"{value_range(lost['i'], x)}; {value_range(lost['j'], y)}"
-            parts.append(f"{name} in {len(lost)} ({ranges})")
-    return f"{label}: {', '.join(parts)}."
-
-
-def value_range(at: "Series", scale: Scale) -> str:
-    """Return the first and the last of the values of an axis, from the middles of their cells."""
-    first, last = scale.texts[int(at.min())], scale.texts[int(at.max())]
-    return f"{scale.name} {first}" if first == last else f"{scale.name} {first} to {last}"
-
-
-def case_line(name: str, rows: "DataFrame") -> str:
-    """Say which methods failed a case, and how."""
-    lost = grouped(rows[~rows["outcome"].isin(GOOD)], "outcome")
-    if not lost:
-        return f"{name}: every method does it."
-    worst_first = sorted(lost, key=OUTCOMES.index)
-    lines = "; ".join(f"{outcome}: {', '.join(lost[outcome]['label'])}" for outcome in worst_first)
-    return f"{name}: {lines}."
+    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
+    panel.draw(lines, {"type": "rule", "color": "white", "strokeWidth": 3.4}, **ends)
+    panel.draw(lines, {"type": "rule", "color": INK, "strokeWidth": 1.7}, **ends)
+    return bool(lines)

@@ -1,0 +1,281 @@
+"""What all charts share: a colour and a marker for each method, axes in readable units, and points with their numbers.
+
+A chart is a Vega-Lite specification; vl-convert draws it, without a browser, as SVG for the page and as PNG.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import cycle, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import vl_convert
+from numpy.typing import ArrayLike
+
+from msmpetsc.output.disk import write_whole
+from msmpetsc.study.table import Row, records, spread
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
+# Okabe and Ito's colours without their yellow, which white paper swallows, then Tol's wine, olive, indigo, and a brown.
+COLORS = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
+    "#882255", "#999933", "#332288", "#8c6239",
+)  # fmt: skip
+STAR = "M0,-1.2L.28,-.38L1.14,-.37L.45,.15L.7,.97L0,.48L-.7,.97L-.45,.15L-1.14,-.37L-.28,-.38Z"
+HOURGLASS = "M-1,-1H1L-1,1H1Z"
+SHAPES = (
+    "circle", "square", "triangle-up", "diamond", "triangle-down", "cross", "triangle-left", STAR, "triangle-right",
+    HOURGLASS,
+)  # fmt: skip  # ten and eleven: a pair is back after 110
+RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
+DASH = "M-1.7,-.12H-.2V.12H-1.7ZM.2,-.12H1.7V.12H.2Z"
+WIDTH, HEIGHT = 1080, 280  # [px] of all panels of a chart, and of one
+SIZES, MANY = (75, 25), 40  # [px^2] of a marker, and of one where there are more in a curve
+LETTER = 8  # [px]: mean width in a legend
+CONFIG: dict[str, Any] = {
+    "background": "white",
+    "font": "DejaVu Sans, Verdana, Arial, sans-serif",
+    "view": {"stroke": None},
+    "axis": {
+        "labelColor": INK, "titleColor": INK, "titleFontWeight": "normal", "gridColor": GRID, "domainColor": FAINT,
+        "tickColor": FAINT, "labelFontSize": 12, "titleFontSize": 12, "labelOverlap": "greedy",
+    },
+    "title": {"anchor": "start", "color": INK, "fontWeight": "normal", "fontSize": 13},
+    "legend": {
+        "orient": "bottom", "labelFontSize": 12, "labelColor": INK, "symbolSize": 90, "columnPadding": 24,
+        "labelLimit": WIDTH, "symbolOpacity": 1, "symbolStrokeWidth": 0,
+    },
+    "point": {"opacity": 1},
+}  # fmt: skip
+UNIT = "replace(format(datum.value, '~s'), regexp('([^0-9.]?)$'), '\N{NO-BREAK SPACE}$1{}')"
+# how the number of a tick is written, as an expression of Vega's
+ERROR, COUNT, PLAIN = (
+    "replace(format(datum.value, '~e'), '+', '')",
+    "format(datum.value, '~s')",
+    "format(datum.value, '~g')",
+)
+SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
+
+Numbers = dict[str, tuple[Callable[[Any], str], str]]  # by heading: how to word a number, and its column
+
+
+@dataclass(frozen=True)
+class CurveStyle:
+    """Colour and marker of one method, the same in all charts."""
+
+    color: str
+    shape: str
+
+
+Styles = dict[str, CurveStyle]  # by label
+
+
+def curve_styles(labels: Iterable[str]) -> Styles:
+    """Return one style a label, given out in order of first appearance."""
+    labels = list(dict.fromkeys(labels))
+    pairs = islice(zip(cycle(COLORS), cycle(SHAPES), strict=False), len(labels))
+    return {label: CurveStyle(*pair) for label, pair in zip(labels, pairs, strict=True)}
+
+
+def tips(rows: "DataFrame", numbers: Numbers, label: str = "label") -> list[str]:
+    """Return what the point of each row tells: its curve, its numbers, and the command that repeats it.
+
+    label : column with the name of its curve
+    """
+    return ["\n".join(filter(None, [row[label], *_told(row, numbers), row["command"]])) for row in records(rows)]
+
+
+def _told(row: Row, numbers: Numbers) -> list[str]:
+    texts = {name: word(row[column]) for name, (word, column) in numbers.items()}
+    return [f"{name}: {text}" for name, text in texts.items() if text]
+
+
+# Axes: channels of Vega-Lite
+
+
+def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
+    """Return an axis; words: how its ticks are written, an expression of Vega's."""
+    axis = {"values": list(ticks), "labelExpr": words}
+    return {"type": "quantitative", "title": title, "scale": {"nice": False, "zero": False} | scale, "axis": axis}
+
+
+def log_axis(title: str, values: ArrayLike, words: str, dense: float = 2.5) -> dict[str, Any]:
+    """Return a logarithmic axis around positive values: a margin on both sides, and a decade at least.
+
+    Numbers stand at the decades, and at 2 and 5 where there are fewer decades than ``dense``.
+    """
+    low, high = math.log10(np.min(values)), math.log10(np.max(values))
+    middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
+    low, high = middle - half, middle + half
+    steps = (1, 2, 5) if high - low < dense else (1,)
+    ticks = [step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps]
+    return channel(title, words, ticks, type="log", domain=[10**low, 10**high])
+
+
+def axis_from_zero(title: str, values: Sequence[float], words: str) -> dict[str, Any]:
+    """Return an axis with 0 at the left, logarithmic from the decade of the least positive value on.
+
+    Methods differ by powers of ten.
+    """
+    positive = [value for value in values if value > 0]
+    if not positive:
+        return channel(title, words, [0], domain=[0, 1])
+    first = 10.0 ** math.floor(math.log10(min(positive)))
+    decades = round(math.log10(max(positive) / first)) + 1
+    steps = (1, 2, 5) if decades <= 2 else (1,)
+    ticks = [0.0, *(first * 10**decade * step for decade in range(decades) for step in steps)]
+    return channel(title, words, ticks, type="symlog", constant=first, domain=[0, 1.3 * max(positive)])
+
+
+# Panels and charts
+
+
+@dataclass
+class Panel:
+    """Axes and what is drawn in them; styles: of all curves of the legend."""
+
+    title: str
+    x: dict[str, Any]
+    y: dict[str, Any]
+    styles: Styles
+    layers: list[dict[str, Any]] = field(default_factory=list)
+
+    def draw(self, values: list[dict[str, Any]], mark: dict[str, Any], **channels: Any) -> None:
+        """Add a layer of values with columns x, y and what the channels name."""
+        if values:
+            axes = {"x": {"field": "x"} | self.x, "y": {"field": "y"} | self.y}
+            silent = {"aria": "description" in channels}
+            self.layers.append({"data": {"values": values}, "mark": mark | silent, "encoding": axes | channels})
+
+    def line(self, x: Iterable[float], y: Iterable[float], color: str = FAINT, **mark: Any) -> None:
+        """Draw a line through points in their order."""
+        values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
+        self.draw(values, {"type": "line", "color": color, "strokeWidth": 1.6, **mark}, order={"field": "n"})
+
+    def whiskers(self, rows: "DataFrame", columns: tuple[str, str], color: str) -> None:
+        """Draw the spread of the repeats of each row that was repeated."""
+        x, cost = columns
+        ends = spread(rows, cost).assign(x=rows[x]).dropna()
+        values = [{"x": a, "y": low, "high": high} for low, high, a in ends.itertuples(index=False)]
+        upper = {"y": {"field": "high"} | self.y}
+        self.draw(values, {"type": "rule", "color": color}, y2={"field": "high"})
+        for end in ({}, upper):
+            self.draw(values, {"type": "tick", "orient": "horizontal", "size": 7, "opacity": 1, "color": color}, **end)
+
+    def mark(
+        self, rows: "DataFrame", columns: tuple[str, str], numbers: Numbers, label: str = "label", **mark: Any
+    ) -> None:
+        """Draw a marker at each row, which tells its numbers; label: column with the name of its curve."""
+        of_rows = zip(*(rows[name] for name in (*columns, label)), tips(rows, numbers, label), strict=True)
+        values = [{"x": x, "y": y, "curve": curve, "tip": tip} for x, y, curve, tip in of_rows]
+        look = {"type": "point", "size": SIZES[0], "stroke": "white", "strokeWidth": 0.6} | mark
+        color = {} if "fill" in look else {"fill": nominal(self.styles, "color")}
+        self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **color)
+
+    def curve(self, rows: "DataFrame", columns: tuple[str, str], numbers: Numbers, label: str = "label") -> None:
+        """Draw the rows of one curve as a line with a marker at each point."""
+        if len(rows):
+            color = self.styles[rows[label].iloc[0]].color
+            self.line(rows[columns[0]], rows[columns[1]], color)
+            self.mark(rows, columns, numbers, label, size=SIZES[len(rows) > MANY])
+
+    def rings(self, rows: "DataFrame", columns: tuple[str, str]) -> None:
+        """Draw a ring around each row."""
+        values = [{"x": x, "y": y} for x, y in rows[list(columns)].itertuples(index=False)]
+        self.draw(values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0})
+
+    def text(self, rows: "DataFrame", columns: tuple[str, str], texts: Sequence[str], **mark: Any) -> None:
+        """Write a text to the upper right of each row."""
+        at = rows[list(columns)].itertuples(index=False)
+        values = [{"x": x, "y": y, "text": text} for (x, y), text in zip(at, texts, strict=True)]
+        look = {"type": "text", "dx": 6, "dy": -6, "align": "left", "fontSize": 9, "color": FAINT} | mark
+        self.draw(values, look, text={"field": "text"})
+
+    def spec(self, width: float, height: float) -> dict[str, Any]:
+        """Return the panel in Vega-Lite, of so many pixels."""
+        return {"title": self.title, "width": width, "height": height, "layer": self.layers}
+
+
+@dataclass
+class Chart:
+    """Panels, and what they say in plain words.
+
+    name     : of its file
+    kind     : the heading it stands under
+    styles   : of all its curves, for the legend
+    columns  : panels side by side, at most
+    gap      : between panels, with their axes [px]
+    height   : of a panel [px]
+    findings : lines in plain words, by their heading
+    """
+
+    name: str
+    kind: str
+    title: str
+    caption: str
+    styles: Styles
+    columns: int = 3
+    gap: float = 85
+    height: float = HEIGHT
+    panels: list[Panel] = field(default_factory=list)
+    findings: dict[str, list[str]] = field(default_factory=dict)
+
+    def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Panel:
+        """Return a new panel behind the others."""
+        self.panels.append(Panel(title, x, y, self.styles))
+        return self.panels[-1]
+
+    def spec(self) -> dict[str, Any]:
+        """Return the panels line by line in Vega-Lite, with one legend of all curves below."""
+        columns = min(len(self.panels), self.columns)
+        width = (WIDTH - self.gap * (columns - 1)) / columns
+        panels = [panel.spec(width, self.height) for panel in self.panels]
+        lines = [{"hconcat": panels[at : at + columns], "spacing": 15} for at in range(0, len(panels), columns)]
+        own_legend = {"scale": {"fill": "independent", "shape": "independent"}}
+        return {"vconcat": [*lines, legend(self.styles)], "resolve": own_legend, "spacing": 14}
+
+
+def legend(styles: Styles) -> dict[str, Any]:
+    """Return a chart of nothing but a legend."""
+    longest = max(map(len, styles), default=1)
+    fit = max(1, min(6, len(styles), int(WIDTH / (LETTER * longest + 40))))
+    lines = -(-len(styles) // fit)
+    shown = {"title": None, "columns": -(-len(styles) // lines)}  # as even as can be
+    channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}
+    values = [{"curve": name} for name in styles]
+    mark = {"type": "point", "opacity": 0, "aria": False}
+    return {"width": WIDTH, "height": 1, "data": {"values": values}, "mark": mark, "encoding": channels}
+
+
+def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return the channel that gives each curve its "color" or its "shape"."""
+    scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
+    return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
+
+
+# Files
+
+
+def png(chart: Chart) -> bytes:
+    """Return the chart with its title as PNG."""
+    title = {"text": chart.title, "fontWeight": "bold", "fontSize": 15, "offset": 12}
+    return vl_convert.vegalite_to_png({"config": CONFIG, "title": title} | chart.spec(), scale=1.5)
+
+
+def save_png(chart: Chart, folder: Path) -> Path:
+    """Write the chart with its title, in a file of its name."""
+    path = folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png"
+    write_whole(path, png(chart))
+    return path
+
+
+def svg_text(chart: Chart) -> str:
+    """Return the chart as an <svg> element: every point has a <title>, which browsers show under the mouse."""
+    text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
+    return re.sub(r'<path aria-label="([^"]*)"([^>]*)/>', r'<path class="point"\2><title>\1</title></path>', text)

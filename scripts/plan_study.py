@@ -5,18 +5,21 @@
 
 The finer run has 32 times the cells of the choice, or 8 times where that takes longer than the limit (a quarter more,
 where a trial of the plan has as many), and explicit substeps or a quarter of its step. Where no choice meets the error,
-the best one is held against a finer run if that takes no longer than the limit. Runs stay in out/plan_study, so the
-same command goes on where it stopped.
+the best one is held against a finer run if that takes no longer than the limit. Where the choice would take over 5 s
+for all of the scene, it is run for that long too: the plan's own time is told over that time. SCENE is a name of the
+study or a scene file. Runs stay in out/plan_study, so the same command goes on where it stopped.
 """
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
 
 from clone import ROOT, parser
 
 from msmpetsc.cli.commands.plan import print_size_trial
 from msmpetsc.errors import InputError
-from msmpetsc.solve.presets import preset_names
+from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import Case
 from msmpetsc.study.distances import surface_error
 from msmpetsc.study.process import Processes
@@ -29,12 +32,13 @@ from msmpetsc.study.table import Row
 OUT, ERRORS, LIMIT = ROOT / "out" / "plan_study", (0.1, 0.03, 0.01), 900.0  # [s] a finer run
 HEAD = (
     "scene", "asked", "chosen, cells", "expected: cells + time + step", "true error", "over asked", "s a simulated s",
-    "what bounds it",
+    "plan, s", "choice in full, s", "what bounds it",
 )  # fmt: skip
 FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1
 MORE = 1.25  # times that, where a trial of the plan has as many
 LIKE = 1.1  # times the cells
 SHORTER = 4  # times, of implicit steps
+LONG = 5.0  # [s] a choice that takes as long for the whole scene is run so
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,8 @@ class Setting:
     """
 
     file: str
-    frames: tuple[int, int, int]
-    cells: tuple[int, int, int]
+    frames: tuple[int, int, int] = (20, 20, 20)
+    cells: tuple[int, int, int] = (1000, 2000, 4000)
 
 
 STUDIES = {
@@ -64,8 +68,14 @@ STUDIES = {
 }
 
 
+@dataclass
 class LastingBench(Bench):
-    """A bench whose rows stay beside its results: nothing is run twice that ended, or that had as much time."""
+    """A bench whose rows stay beside its results: nothing is run twice that ended, or that had as much time.
+
+    spared : seconds of the runs that were known
+    """
+
+    spared: float = field(default=0.0, init=False)
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
         """Run a case if it is not known; its result stays."""
@@ -74,6 +84,7 @@ class LastingBench(Bench):
             known = json.loads(path.read_text())
             ended, spent = known["row"]["status"], known["limit"] >= case.timeout
             if self.result_of(case).is_file() if ended == "ok" else ended == "failed" or spent:
+                self.spared += known["seconds"]
                 return CaseResult(known["row"], None, known["seconds"])
         result = super().measure(case, True)
         if not self.processes.stopped:
@@ -92,7 +103,8 @@ def finer_cells(sizer: Sizer, choice: Choice, times: int) -> int:
 def finer_methods(sizer: Sizer, choice: Choice, cells: int) -> list[tuple[float, Candidate]]:
     """Return ways to step the finer run of so many cells, the cheapest first, each with the seconds that it may take.
 
-    Explicit substeps of the lattice's own length, if a trial of them ended well, and BDF2 in shorter steps.
+    Explicit substeps of the lattice's own length, if a trial of them ended well, and BDF2 in shorter steps. Of statics
+    there is one way, solved to 1e-3.
     """
     known = {each.method.integrator: each for each in sizer.trials if each.method.time_step == sizer.step}
     method = choice.method
@@ -100,7 +112,9 @@ def finer_methods(sizer: Sizer, choice: Choice, cells: int) -> list[tuple[float,
     if explicit := known.get("verlet"):
         growth = (cells / explicit.cells) ** (4 / 3)
         ways.append((explicit.cost * growth * sizer.duration, Candidate("verlet", sizer.step)))
-    if method.integrator != "verlet":
+    if method.integrator == STATIC:
+        ways = [(choice.cost * cells / choice.cells, replace(method, step_error=1e-3))]
+    elif method.integrator != "verlet":
         step = method.time_step / SHORTER
         shorter = Candidate("bdf2", min(step, sizer.step), "newton", min(1e-3, method.step_error or 1e-3))
         ways.append((choice.cost * cells / choice.cells * SHORTER * sizer.duration, shorter))
@@ -127,9 +141,28 @@ def true_error(sizer: Sizer, choice: Choice, limit: float) -> tuple[float | None
     return None, row, why
 
 
-def row_of(name: str, target: float, plan: SizePlan, sizer: Sizer, limit: float) -> str:
-    """Return the row of a plan."""
+def timed_plan(sizer: Sizer, bench: LastingBench) -> tuple[SizePlan, float]:
+    """Return the plan and the seconds that it takes, with those of trials made before."""
+    began, spared = perf_counter(), bench.spared
+    plan = sizer.plan()
+    return plan, perf_counter() - began + bench.spared - spared
+
+
+def full_seconds(sizer: Sizer, choice: Choice, limit: float) -> float | None:
+    """Return the seconds of the choice for all of the scene; None where they are few, or more than the limit."""
+    tried, sizer.duration = sizer.duration, sizer.as_given.time.duration
+    case = replace(sizer.case(choice.method, choice.cells), timeout=limit)
+    sizer.duration = tried
+    if not LONG <= choice.cost * sizer.as_given.time.duration <= limit:
+        return None
+    ended = sizer.bench.measure(case.changed("output.surface=false"), keep=True)
+    return ended.seconds if ended.row["status"] == "ok" else None
+
+
+def row_of(name: str, target: float, plan: SizePlan, sizer: Sizer, limit: float, planned: float) -> str:
+    """Return the row of a plan that took so many seconds."""
     choice, method, budget = plan.choice, plan.choice.method, plan.choice.budget
+    full = full_seconds(sizer, choice, limit)
     error, run, why = true_error(sizer, choice, limit)
     solved = "" if method.step_error is None else f" to {method.step_error:g}"
     step = "" if method.integrator == "verlet" else f", {1000 * method.time_step:.3g} ms{solved}"
@@ -138,7 +171,8 @@ def row_of(name: str, target: float, plan: SizePlan, sizer: Sizer, limit: float)
     reached = f"{100 * error:.2g}% | {error / target:.2g}" if error is not None else " | "
     bounds = "; ".join([*([] if plan.met else ["**not met**"]), *filter(None, [why]), *plan.bounds])
     cost = run.get("time_second") or choice.cost
-    return f"| {name} | {100 * target:g}% | {chosen} | {parts} | {reached} | {cost:.2g} | {bounds} |"
+    took = f"{planned:.0f} | {full:.0f}: {planned / full:.1f} times" if full else f"{planned:.0f} | "
+    return f"| {name} | {100 * target:g}% | {chosen} | {parts} | {reached} | {cost:.2g} | {took} | {bounds} |"
 
 
 def main() -> None:
@@ -149,10 +183,10 @@ def main() -> None:
     arguments.add_argument("--frames", type=int, help="the first ones, that are tried")
     arguments.add_argument("--limit", type=float, default=LIMIT, help="seconds of a finer run")
     given = arguments.parse_args()
-    if unknown := set(given.scenes) - set(STUDIES):
+    if unknown := {name for name in given.scenes if name not in STUDIES and not Path(name).is_file()}:
         arguments.error(f"no such scene: {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
     OUT.mkdir(parents=True, exist_ok=True)
-    rows, bench = [], LastingBench(OUT, Processes())
+    rows, bench = [], LastingBench(OUT, Processes(), warm=True)  # as the command's
     try:
         for target in given.errors:
             for name in given.scenes or STUDIES:
@@ -163,9 +197,14 @@ def main() -> None:
     print(*rows, sep="\n")
 
 
-def plan_row(name: str, target: float, bench: Bench, *, cells: int | None, frames: int | None, limit: float) -> str:
+def plan_row(
+    name: str, target: float, bench: LastingBench, *, cells: int | None, frames: int | None, limit: float
+) -> str:
     """Return the row of a scene, made as the command makes a plan."""
-    setting = STUDIES[name]
+    from msmpetsc.solve.presets import preset_names  # late: it begins MPI, which trials forked from here do themselves
+
+    setting = STUDIES.get(name) or Setting(str(Path(name).resolve()))
+    name = Path(setting.file).stem
     of_error = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
     print(f"\n{name}, {100 * target:g}%", flush=True)
     sizer = Sizer(
@@ -174,9 +213,10 @@ def plan_row(name: str, target: float, bench: Bench, *, cells: int | None, frame
         report=print_size_trial,
     )  # fmt: skip
     try:
-        row = row_of(name, target, sizer.plan(), sizer, limit)
+        plan, seconds = timed_plan(sizer, bench)
+        row = row_of(name, target, plan, sizer, limit, seconds)
     except InputError as error:
-        row = f"| {name} | {100 * target:g}% | none | | | | | {error} |"
+        row = f"| {name} | {100 * target:g}% | none | | | | | | | {error} |"
     print(row, flush=True)
     return row
 

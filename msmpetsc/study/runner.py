@@ -37,11 +37,15 @@ class CaseResult:
 
 @dataclass
 class Bench:
-    """Runs cases in a folder: results come and go in it, references stay."""
+    """Runs cases in a folder: results come and go in it, references stay.
+
+    warm : spare each the start of the program; so it is of points of maps, of which no time is asked
+    """
 
     folder: Path
     processes: Processes
     study: str = ""
+    warm: bool = False
     _locks: dict[str, Lock] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -84,8 +88,8 @@ class Bench:
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
         figures, log = path.with_suffix(".json"), path.with_suffix(".log")
-        # no time is asked of a point of a map
-        return self.processes.run(command(case, path, figures), log, case.timeout, warm=case.point is not None)
+        warm = self.warm or case.point is not None
+        return self.processes.run(command(case, path, figures), log, case.timeout, warm)
 
     def _figures(self, case: Case, path: Path, ended: Ended) -> tuple[Row, str]:
         """Return the figures of a run, as far as it came; and what is missing, in words."""

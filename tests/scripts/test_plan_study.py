@@ -57,3 +57,10 @@ def test_a_finer_run_takes_the_cheaper_way():
     assert implicit == Candidate("bdf2", 0.005, "newton", 1e-3) and more == pytest.approx(0.5 * 2 * 8 * 4)
     sizer.trials = [trial("verlet", 0.001, 1000.0, 1.0)]  # a trial of the step's error alone
     assert [method.integrator for _, method in plan_study.finer_methods(sizer, choice, 8000)] == ["bdf2"]
+
+
+def test_the_finer_run_of_a_static_choice_is_static():
+    choice = Choice(Candidate("static", 1.0, "newton", "", 1e-1), 100, NOTHING, 2.0, NOTHING)
+    sizer = SimpleNamespace(trials=[trial("static", 1.0, 1000.0, 1.0)], step=1.0, duration=1.0)
+    ((seconds, method),) = plan_study.finer_methods(sizer, choice, 3200)
+    assert method == replace(choice.method, step_error=1e-3) and seconds == pytest.approx(2 * 32)

@@ -297,6 +297,22 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
     plan, *_ = sized(tmp_path, monkeypatch, 0.1)
     assert plan.met and 300 < plan.choice.cells < 330
     assert plan.choice.budget.total == pytest.approx(plan.choice.cells**-0.5, rel=0.2)
+    (said,) = plan.bounds
+    assert said.startswith("the fewest cells: 5.") and "nothing was found between" in said
+
+
+def test_a_plan_says_when_even_one_cell_is_better_than_asked(tmp_path: Path, monkeypatch):
+    """As where a body flies as a whole."""
+    plan, *_ = sized(tmp_path, monkeypatch, 0.1, cell_error=0.03)
+    assert plan.met and plan.choice.cells == 1
+    assert plan.bounds[0].endswith("is less than was asked for; no lattice of fewer can be run")
+
+
+def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path, monkeypatch):
+    """Errors of 0.1, 0.07 and 0.025 show no order, so the last is taken as 0.046, until a finer one is asked."""
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=2.0, most=0.1)
+    assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
+    assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.75 * 0.1
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
@@ -413,24 +429,45 @@ def test_a_scene_with_a_cell_size_needs_a_number_of_cells(tmp_path: Path):
         )  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_true_error_of_a_plan_is_what_was_asked_for(tmp_path: Path):
-    """A soft beam, against a run of 32 times the cells in explicit substeps, whose own error is little."""
+def true_error(scene: Path, *, choice: list[str], finer: list[str], until: float = math.inf) -> float:
+    """Return the error of what a plan wrote, against a run of 32 times the cells; each with changes of its own."""
+    fine = [f"cages.count={32 * load_scene(scene).cages.count}", *finer]
+    results = [scene.with_name("choice.h5"), scene.with_name("finer.h5")]
+    for result, changes in zip(results, (choice, fine), strict=True):
+        own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
+        command = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(result), *own]
+        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
+    return surface_error(*results, until=until)
+
+
+@pytest.fixture
+def soft_beam(tmp_path: Path) -> Path:
     for name in ("beam_soft.toml", "beam.obj"):
         shutil.copy(ROOT / "scenes" / "studies" / name, tmp_path)
-    scene = str(tmp_path / "beam_soft.toml")
+    return tmp_path / "beam_soft.toml"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
+    """A soft beam, against a run in explicit substeps, whose own error is little."""
     words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
-    assert main(["plan", scene, *words]) == 0
-    time, cells = load_scene(Path(scene)).time, load_scene(Path(scene)).cages.count
-    every = max(1, round(1 / 60 / time.step))
-    fine = ["time={step = 0.016666666666666666, duration = 0.5, integrator = 'verlet'}", f"cages.count={32 * cells}"]
-    results = [tmp_path / "plan.h5", tmp_path / "fine.h5"]
-    for result, changes in zip(results, ([f"output.every={every}"], fine), strict=True):
-        own = [word for change in ("output.surface=true", *changes) for word in ("--set", change)]
-        command = [sys.executable, "-m", "msmpetsc", "run", scene, "-o", str(result), *own]
-        subprocess.run(command, env=ENVIRONMENT, check=True, timeout=300, capture_output=True)
-    assert 0.6 * 0.1 < surface_error(*results, until=20 / 60) < 1.1 * 0.1  # of the frames that were tried
+    assert main(["plan", str(soft_beam), *words]) == 0
+    every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
+    fine = ["time={step = 0.016666666666666666, duration = 0.5, integrator = 'verlet'}"]
+    error = true_error(soft_beam, choice=[f"output.every={every}"], finer=fine, until=20 / 60)  # frames that were tried
+    assert 0.6 * 0.1 < error < 1.1 * 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Path):
+    """The soft beam where it comes to rest under its weight, to twice as little."""
+    text = soft_beam.read_text()
+    time = text[text.index("[time]") : text.index("[gravity]")]
+    soft_beam.write_text(text.replace(time, f"[time]\n{STATIC}\n\n"))
+    assert main(["plan", str(soft_beam), "--surface-error", "0.05", "--cells", "1000", "--write"]) == 0
+    assert 0.6 * 0.05 < true_error(soft_beam, choice=[], finer=[]) < 1.1 * 0.05
 
 
 PLAN = SizePlan(

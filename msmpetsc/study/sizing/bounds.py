@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from msmpetsc.errors import InputError
-from msmpetsc.study.sizing.choice import Model
+from msmpetsc.study.sizing.choice import Choice, Model
 
 
 def size_bounds(model: Model, target: float, step_known: bool) -> list[str]:
@@ -21,6 +21,17 @@ def size_bounds(model: Model, target: float, step_known: bool) -> list[str]:
             f"would take {wanted:.2g}"
         )
     return bounds
+
+
+def fewest_bound(choice: Choice, coarser: Sequence[tuple[int, float]]) -> list[str]:
+    """Return why a choice of so small an error has no fewer cells.
+
+    coarser : cells and error of the finest lattice that is too coarse, if there is one
+    """
+    why = "no lattice of fewer can be run"
+    for cells, error in coarser:
+        why = f"{cells} cells have {error:.1e}, nothing was found between"
+    return [f"the fewest cells: {choice.budget.total:.1e} is less than was asked for; {why}"]
 
 
 def inverted_bound(inverted: float, cells: float, law: str) -> list[str]:

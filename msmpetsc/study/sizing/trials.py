@@ -15,7 +15,7 @@ from msmpetsc.study.distances import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
 from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried
-from msmpetsc.study.sizing.bounds import inverted_bound, size_bounds, time_bound
+from msmpetsc.study.sizing.bounds import fewest_bound, inverted_bound, size_bounds, time_bound
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
@@ -35,6 +35,7 @@ LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
 CHOICES = 6  # that are tried
 NARROW = 1.05  # times the cells: between cells so alike none are tried
+VAGUE = 1 / 3  # of the error asked for: the most that the finest lattice may have by an order that was not seen
 AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
@@ -94,12 +95,13 @@ class Sizer:
         model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
         wanted = model.cheapest(AIM * self.target)
         like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
-        blind = wanted is None and not law.seen
+        # an order that is only assumed makes the finest lattice's error too great, and with it each that is measured
+        blind = not law.seen and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
         if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))
         plan, model = self._checked(model, lattices)
-        return replace(plan, bounds=self._bounds(plan, model, lattices), tried=self._tried(model))
+        return replace(plan, bounds=[*plan.bounds, *self._bounds(plan, model, lattices)], tried=self._tried(model))
 
     # Time
 
@@ -277,7 +279,10 @@ class Sizer:
                 break
             self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
             model = replace(model, law=law.through(*coarse, *fine))
-        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
+        bounds = []
+        if met is not None and met.budget.total < ENOUGH * self.target and (coarse or model.least > model.most):
+            bounds = fewest_bound(met, [(round(edge**-3), error) for edge, error in coarse])
+        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None, bounds), model
 
     def _without(self, choice: Choice, model: Model, fewest: int) -> Model:
         """Return a model without the cells of what fails, where they are fewer than were tried, or its way to step."""

@@ -185,3 +185,13 @@ def test_the_study_files_are_some(tmp_path: Path):
         path.write_text(text)
         study = load_study(path, PRESETS)
         assert study.sweep or study.map
+
+
+def test_the_tests_of_cases_are_there():
+    """Those that its table names, of which it gives how they begin or all but `test_`."""
+    named = re.findall(r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M)
+    assert len(named) > 30
+    for file, names in named:
+        text = (ROOT / file).read_text()
+        for name in re.findall(r"(?:^|, )(\w+)", names):
+            assert re.search(rf"def test_{name}", text), f"{file}: {name}"

@@ -199,3 +199,13 @@ def options_of_run() -> str:
 
 def test_the_table_of_options_is_that_of_the_request():
     assert options_of_run() in (ROOT / "msmpetsc" / "README.md").read_text(), options_of_run()
+
+
+def test_the_tests_of_cases_are_there():
+    """Those that its table names, of which it gives how they begin or all but `test_`."""
+    named = re.findall(r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M)
+    assert len(named) > 30
+    for file, names in named:
+        text = (ROOT / file).read_text()
+        for name in re.findall(r"(?:^|, )(\w+)", names):
+            assert re.search(rf"def test_{name}", text), f"{file}: {name}"

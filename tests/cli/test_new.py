@@ -141,6 +141,12 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     hole.export("open.ply")
     assert main(["new", "open.toml", "--mesh", "open.ply"]) == 0
     assert "warning: open.ply: the mesh is open (4 boundary edges)" in capsys.readouterr().err
+    cubes = [trimesh.creation.box(bounds=[[at, at, 0], [at + 0.1, at + 0.1, 0.1]]) for at in (0, 0.1)]
+    joined = trimesh.util.concatenate(cubes)
+    joined.merge_vertices()
+    joined.export("edge.ply")
+    assert main(["new", "edge.toml", "--mesh", "edge.ply"]) == 0
+    assert "warning: edge.ply: 1 edges have more than two triangles" in capsys.readouterr().err
 
 
 def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Path, monkeypatch, capsys):

@@ -309,7 +309,11 @@ def test_energy_from_nowhere_is_told_once_with_its_frame(tmp_path: Path, caplog:
     had = frames[0].kinetic
     assert float(re.search(r"of ([\d.e+]+) J", first)[1]) == pytest.approx(had, rel=0.05)
     assert "% of all energy" in first and first.startswith("frame 2") and "frames there was energy from nowhere" in last
+    assert 'try response = "reflect"' in first
     caplog.clear()
+    reflecting = scene | {"obstacle": [floor | {"response": "reflect"}]}
+    play(ball(tmp_path, time={"step": 0.001, "duration": 0.03}, **reflecting))
+    assert not told(caplog, "nowhere")
     play(ball(tmp_path, time={"step": 0.0001, "duration": 0.03}, **scene))
     assert not told(caplog, "nowhere")
 

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS, write_ball
 from conftest import ROOT
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing import legend, moments, overlays, sheet, stage, subject
 from msmpetsc.output.drawing.camera import YAW, camera_facing
+from msmpetsc.output.drawing.shots import Style
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Region
@@ -342,6 +343,20 @@ def test_many_panels_stand_in_rows_and_each_is_shown(drawing, tmp_path):
         np.testing.assert_array_equal(other, first)
     assert (each[19] == 255).all()
     assert body_rows(each[1])[0] > body_rows(each[0])[0] > 0
+
+
+def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
+    """Captions and the lengths of axes too, which VTK wrote in its own."""
+    written, draw = {}, ImageDraw.ImageDraw.text
+
+    def recorded(self, at, text, fill=None, font=None, **options):
+        written[text] = font.getname()[0]
+        draw(self, at, text, fill, font, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
+    sheet.contact_sheet(result, tmp_path / "x.png", frames=[0], style=Style(axes=True, colour="displacement"))
+    assert set(written.values()) == {"DejaVu Sans"}
+    assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
 def test_a_picture_too_high_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):

@@ -55,7 +55,7 @@ class Setting:
 
 
 STUDIES = {
-    "armadillo_forehead": Setting("armadillo_forehead.toml", (4, 2, 2), (1000, 4000, 8000)),
+    "armadillo_forehead": Setting("armadillo_forehead.toml", (2, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": Setting("armadillo_leg.toml", (4, 2, 2), (1000, 4000, 8000)),
     "armadillo_palm": Setting("armadillo_palm.toml", (4, 2, 2), (1000, 4000, 8000)),
     "dragon_raise_push": Setting("dragon_raise_push.toml", (4, 2, 2), (1000, 8000, 16000)),

@@ -97,7 +97,7 @@ class Sizer:
         wanted = model.cheapest(AIM * self.target)
         like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
         # such an order makes the error of the finest lattice, which is part of all that are measured
-        vague = not law.seen or _apart(*lattices[:2]) > FAR
+        vague = not law.seen or _apart(lattices[0], lattices[1]) > FAR
         blind = vague and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
         if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order

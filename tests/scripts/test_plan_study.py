@@ -41,9 +41,9 @@ def trial(integrator: str, step: float, cells: float, cost: float) -> SimpleName
     return SimpleNamespace(method=Candidate(integrator, step), cells=cells, cost=cost)
 
 
-@pytest.mark.parametrize(("cells", "finer"), [(100, 800), (125, 1250)])
-def test_no_trial_of_the_plan_is_a_finer_run(cells: int, finer: int):
-    sizer = SimpleNamespace(trials=[trial("verlet", 0.01, 1010.0, 1.0)])
+@pytest.mark.parametrize(("cells", "finer"), [(100, 1250), (400, 3200)])
+def test_the_finer_run_has_more_cells_than_any_trial_of_the_plan(cells: int, finer: int):
+    sizer = SimpleNamespace(trials=[trial("verlet", 0.01, 1000.0, 1.0)])
     choice = Choice(Candidate("verlet", 0.01), cells, NOTHING, 1.0, NOTHING)
     assert plan_study.finer_cells(sizer, choice, 8) == finer
 

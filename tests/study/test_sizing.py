@@ -333,6 +333,14 @@ def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path
     assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.75 * 0.1
 
 
+def test_a_coarsest_lattice_far_off_makes_no_steep_order(tmp_path: Path, monkeypatch):
+    """It is 100% off: as if the error fell so fast that of 6,400 cells next to nothing were left."""
+    formula = Bodies.error_of
+    monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: formula(self, case, cells) + (cells == 100))
+    plan, bench, _ = sized(tmp_path, monkeypatch, 0.057, cell_error=3.0)
+    assert plan.met and 0.75 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) / 0.057 < 1.05
+
+
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
     """Verlet runs away on the cells that are chosen, though not on those tried before: BDF2 it is, and that is said."""
     first, *_ = sized(tmp_path, monkeypatch, 0.1)

@@ -35,7 +35,7 @@ LOOSE = (1e-1, 1e-2)  # step errors that are tried beside that of the trials
 TIME, LONG_TIME = 150.0, 900.0  # [s] a trial on a coarse lattice, or on a fine one, may take
 CHOICES = 6  # that are tried
 NARROW = 1.05  # times the cells: between cells so alike none are tried
-VAGUE = 1 / 3  # of the error asked for: the most that the finest lattice may have by an order that was not seen
+VAGUE = 1 / 3  # of the error asked for: the most that the finest lattice may have by an order that is not sure
 AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
@@ -95,8 +95,9 @@ class Sizer:
         model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
         wanted = model.cheapest(AIM * self.target)
         like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
-        # an order that is only assumed makes the finest lattice's error too great, and with it each that is measured
-        blind = not law.seen and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
+        # such an order makes the error of the finest lattice, which is part of all that are measured
+        vague = not law.seen or _apart(lattices[0], lattices[1]) > FAR
+        blind = vague and (wanted is None or law.error(lattices[-1].edge) > VAGUE * self.target)
         if (like or blind) and (finer := self._run(method, self._coarser(-0.5))):
             lattices = [*lattices[-2:], finer]  # from which the choice can be told, and the order
             model = replace(model, law=self._law(lattices))

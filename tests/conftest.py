@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from forked import run_forked
 
 ROOT = Path(__file__).parent.parent
 WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
@@ -33,7 +34,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def run(ranks: int, *arguments: object, timeout: float = 120) -> subprocess.CompletedProcess:
-    """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out."""
+    """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out.
+
+    The program itself on one rank is forked.
+    """
+    if ranks == 1 and arguments[:2] == ("-m", "msmpetsc.cli.main"):
+        return run_forked([*map(str, arguments[2:])], ENVIRONMENT, timeout)
     launcher = ["mpiexec", "--oversubscribe", "-n", str(ranks)]
     command = [*launcher, sys.executable, *map(str, arguments)]
     return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)

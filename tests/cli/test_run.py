@@ -20,7 +20,7 @@ def folder(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("runs")
 
 
-def run_bunny(msmpetsc, path: Path, ranks: int, *options: str) -> h5py.File:
+def run_bunny(msmpetsc, path: Path, ranks: int, *options: object) -> h5py.File:
     done = msmpetsc(ranks, "run", SCENES / "bunny_fall.toml", "-o", path, *SMALL, *options, timeout=200)
     assert done.returncode == 0, done.stderr
     return h5py.File(path)

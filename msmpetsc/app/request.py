@@ -163,7 +163,9 @@ class RunRequest:
         """Changes of the scene, as ``--set`` takes them."""
         given = {"solver.preset": self.preset, "solver.error": self.error}
         method = overrides_of({key: value for key, value in given.items() if value is not None})
-        return [*method, *(overrides_of(self.set) if isinstance(self.set, Mapping) else self.set)]
+        if isinstance(self.set, Mapping):
+            return [*method, *overrides_of(self.set)]
+        return [*method, *([self.set] if isinstance(self.set, str) else self.set)]
 
     @property
     def command(self) -> str:

@@ -1,15 +1,10 @@
-"""Progress of a study: a bar on a terminal, lines in a log, both with the time that is left."""
+"""Progress of a study: a line for each case that is done, with the time that is left."""
 
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
 from time import monotonic
 from typing import TextIO
 
-from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
-
-from msmpetsc.comm import log
 from msmpetsc.output.progress import duration
 from msmpetsc.study.table import Row
 
@@ -26,31 +21,14 @@ class StudyProgress:
         self._left, self._spent = sum(work), 0.0
         self._stream = stream or sys.stderr
         self._begun = monotonic()
-        self._bar: tqdm | None = None
-        self._redirected = ExitStack()  # log lines, above the bar
-        if self._stream.isatty():
-            self._bar = tqdm(total=self._total, initial=done, unit="case", file=self._stream, dynamic_ncols=True)
-            self._redirected.enter_context(logging_redirect_tqdm([log]))
-        elif done:
+        if done:
             self._print(f"{done} of {self._total} cases are done already")
 
     def update(self, row: Row, work: float) -> None:
         """Show a case that is done."""
         self._done, self._left, self._spent = self._done + 1, self._left - work, self._spent + work
         left = duration((monotonic() - self._begun) * self._left / self._spent)
-        if self._bar is None:
-            self._print(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
-            return
-        if row["status"] != "ok" and not row.get("map"):
-            self._bar.write(f"{described(row)}: {row['reason']}", file=self._stream)
-        self._bar.set_postfix_str(f"{left} left, {described(row)}", refresh=False)
-        self._bar.update()
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        self._redirected.close()
-        if self._bar is not None:
-            self._bar.close()
+        self._print(f"case {self._done}/{self._total}  {described(row)}  {_outcome(row)}  {left} left")
 
     def _print(self, line: str) -> None:
         print(line, file=self._stream, flush=True)

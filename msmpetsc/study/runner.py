@@ -249,7 +249,6 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
                 results.add(result)
                 progress.update(result.row, work[result.row["case"]])
     finally:
-        progress.close()
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()
 

@@ -184,25 +184,11 @@ def test_our_options_and_petscs_stand_in_any_order(given: str, ours: str, petsc:
 
 # What it refuses
 
-REFUSED_OPTIONS = {
-    "-ksp_tpye cg": ("-ksp_tpye", "'ksp_type'"),
-    "-pc_typ jacobi": ("-pc_typ", "'pc_type'"),
-    "-log_veiw": ("-log_veiw",),
-    "-ksp_type nonsense": ("KSP type nonsense",),
-    "-pc_type nonsense": ("PC type nonsense",),
-    "-mat_type nonsense": ("Mat type", "nonsense"),
-    "-ksp_rtol abc": ("abc has no numeric value",),
-    "--presett anderson": ("--presett", "'--preset'"),
-}
 
-
-@pytest.mark.parametrize(
-    ("ranks", "options"),
-    [*((1, options) for options in REFUSED_OPTIONS), *((2, options) for options in list(REFUSED_OPTIONS)[::3])],
-)
-def test_options_that_cannot_be_meant_are_refused_before_the_first_frame(scene: Path, tmp_path: Path, ranks, options):
-    done = on(ranks, scene, "-o", tmp_path / "o.h5", *options.split())
-    assert_one_line(done, 2, *REFUSED_OPTIONS[options])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_an_option_that_petsc_does_not_know_is_refused_before_the_first_frame(scene: Path, tmp_path: Path, ranks: int):
+    done = on(ranks, scene, "-o", tmp_path / "o.h5", "-log_veiw")
+    assert_one_line(done, 2, "-log_veiw")
     assert "frame 0" not in done.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -256,7 +242,17 @@ BAD = {  # what is wrong: arguments after the scene, and what the one line must 
     "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "held"]),
     "disk too small": (sets("time.duration=9e6"), ["GB"]),
     "two scenes": (["another.toml"], ["unknown argument another.toml"]),
+    "option of another letter": (["-ksp_tpye", "cg"], ["-ksp_tpye", "'ksp_type'"]),
+    "option without its end": (["-pc_typ", "jacobi"], ["-pc_typ", "'pc_type'"]),
+    "no such KSP": (["-ksp_type", "nonsense"], ["KSP type nonsense"]),
+    "no such PC": (["-pc_type", "nonsense"], ["PC type nonsense"]),
+    "no such Mat": (["-mat_type", "nonsense"], ["Mat type", "nonsense"]),
+    "tolerance not a number": (["-ksp_rtol", "abc"], ["abc has no numeric value"]),
+    "option of ours misspelt": (["--presett", "anderson"], ["--presett", "'--preset'"]),
+    "scene missing": ([], ["gone.toml", "no such scene"]),
+    "scene broken": ([], ["broken.toml", "is not TOML"]),
 }
+SCENES = {"scene missing": "gone.toml", "scene broken": "broken.toml"}  # the others have scene.toml
 REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2])]
 
 
@@ -267,7 +263,9 @@ def refusals(folder: Path) -> dict:
     for ranks in (1, 2):
         names = [name for number, name in REFUSALS if number == ranks]
         out = folder / f"refused{ranks}" / "o.h5"
-        commands = [["run", str(folder / "scene.toml"), "-o", str(out), *BAD[name][0]] for name in names]
+        commands = [
+            ["run", str(folder / SCENES.get(name, "scene.toml")), "-o", str(out), *BAD[name][0]] for name in names
+        ]
         done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=120)
         assert done.returncode == 0, done.stderr
         assert done.stderr.strip() == "", "not even the C libraries speak"
@@ -288,13 +286,6 @@ def test_bad_input_is_one_line_from_one_rank(refusals: dict, ranks: int, name: s
 def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
     left = [path.name for ranks in (1, 2) for path in (folder / f"refused{ranks}").glob("*")]
     assert left == []
-
-
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize(("name", "words"), [("gone.toml", "no such scene"), ("broken.toml", "is not TOML")])
-def test_a_scene_that_is_not_there_or_not_one(folder: Path, tmp_path: Path, ranks: int, name: str, words: str):
-    assert_one_line(on(ranks, folder / name, "-o", tmp_path / "o.h5"), 2, name, words)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

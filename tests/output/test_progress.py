@@ -10,7 +10,6 @@ from msmpetsc.comm import log
 from msmpetsc.model.fields import Frame
 from msmpetsc.output import progress
 from msmpetsc.output.progress import Progress
-from msmpetsc.study.progress import StudyProgress
 
 
 def frame(index: int) -> Frame:
@@ -91,13 +90,12 @@ def test_other_ranks_are_silent(kind):
     assert stream.getvalue() == ""
 
 
-@pytest.mark.parametrize("shown", [lambda: Progress(10), lambda: StudyProgress([1.0] * 10)], ids=["run", "study"])
-def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch, shown):
+def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     handlers = [logging.StreamHandler(terminal)]
     monkeypatch.setattr(log, "handlers", handlers)
-    bar = shown()
+    bar = Progress(10)
     log.warning("a cell is inside out")
     bar.close()
     log.warning("afterwards")

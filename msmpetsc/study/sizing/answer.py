@@ -1,10 +1,13 @@
-"""What a plan of a surface error tells: its trials and its answer."""
+"""What a plan of a surface error tells: its trials, its answer, and what keeps the error from being smaller."""
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from msmpetsc.study.sizing.choice import Candidate, Choice
+from msmpetsc.errors import InputError
+from msmpetsc.study.sizing.choice import Candidate, Choice, Model
 
 
 @dataclass(frozen=True)
@@ -54,3 +57,60 @@ class SizePlan:
     met: bool
     bounds: list[str] = field(default_factory=list)
     tried: list[Tried] = field(default_factory=list)
+
+
+def size_bounds(model: Model, target: float, step_known: bool) -> list[str]:
+    """Return what an error out of reach is made of: more than half of it by the step, or by the cells.
+
+    step_known : whether what is wrong with the step is said already
+    """
+    bounds, best, wanted = [], model.best().budget, model.cells_for(target / 2)
+    if best.time > target / 2 and not step_known:
+        bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
+    if best.cells > target / 2:
+        bounds.append(
+            f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; half the error asked for "
+            f"would take {wanted:.2g}"
+        )
+    return bounds
+
+
+def fewest_bound(choice: Choice, coarser: Sequence[tuple[int, float]]) -> list[str]:
+    """Return why a choice of so small an error has no fewer cells.
+
+    coarser : cells and error of the finest lattice that is too coarse, if there is one
+    """
+    why = "no lattice of fewer can be run"
+    for cells, error in coarser:
+        why = f"{cells} cells have {error:.1e}, nothing was found between"
+    return [f"the fewest cells: {choice.budget.total:.1e} is less than was asked for; {why}"]
+
+
+def inverted_bound(inverted: float, cells: float, law: str) -> list[str]:
+    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge.
+
+    law : of the material
+    """
+    if not inverted:
+        return []
+    helps = "" if law == "stiffening" else ' or material.law = "stiffening"'
+    return [
+        f"the motion: of {cells:.0f} cells {inverted:.0f} end inside out, each lattice in its own way; fewer --frames"
+        f"{helps} may help"
+    ]
+
+
+def time_bound(model: Model, target: float, times: Sequence[float], apart: Callable[[float], float]) -> list[str]:
+    """Return until when an error out of reach would be within it; nothing if it is so at none of the times [s].
+
+    apart : distance of the finest two lattices up to a time; the error of the cells is taken to go with it
+    """
+    best, whole = model.best().budget, apart(math.inf)
+    for time in sorted(times, reverse=True):
+        try:
+            error = best.cells * apart(time) / whole + best.time + best.step
+        except InputError:  # nothing moves so early
+            break
+        if error <= target:
+            return [f"the motion: {error:.1e} would be left if it ended at {time:.3g} s: fewer --frames"]
+    return []

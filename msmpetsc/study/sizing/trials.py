@@ -14,8 +14,15 @@ from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
 from msmpetsc.study.distances import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
-from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried
-from msmpetsc.study.sizing.bounds import fewest_bound, inverted_bound, size_bounds, time_bound
+from msmpetsc.study.sizing.answer import (
+    SizePlan,
+    SizeTrial,
+    Tried,
+    fewest_bound,
+    inverted_bound,
+    size_bounds,
+    time_bound,
+)
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, Model, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 

@@ -8,7 +8,7 @@ from msmpetsc.errors import InputError, printable
 
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
-SCENE_NAMES = (".toml",)
+SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
 NO_FOLDERS = (
     *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES,
     ".csv", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"

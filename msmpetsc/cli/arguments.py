@@ -4,11 +4,9 @@ What is imported at the top starts neither MPI nor PETSc, so that ``--help`` ans
 """
 
 import argparse
-import platform
-import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -92,33 +90,11 @@ class Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from msmpetsc.cli.versions import library_versions
+
         libraries = ", ".join(library_versions())
         parser._print_message(f"msmpetsc {msmpetsc.__version__} ({libraries})\n", sys.stdout)
         parser.exit()
-
-
-def library_versions() -> Iterator[str]:
-    """Yield name and version of PETSc, MPI and Python; what cannot be loaded says so."""
-    for name, version in {"PETSc": petsc_version, "MPI": mpi_version}.items():
-        try:
-            yield version()
-        except Exception:  # a library that is missing, or built for another: each in its own way
-            yield f"no {name}"
-    yield f"Python {platform.python_version()}"
-
-
-def petsc_version() -> str:
-    """Return "PETSc 3.22.4"."""
-    from petsc4py import PETSc
-
-    return f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
-
-
-def mpi_version() -> str:
-    """Return "Open MPI v5.0.7", or as much of what the library says of itself."""
-    from mpi4py import MPI
-
-    return re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
 
 
 def command_parser() -> Parser:

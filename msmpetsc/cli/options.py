@@ -44,7 +44,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "check": (
         "msmpetsc check my.toml --update --cells 400 --frames 10",
-        "msmpetsc check my.toml other.toml --ranks 2",
+        "msmpetsc check my.toml other.toml --ranks 2 --junit out/check.xml",
     ),
     "fetch": ("msmpetsc fetch --list", "msmpetsc fetch bunny armadillo"),
     "keys": ("msmpetsc keys", "msmpetsc keys material", "msmpetsc keys pin.region"),
@@ -204,6 +204,7 @@ def add_check(commands: Commands) -> None:
     parser.add_argument("--cells", type=int, metavar="N", help="of --update: cages.count; the scene's if not given")
     parser.add_argument("--frames", type=int, metavar="N", help="of --update: steps, the scene's at the most (20)")
     add_set(parser)
+    parser.add_argument("--junit", type=checked_file, metavar="OUT.xml", help="write what was checked as JUnit XML")
     add_json(parser)
 
 
@@ -356,7 +357,7 @@ def add_doctor(commands: Commands) -> None:
     commands.add_parser(
         "doctor",
         help="say what is installed, and how to get what is not",
-        description="Examine PETSc, MPI, the device, HDF5 and packages. "
+        description="Examine PETSc, MPI, the device, HDF5, the kernels' cache, packages and meshes. "
         "Exit status 1: a run lacks something that it needs.",
     )
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -43,8 +44,11 @@ def test_the_numbers_say_how_they_were_made(numbers: Path):
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_the_same_scene_has_the_same_numbers_on_any_ranks(scene: Path, ranks: int, tmp_path: Path, capfd):
-    assert main(["check", str(scene), "--ranks", str(ranks)]) == 0
+    junit = tmp_path / "out" / "check.xml"
+    assert main(["check", str(scene), "--ranks", str(ranks), "--junit", str(junit)]) == 0
     assert capfd.readouterr().out.endswith(" same\n")
+    (suite,) = ElementTree.parse(junit).getroot()
+    assert suite.get("failures") == "0" and int(suite.get("tests")) == len(suite) > 10
 
 
 def test_what_differs_is_named_and_counted(scene: Path, numbers: Path, tmp_path: Path, capfd):
@@ -53,10 +57,14 @@ def test_what_differs_is_named_and_counted(scene: Path, numbers: Path, tmp_path:
     stored["numbers"]["highest corner"]["value"][2] += 0.5 * allowed(STEPS, "m") * stored["scales"]["m"]
     stored["counts"]["pinned"] += 1
     numbers.write_text(json.dumps(stored))
-    assert main(["check", str(scene), "--json"]) == 1
+    junit = tmp_path / "check.xml"
+    assert main(["check", str(scene), "--json", "--junit", str(junit)]) == 1
     shown = json.loads(capfd.readouterr().out)
     wrong = shown["differences"][str(scene)]
     assert not shown["same"] and [line.partition(":")[0] for line in wrong] == ["elastic", "pinned"]
+    (suite,) = ElementTree.parse(junit).getroot()
+    failed = [case.get("name") for case in suite if case.find("failure") is not None]
+    assert suite.get("failures") == "2" and failed == ["elastic", "pinned"]
 
 
 def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(scene: Path, numbers: Path, capfd):
@@ -79,6 +87,7 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
         "nothing is stored of": ["check", str(other)],
         "are for --update": ["check", str(scene), "--cells", "30"],
         "time.error": ["check", "--update", str(other)],
+        "is named *.xml": ["check", str(scene), "--junit", "x.txt"],
         "--frames must be at least 1": ["check", "--update", str(other), "--frames", "0"],
         "the run failed": ["check", "--update", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
     }

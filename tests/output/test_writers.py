@@ -19,6 +19,7 @@ from conftest import ROOT
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
 from msmpetsc.cli.commands import new
+from msmpetsc.cli.commands.check import Checked, write_junit
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
@@ -86,6 +87,10 @@ def writers(sources: Path) -> dict[str, Writer]:
         ),
         "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
         "x.baseline.json": Writer("study/baselines/baseline.py", lambda path: baseline.write(path, {"counts": {}})),
+        "junit.xml": Writer(
+            "cli/commands/check.py",
+            lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
+        ),
         "planned.toml": Writer(
             "study/scene_lines.py",
             lambda path: put_into(path, Candidate("verlet", 0.02)),

@@ -4,12 +4,15 @@ import argparse
 import json
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from xml.etree import ElementTree
 
-from msmpetsc.app.checks import MEASURE_NAMES, refuse_below_one, refuse_other_format
+from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_below_one, refuse_other_format
 from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
 from msmpetsc.errors import InputError
+from msmpetsc.output.disk import write_whole
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.baselines import baseline
 from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, row
@@ -18,17 +21,36 @@ SAME, DIFFERENT = 0, 1
 STEPS = 20  # of a scene's numbers, if nothing else is asked for
 
 
+@dataclass(frozen=True)
+class Checked:
+    """A scene that was run and held against its numbers.
+
+    lines   : for each count and number what is wrong with it, nothing for what is as stored
+    seconds : that the run took
+    """
+
+    scene: Path
+    lines: Mapping[str, str]
+    seconds: float
+
+    @property
+    def wrong(self) -> list[str]:
+        """What is not as stored, a line each."""
+        return [line for line in self.lines.values() if line]
+
+
 def run(args: argparse.Namespace) -> int:
     """Run each scene, and compare or store its numbers; return the exit status."""
     refuse_ranks("check", RUNS_ITSELF)
     refuse_below_one(ranks=args.ranks, frames=args.frames, cells=args.cells)
+    refuse_other_format("--junit", args.junit, XML_NAMES)
     refuse_other_format("--baseline", args.baseline, MEASURE_NAMES)
     if args.baseline and len(args.scenes) > 1:
         raise InputError("--baseline names the numbers of one scene: of several, each has its own beside it")
     files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
     if args.update:
-        if args.json:
-            raise InputError("--update checks nothing: --json has no place beside it")
+        if args.junit or args.json:
+            raise InputError("--update checks nothing: --junit and --json have no place beside it")
         for scene, file in files.items():
             update(scene, file, args)
         return SAME
@@ -85,20 +107,39 @@ def check(files: Mapping[Path, Path], args: argparse.Namespace) -> int:
     stored = {scene: baseline.read(file) for scene, file in files.items()}
     if not args.json:
         print(HEAD, flush=True)
-    wrong = {str(scene): checked(scene, numbers, args) for scene, numbers in stored.items()}
+    outcomes = [checked(scene, numbers, args) for scene, numbers in stored.items()]
+    wrong = [f"{outcome.scene}: {line}" for outcome in outcomes for line in outcome.wrong]
     if args.json:
-        print(json.dumps({"same": not any(wrong.values()), "differences": wrong}, indent=1))
+        lines = {str(outcome.scene): outcome.wrong for outcome in outcomes}
+        print(json.dumps({"same": not wrong, "differences": lines}, indent=1))
     else:
-        print("".join(f"{scene}: {line}\n" for scene, lines in wrong.items() for line in lines), end="")
-    return DIFFERENT if any(wrong.values()) else SAME
+        print("".join(f"{line}\n" for line in wrong), end="")
+    if args.junit:
+        write_junit(args.junit, outcomes)
+    return DIFFERENT if wrong else SAME
 
 
-def checked(scene: Path, stored: Numbers, args: argparse.Namespace) -> list[str]:
-    """Run a scene as its stored numbers were made, and print its line; return what differs, a line each."""
+def checked(scene: Path, stored: Numbers, args: argparse.Namespace) -> Checked:
+    """Run a scene as its stored numbers were made, and print its line."""
     began = perf_counter()
     numbers = found(scene, Recipe.of(stored), args.ranks)
-    wrong = [line for line in judged(numbers, stored).values() if line]
+    outcome = Checked(scene, judged(numbers, stored), perf_counter() - began)
     if not args.json:
-        limit, seconds = nearest_to_limit(numbers, stored), perf_counter() - began
-        print(row(scene.stem, numbers["counts"], limit, seconds, "DIFFERS" if wrong else "same"), flush=True)
-    return wrong
+        verdict = "DIFFERS" if outcome.wrong else "same"
+        limit = nearest_to_limit(numbers, stored)
+        print(row(scene.stem, numbers["counts"], limit, outcome.seconds, verdict), flush=True)
+    return outcome
+
+
+def write_junit(path: Path, outcomes: list[Checked]) -> None:
+    """Write a suite for each scene, a case for each number, as continuous integration reads. Raises InputError."""
+    root = ElementTree.Element("testsuites", name="msmpetsc check")
+    for outcome in outcomes:
+        counts = {"tests": str(len(outcome.lines)), "failures": str(len(outcome.wrong))}
+        suite = ElementTree.SubElement(root, "testsuite", {"name": str(outcome.scene), "errors": "0"} | counts)
+        suite.set("time", f"{outcome.seconds:.3f}")
+        for name, line in outcome.lines.items():
+            case = ElementTree.SubElement(suite, "testcase", classname=outcome.scene.stem, name=name)
+            if line:
+                ElementTree.SubElement(case, "failure", message=line).text = line
+    write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

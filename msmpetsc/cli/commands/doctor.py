@@ -6,7 +6,6 @@ What could end the process, libraries that do not fit together above all, is loa
 import argparse
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from typing import Any
 
 import msmpetsc
 from msmpetsc.cli.ranks import world
+from msmpetsc.cli.versions import PYTHON
 from msmpetsc.errors import EXTRAS, extra_of, one_line
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -34,6 +34,17 @@ DEVICE = """
 import json, cupy
 print(json.dumps([cupy.cuda.runtime.getDeviceProperties(i)["name"].decode()
                   for i in range(cupy.cuda.runtime.getDeviceCount())]))
+"""
+CACHE = """
+import os
+from pathlib import Path
+import msmpetsc
+from msmpetsc.backend.compiling import cache_is_empty
+print("empty" if cache_is_empty() else "filled", os.environ["NUMBA_CACHE_DIR"])
+"""
+MESHES = """
+from msmpetsc.geometry.registry import MODELS, find
+print(*(name for name in MODELS if find(name)))
 """
 IMPORTS = """
 import importlib, json
@@ -64,7 +75,7 @@ def run(_: argparse.Namespace) -> int:
         return 0
     needed = (petsc, ranks, results, packages)
     states = set()
-    for examine in (petsc, ranks, solvers, device, results, packages):
+    for examine in (petsc, ranks, solvers, device, results, kernels, packages, meshes):
         for what, state, words in examined(examine):
             print(f"{state:8} {what:16} {words}", flush=True)
             states |= {state} if examine in needed and what not in OPTIONAL else set()
@@ -183,13 +194,19 @@ def results() -> Iterator[Finding]:
     yield "HDF5", OK, f"{version}, {'with' if parallel == 'True' else 'without'} MPI (either will do)"
 
 
+def kernels() -> Iterator[Finding]:
+    """The cache of compiled kernels."""
+    state, folder = said(CACHE).strip().split(" ", 1)
+    nearest = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
+    if not os.access(nearest, os.W_OK):
+        yield "kernels", MISSING, f"{nearest} cannot be written, each run compiles anew: export NUMBA_CACHE_DIR=FOLDER"
+    else:
+        yield "kernels", OK, "compiled" if state == "filled" else "not yet compiled: the first run takes a minute more"
+
+
 def packages() -> Iterator[Finding]:
     """The packages of each extra: missing, or there but broken, so that they cannot be imported."""
-    yield (
-        "msmpetsc",
-        OK,
-        f"{msmpetsc.__version__} in {Path(msmpetsc.__file__).parent}, Python {platform.python_version()}",
-    )
+    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {Path(msmpetsc.__file__).parent}, {PYTHON}"
     found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
     reasons = json.loads(said(IMPORTS.format(names=found)).splitlines()[-1])
     for extra, names in EXTRAS.items():
@@ -200,3 +217,12 @@ def packages() -> Iterator[Finding]:
             yield f"extra {extra}", MISSING, f"{', '.join(gone)}: pip install 'msmpetsc[{extra}]'"
         elif not gone:
             yield f"extra {extra}", OK, ", ".join(names)
+
+
+def meshes() -> Iterator[Finding]:
+    """Models of the registry that lie on this machine."""
+    names = said(MESHES).split()
+    if names:
+        yield "meshes", OK, f"{len(names)} named models: {', '.join(names)}"
+    else:
+        yield "meshes", MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list"

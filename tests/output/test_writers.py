@@ -23,9 +23,9 @@ from msmpetsc.errors import InputError
 from msmpetsc.output.compress import pack
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
+from msmpetsc.output.drawing.playback import Style
 from msmpetsc.output.drawing.sheet import contact_sheet
-from msmpetsc.output.drawing.shots import Style
-from msmpetsc.output.drawing.subject import subject_of_result
+from msmpetsc.output.drawing.subject import drawable_of_result
 from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
@@ -69,7 +69,7 @@ def film(path: Path) -> None:
 
 def page(result: Path, path: Path) -> None:
     with Result(result) as run:
-        write_page(subject_of_result(run), path, [0, 1], Style(), None)
+        write_page(drawable_of_result(run), path, [0, 1], Style(), None)
 
 
 def chart(path: Path) -> None:
@@ -184,7 +184,7 @@ ALLOWED = {
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
     "cli/running/profile.py": "asks before a run whether it could write",
-    "output/drawing/stage.py": "/dev/null",
+    "output/drawing/renderer.py": "/dev/null",
 }
 
 

@@ -23,9 +23,9 @@ from msmpetsc.cli.commands.check import Checked, write_junit
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.film import written
 from msmpetsc.output.drawing.page import write_page
+from msmpetsc.output.drawing.playback import Style
 from msmpetsc.output.drawing.sheet import contact_sheet
-from msmpetsc.output.drawing.shots import Style
-from msmpetsc.output.drawing.subject import subject_of_result
+from msmpetsc.output.drawing.subject import drawable_of_result
 from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
@@ -68,7 +68,7 @@ def film(path: Path) -> None:
 
 def page(result: Path, path: Path) -> None:
     with Result(result) as run:
-        write_page(subject_of_result(run), path, [0, 1], Style(), None)
+        write_page(drawable_of_result(run), path, [0, 1], Style(), None)
 
 
 def chart(path: Path) -> None:

@@ -20,11 +20,11 @@ from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.output.drawing.colouring import opened_reference
-from msmpetsc.output.drawing.fabric import SHOWN
+from msmpetsc.output.drawing.colours import opened_reference
+from msmpetsc.output.drawing.mesh import SHOWN
 from msmpetsc.output.drawing.page import write_page
-from msmpetsc.output.drawing.shots import Style
-from msmpetsc.output.drawing.subject import Subject, subject_of_model, subject_of_result, subject_of_surface
+from msmpetsc.output.drawing.playback import Style
+from msmpetsc.output.drawing.subject import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
 from msmpetsc.output.frame_choice import Frames, frames_of
 from msmpetsc.output.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
@@ -84,7 +84,7 @@ def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
         contact_sheet(args.subject, path, args.frames, args.count, None, style, args.reference)
         return
     with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
-        subject = subject_of_result(run)
+        subject = drawable_of_result(run)
         everything: Frames = [slice(-1, None) if args.turntable else slice(None)]
         numbers = frames_of(subject.name, args.frames or everything, len(subject.times))
         _draw_motion(args, subject, path, numbers, style, reference)
@@ -97,7 +97,7 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
             raise InputError(f"--{option} is for results, and {args.subject} is none")
     if path.suffix.lower() in MOVIE_NAMES and not args.turntable:
         raise InputError(f"{args.subject} has no motion to film: --turntable turns it around")
-    subject, about = subject_of_file(args.subject, args.set)
+    subject, about = drawable_of_file(args.subject, args.set)
     if path.suffix.lower() not in PICTURE_NAMES:
         _draw_motion(args, subject, path, [0], style, None)
         return
@@ -110,39 +110,39 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
 
 
 def _draw_motion(
-    args: argparse.Namespace, subject: Subject, path: Path, frames: list[int], style: Style, reference: Result | None
+    args: argparse.Namespace, subject: Drawable, path: Path, frames: list[int], style: Style, reference: Result | None
 ) -> None:
     """Draw a film or a page of these frames."""
     if path.suffix.lower() in PAGE_NAMES:
         write_page(subject, path, frames, style, reference)
         return
     from msmpetsc.output.drawing.film import TURN, write_film
-    from msmpetsc.output.drawing.pace import Pace, paced
+    from msmpetsc.output.drawing.playback import Playback, playback_of
 
     if args.turntable and len(frames) == 1:
         if args.speed is not None:
             raise InputError("--speed needs --frames, two or more: time stands still on this turntable")
         fps = args.fps or TURN_FPS
-        pace = Pace(np.zeros(round(TURN * fps), int), fps, 0.0)
+        playback = Playback(np.zeros(round(TURN * fps), int), fps, 0.0)
     else:
-        pace = paced(subject.times[frames], args.fps, args.speed)
-    write_film(subject, path, frames, style, pace, float(args.turntable), reference)
+        playback = playback_of(subject.times[frames], args.fps, args.speed)
+    write_film(subject, path, frames, style, playback, float(args.turntable), reference)
 
 
-def subject_of_file(path: Path, changes: list[str]) -> tuple[Subject, tuple[str, str]]:
+def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
     """Return what a scene or a mesh shows, with its size and its cells in words. Raises InputError."""
     if path.suffix.lower() not in SCENE_NAMES:
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")
         surface = read_surface(path)
-        return subject_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
+        return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
     from mpi4py import MPI
 
     from msmpetsc.model.build import build_model  # compiled kernels, which drawing a result needs not
 
     scene = load_scene(path, changes)
     model = build_model(MPI.COMM_SELF, scene)
-    subject = subject_of_model(path, scene, model)
+    subject = drawable_of_model(path, scene, model)
     lattice = model.lattice
     cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
     return subject, (f"{_sides(subject.rest.points)} m", cells)

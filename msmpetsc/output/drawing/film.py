@@ -15,16 +15,13 @@ from PIL import Image
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.output.disk import whole_file
-from msmpetsc.output.drawing.fabric import Fabric, cut_open
-from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
-from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
+from msmpetsc.output.drawing.annotations import CAPTION, Entry, caption_picture, entries_of, legend_picture, scale_bar
+from msmpetsc.output.drawing.mesh import LatticeMesh, cut_open, drawn
 from msmpetsc.output.drawing.overlays import MARGIN
-from msmpetsc.output.drawing.pace import Pace
+from msmpetsc.output.drawing.playback import Extent, Playback, Style, View, extent_of, room_of, views_of
 from msmpetsc.output.drawing.sheet import LABELS
-from msmpetsc.output.drawing.shots import Shot, Style, Survey, room_of, shots_of, survey
-from msmpetsc.output.drawing.skin import drawn
-from msmpetsc.output.drawing.stage import Panel, Stage
-from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.drawing.stage import Panel, Renderer
+from msmpetsc.output.drawing.subject import Drawable
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
 
@@ -35,73 +32,77 @@ QUALITY = 10  # as ffmpeg's -crf counts: 0 without loss, 51 the worst
 
 
 def write_film(
-    subject: Subject, path: Path, frames: Sequence[int], style: Style, pace: Pace, turns: float = 0.0,
+    subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback, turns: float = 0.0,
     reference: Result | None = None,
 ) -> None:  # fmt: skip
-    """Write a film of these frames at a pace; from start to end the eye goes so many times around the body.
+    """Write a film of these frames at a playback; from start to end the eye goes so many times around the body.
 
     Raises InputError where it cannot be drawn or written.
     """
     subject = drawn(subject)
-    played = [frames[number] for number in pace.numbers]
-    seen = survey(subject, played, style, reference)
-    shots = shots_of(subject, played, seen, turns)
-    if pace.speed:
-        log.info("the film lasts %.2g s, %s", pace.seconds, pace.words or "in real time")
-    size = style.size or _fitting(shots, seen, style)
-    with written(path, size, pace.fps) as add:
-        for picture in _pictures(subject, shots, seen, replace(style, size=size), pace.words):
+    played = [frames[number] for number in playback.numbers]
+    seen = extent_of(subject, played, style, reference)
+    views = views_of(subject, played, seen, turns)
+    if playback.speed:
+        log.info("the film lasts %.2g s, %s", playback.seconds, playback.words or "in real time")
+    size = style.size or _fitting(views, seen, style)
+    with written(path, size, playback.fps) as add:
+        for picture in _pictures(subject, views, seen, replace(style, size=size), playback.words):
             add(picture)
 
 
-def _fitting(shots: list[Shot], seen: Survey, style: Style) -> tuple[int, int]:
+def _fitting(views: list[View], seen: Extent, style: Style) -> tuple[int, int]:
     """Return width and height [px], both even, of a film that what is seen fills."""
-    low, high, _ = room_of(shots, seen, LABELS if style.axes else MARGIN)
+    low, high, _ = room_of(views, seen, LABELS if style.axes else MARGIN)
     width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
     return 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
 
 
-def _pictures(subject: Subject, shots: list[Shot], seen: Survey, style: Style, words: str) -> Iterator[np.ndarray]:
-    """Yield the picture (height, width, 3) of each shot; of equal ones in a row the first is drawn only."""
+def _pictures(subject: Drawable, views: list[View], seen: Extent, style: Style, words: str) -> Iterator[np.ndarray]:
+    """Yield the picture (height, width, 3) of each view; of equal ones in a row the first is drawn only."""
     assert style.size
     width, height = style.size
-    low, high, depth = room_of(shots, seen, LABELS if style.axes else MARGIN)
-    entries = entries_of(subject.scene, seen.fixed, [shot.overlays for shot in shots], seen.colouring, style.shown)
+    low, high, depth = room_of(views, seen, LABELS if style.axes else MARGIN)
+    entries = entries_of(subject.scene, seen.fixed, [view.overlays for view in views], seen.colouring, style.shown)
     letters = min(1.0, max(height / USUAL, SMALLEST))
     bar = [Entry("length", "")] if style.scale_bar else []
-    stage_height = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
-    scale = min(width / (high - low)[0], stage_height / (high - low)[1])  # [px/m]
-    if stage_height < height / 4:
+    room = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
+    scale = min(width / (high - low)[0], room / (high - low)[1])  # [px/m]
+    if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     bar = [scale_bar(scale / letters, width / letters / 5)] if style.scale_bar else []
     legend = legend_picture([*entries, *bar], width, letters)
     across, upward = (low + high) / 2
     middle = seen.box.mean(axis=0)
     cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
-    before: Shot | None = None
+    before: View | None = None
     picture = np.empty(0)
-    with Stage(width, stage_height, subject.triangles) as stage:
-        for shot in counted(shots, "pictures"):
-            if before is None or shot.index != before.index or shot.camera is not before.camera:
-                camera = shot.camera
+    with Renderer(width, room, subject.triangles) as renderer:
+        for view in counted(views, "pictures"):
+            if before is None or view.index != before.index or view.camera is not before.camera:
+                camera = view.camera
                 centre = across * camera.right + upward * camera.upward + middle @ camera.to_eye * camera.to_eye
-                stage.face(camera, centre, stage_height / scale, depth)
-                fabric = cut.fabric(subject.nodes(shot.index)) if cut else ()
-                panel = _panel(subject, shot, seen, style, fabric, words)
-                picture = np.concatenate([stage.picture(panel), caption_picture(panel.caption, width, letters), legend])
-            before = shot
+                renderer.face(camera, centre, room / scale, depth)
+                lattice = cut.meshes(subject.nodes(view.index)) if cut else ()
+                panel = _panel(subject, view, seen, style, lattice, words)
+                picture = np.concatenate(
+                    [renderer.picture(panel), caption_picture(panel.caption, width, letters), legend]
+                )
+            before = view
             yield picture
 
 
-def _panel(subject: Subject, shot: Shot, seen: Survey, style: Style, fabric: tuple[Fabric, ...], words: str) -> Panel:
-    """Return the panel of a shot, with its time and how much slower or faster than real it goes, in words."""
+def _panel(
+    subject: Drawable, view: View, seen: Extent, style: Style, lattice: tuple[LatticeMesh, ...], words: str
+) -> Panel:
+    """Return the panel of a view, with its time and how much slower or faster than real it goes, in words."""
     return Panel(
-        points=subject.surface(shot.index),
-        fixed=subject.fixed(shot.index),
-        overlays=shot.overlays,
-        caption=(f"t = {subject.times[shot.index]:.3f} s", words),
-        colours=seen.colouring.rgb(shot.index) if seen.colouring else None,
-        fabric=fabric,
+        points=subject.surface(view.index),
+        fixed=subject.fixed(view.index),
+        overlays=view.overlays,
+        caption=(f"t = {subject.times[view.index]:.3f} s", words),
+        colours=seen.colouring.rgb(view.index) if seen.colouring else None,
+        lattice=lattice,
         axes=seen.box if style.axes else None,
     )
 

@@ -21,14 +21,12 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.output.disk import write_whole
 from msmpetsc.output.drawing import colours
-from msmpetsc.output.drawing.colouring import Colouring
-from msmpetsc.output.drawing.fabric import KINDS, SHRUNK, THROUGH, Cut, cut_open
-from msmpetsc.output.drawing.legend import entries_of
+from msmpetsc.output.drawing.annotations import entries_of
+from msmpetsc.output.drawing.colours import Colouring
+from msmpetsc.output.drawing.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, cut_open, drawn
 from msmpetsc.output.drawing.overlays import Overlays
-from msmpetsc.output.drawing.pace import usual_speed
-from msmpetsc.output.drawing.shots import Shot, Style, Survey, shots_of, survey
-from msmpetsc.output.drawing.skin import HELD, drawn
-from msmpetsc.output.drawing.subject import FARTHEST, Subject
+from msmpetsc.output.drawing.playback import Extent, Style, View, extent_of, usual_speed, views_of
+from msmpetsc.output.drawing.subject import FARTHEST, Drawable
 from msmpetsc.output.gaps import TINY, unit_vectors
 from msmpetsc.output.progress import counted
 from msmpetsc.output.reader import Result
@@ -40,14 +38,14 @@ SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", 
 
 
 def write_page(
-    subject: Subject, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
+    subject: Drawable, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
 ) -> None:
     """Write the page of these frames; of fewer, evenly chosen, where it would be larger than `MOST`.
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
     subject = drawn(subject)
-    seen = survey(subject, frames, style, reference)
+    seen = extent_of(subject, frames, style, reference)
     cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
     chosen, about_lattice = list(frames), None
     while True:
@@ -62,13 +60,13 @@ def write_page(
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
         log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
-    shots = shots_of(subject, chosen, seen)
+    views = views_of(subject, chosen, seen)
     streams["fixed"], numbers = fixed_states(subject, chosen)
-    facts = page_facts(subject, shots, seen, style) | {"fixed": numbers, "lattice": about_lattice}
+    facts = page_facts(subject, views, seen, style) | {"fixed": numbers, "lattice": about_lattice}
     write_whole(path, page_text(subject.title, facts, streams))
 
 
-def packed_frames(subject: Subject, frames: Sequence[int], seen: Survey) -> dict[str, bytes]:
+def packed_frames(subject: Drawable, frames: Sequence[int], seen: Extent) -> dict[str, bytes]:
     """Return positions, colours and triangles as deflated bytes, for the script to read."""
     streams = {
         "positions": deflated(residuals(quantised(subject.surface, frames, seen.box))),
@@ -79,7 +77,7 @@ def packed_frames(subject: Subject, frames: Sequence[int], seen: Survey) -> dict
     return streams
 
 
-def packed_lattice(subject: Subject, frames: Sequence[int], cut: Cut) -> tuple[dict[str, bytes], dict[str, Any]]:
+def packed_lattice(subject: Drawable, frames: Sequence[int], cut: Cut) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Return the nodes of what is left of a lattice, its cells and springs as deflated bytes, and what the script must
     know beside them. Raises InputError where they cannot be drawn."""
     cells = np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
@@ -145,7 +143,7 @@ def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
         before = frame
 
 
-def fixed_states(subject: Subject, frames: Iterable[int]) -> tuple[bytes, list[int]]:
+def fixed_states(subject: Drawable, frames: Iterable[int]) -> tuple[bytes, list[int]]:
     """Return which points are pinned or led (255, or 0), each state once, deflated, and that of each frame."""
     states: dict[bytes, int] = {}
     masks = (np.where(subject.fixed(index) > HELD, 255, 0).astype(np.uint8).tobytes() for index in frames)
@@ -159,18 +157,18 @@ def deflated(parts: Iterable[bytes]) -> bytes:
     return b"".join([*map(packer.compress, parts), packer.flush()])
 
 
-def page_facts(subject: Subject, shots: Sequence[Shot], seen: Survey, style: Style) -> dict[str, Any]:
+def page_facts(subject: Drawable, views: Sequence[View], seen: Extent, style: Style) -> dict[str, Any]:
     """Return what the script must know beside the streams, in types of JSON."""
     camera, colouring = seen.camera, seen.colouring
-    overlays = [shot.overlays for shot in shots]
+    overlays = [view.overlays for view in views]
     bar = entries_of(subject.scene, seen.fixed, overlays, colouring, style.shown)
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
         "box": seen.box.tolist(),
-        "times": [float(subject.times[shot.index]) for shot in shots],
-        "frames": [shot.index for shot in shots],
-        "speed": usual_speed(float(np.ptp(subject.times[[shots[0].index, shots[-1].index]]))),
+        "times": [float(subject.times[view.index]) for view in views],
+        "frames": [view.index for view in views],
+        "speed": usual_speed(float(np.ptp(subject.times[[views[0].index, views[-1].index]]))),
         "camera": {
             "right": camera.right.tolist(),
             "away": camera.away.tolist(),

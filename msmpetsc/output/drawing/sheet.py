@@ -13,17 +13,14 @@ from PIL import Image
 
 from msmpetsc.errors import InputError
 from msmpetsc.output.disk import whole_file
+from msmpetsc.output.drawing.annotations import CAPTION, Entry, caption_picture, entries_of, legend_picture, scale_bar
 from msmpetsc.output.drawing.camera import Camera, camera_facing
-from msmpetsc.output.drawing.colouring import colouring_of, opened_reference, plain_colouring, scaled
-from msmpetsc.output.drawing.fabric import cut_open
-from msmpetsc.output.drawing.legend import Entry, entries_of, legend_picture, scale_bar
-from msmpetsc.output.drawing.lettering import CAPTION, caption_picture
-from msmpetsc.output.drawing.moments import COUNT, choose_moments, moments_at
+from msmpetsc.output.drawing.colours import colouring_of, opened_reference, plain_colouring, scaled
+from msmpetsc.output.drawing.mesh import cut_open, drawn
 from msmpetsc.output.drawing.overlays import MARGIN
-from msmpetsc.output.drawing.shots import Style
-from msmpetsc.output.drawing.skin import drawn
-from msmpetsc.output.drawing.stage import Panel, Stage
-from msmpetsc.output.drawing.subject import FARTHEST, Subject, subject_of_result
+from msmpetsc.output.drawing.playback import Style
+from msmpetsc.output.drawing.stage import Panel, Renderer
+from msmpetsc.output.drawing.subject import FARTHEST, Drawable, drawable_of_result
 from msmpetsc.output.frame_choice import Frames, frames_of
 from msmpetsc.output.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
@@ -62,7 +59,7 @@ def contact_sheet(
     style = style or Style()
     style = style if eye is None else replace(style, eye=eye)
     with plain_damage(Path(h5_path)), Result(h5_path) as run, opened_reference(reference, run) as compared:
-        subject = subject_of_result(run)
+        subject = drawable_of_result(run)
         chosen = _moments(run, subject, frames, count)
         times = subject.times
         moments = [Moment(i, (f"t = {times[i]:.3f} s", text), style.shown) for i, text in chosen.items()]
@@ -71,7 +68,7 @@ def contact_sheet(
 
 
 def draw_moments(
-    subject: Subject, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
+    subject: Drawable, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
 ) -> None:
     """Draw a subject at some moments, side by side."""
     subject = drawn(subject)
@@ -89,15 +86,15 @@ def draw_moments(
         index, shown = moment.index, moment.shown
         overlays = subject.overlays(index, everywhere, camera)
         colours = colouring.rgb(index) if colouring else None
-        fabric = cut_open(subject, camera, shown).fabric(subject.nodes(index)) if shown else ()
-        panels.append(Panel(bodies[index], subject.fixed(index), overlays, moment.caption, colours, fabric, axes))
+        lattice = cut_open(subject, camera, shown).meshes(subject.nodes(index)) if shown else ()
+        panels.append(Panel(bodies[index], subject.fixed(index), overlays, moment.caption, colours, lattice, axes))
     fixed = any(panel.fixed.any() for panel in panels)
     every = tuple({name: None for moment in moments for name in moment.shown})
     entries = entries_of(subject.scene, fixed, [panel.overlays for panel in panels], colouring, every)
     draw(panels, subject.triangles, camera, path, style, entries)
 
 
-def _moments(run: Result, subject: Subject, frames: Frames | None, count: int | None) -> dict[int, str]:
+def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int | None) -> dict[int, str]:
     """Return the frames to draw, each with its reason or ""."""
     total = len(subject.times)
     assert isinstance(subject.scene, SceneFile)
@@ -135,10 +132,10 @@ def draw(
     depth = float(np.linalg.norm(np.ptp(shown, axis=0)))  # nothing reaches farther towards the eye
     middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
     sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
-    with Stage(int(width), int(height), triangles) as stage:
-        stage.face(camera, middle, height / scale, depth)
+    with Renderer(int(width), int(height), triangles) as renderer:
+        renderer.face(camera, middle, height / scale, depth)
         for number, panel in enumerate(panels):
-            captioned = [stage.picture(panel), caption_picture(panel.caption, int(width))]
+            captioned = [renderer.picture(panel), caption_picture(panel.caption, int(width))]
             sheet[number // columns, :, number % columns] = np.concatenate(captioned)
     sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     if style.scale_bar:
@@ -175,3 +172,39 @@ def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]
     below = [ground.below(panel.points) for panel in panels for ground in panel.overlays.grounds]
     inner = camera.flat(np.concatenate([bodies, *below, *sharp]))
     return inner.min(axis=0) - margin, inner.max(axis=0) + margin
+
+
+# The moments, where none are asked for
+
+
+COUNT = 5  # moments, where nothing is said
+
+
+def moments_at(run: Result, times: Sequence[float]) -> dict[int, str]:
+    """Return the start, and the finished frames nearest to these times [s], in order of time."""
+    time = run.frames.time[:]
+    nearest = {0, *(int(np.argmin(abs(time - wanted))) for wanted in times)}
+    return {index: "" if index else "start" for index in sorted(nearest)}
+
+
+def choose_moments(run: Result, count: int) -> dict[int, str]:
+    """Return at most `count` frames that tell the story, in order of time, each with its reason.
+
+    In order of importance: the first and the last; the greatest elastic energy; before it the greatest kinetic
+    energy (a falling body is fastest just before it touches the ground); after it the greatest potential energy
+    (the top of the leap). Where these coincide, the middle of the longest gap between chosen frames is added.
+    """
+    kinetic, elastic, potential = (run.frames[name][:] for name in ("kinetic", "elastic", "potential"))
+    total = len(elastic)
+    most_elastic = int(np.argmax(elastic))
+    fastest = int(np.argmax(kinetic[: most_elastic + 1]))
+    highest = most_elastic + int(np.argmax(potential[most_elastic:]))
+    moments = {0: "start", total - 1: "end"}
+    for index, reason in (most_elastic, "most elastic energy"), (fastest, "fastest"), (highest, "highest"):
+        if len(moments) < count:
+            moments.setdefault(index, reason)
+    while len(moments) < min(count, total):
+        chosen = sorted(moments)
+        widest = int(np.argmax(np.diff(chosen)))
+        moments[(chosen[widest] + chosen[widest + 1]) // 2] = ""
+    return dict(sorted(moments.items())[:count])

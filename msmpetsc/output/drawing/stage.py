@@ -11,6 +11,7 @@ import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 from msmpetsc.errors import InputError
+from msmpetsc.output.drawing.annotations import labelled, rounded
 from msmpetsc.output.drawing.camera import Camera
 from msmpetsc.output.drawing.colours import (
     ARROW,
@@ -23,10 +24,8 @@ from msmpetsc.output.drawing.colours import (
     SHADOW,
     rgb,
 )
-from msmpetsc.output.drawing.fabric import THROUGH, Fabric
-from msmpetsc.output.drawing.lettering import labelled, rounded
+from msmpetsc.output.drawing.mesh import HELD, THROUGH, LatticeMesh
 from msmpetsc.output.drawing.overlays import Ground, Overlays
-from msmpetsc.output.drawing.skin import HELD
 
 GLASS_OPACITY = 0.22
 FADING, AROUND = np.append(0, np.linspace(0.55, 1, 10)), 72  # radii of the rings of a ground, of the last; corners
@@ -40,7 +39,7 @@ class Panel:
     """One moment: surface points (v, 3) [m], how far each is fixed (v,) in [0, 1], and what stands beside them.
 
     colours : (v, 3) of the points where they are not fixed, 0 to 255; those of a plain body if None
-    fabric  : cells and springs
+    lattice  : cells and springs
     axes    : corners (2, 3) of the box that axes are drawn around [m]
     """
 
@@ -49,11 +48,11 @@ class Panel:
     overlays: Overlays
     caption: tuple[str, str]
     colours: np.ndarray | None = None
-    fabric: tuple[Fabric, ...] = ()
+    lattice: tuple[LatticeMesh, ...] = ()
     axes: np.ndarray | None = None
 
 
-class Stage:
+class Renderer:
     """A window off screen in which panels are drawn, one after the other.
 
     Used as a context, which closes it.
@@ -70,7 +69,7 @@ class Stage:
                 self._plotter.add_light(pv.Light(position=position, intensity=intensity, light_type="camera light"))
             self._plotter.enable_anti_aliasing("ssaa")
 
-    def __enter__(self) -> "Stage":
+    def __enter__(self) -> "Renderer":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -127,8 +126,8 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
     for ground in panel.overlays.grounds:
         _draw_ground(plotter, ground, panel.points, triangles)
     _draw_body(plotter, panel, triangles)
-    for fabric in panel.fabric:
-        _draw_fabric(plotter, fabric)
+    for lattice in panel.lattice:
+        _draw_lattice(plotter, lattice)
     for corners in panel.overlays.glass:
         _draw_glass(plotter, corners)
     for ball in panel.overlays.balls:
@@ -149,7 +148,7 @@ def _draw_panel(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray, front:
 def _draw_body(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray) -> None:
     fixed = (panel.fixed > HELD)[triangles].all(axis=1)
     shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08)
-    if panel.fabric:
+    if panel.lattice:
         shading |= dict(opacity=THROUGH)
     free: dict[str, Any] = dict(color=BODY)
     if panel.colours is not None:
@@ -159,13 +158,13 @@ def _draw_body(plotter: pv.Plotter, panel: Panel, triangles: np.ndarray) -> None
             plotter.add_mesh(pv.PolyData.from_regular_faces(panel.points, faces), **look, **shading)
 
 
-def _draw_fabric(plotter: pv.Plotter, fabric: Fabric) -> None:
-    if fabric.joined.shape[1] == 2:
-        lines = pv.PolyData(fabric.points, lines=np.insert(fabric.joined, 0, 2, axis=1).ravel())
-        plotter.add_mesh(lines, color=fabric.colour, line_width=1, lighting=False)
+def _draw_lattice(plotter: pv.Plotter, lattice: LatticeMesh) -> None:
+    if lattice.joined.shape[1] == 2:
+        lines = pv.PolyData(lattice.points, lines=np.insert(lattice.joined, 0, 2, axis=1).ravel())
+        plotter.add_mesh(lines, color=lattice.colour, line_width=1, lighting=False)
     else:
-        faces = pv.PolyData.from_regular_faces(fabric.points, fabric.joined)
-        plotter.add_mesh(faces, color=fabric.colour, ambient=0.5, diffuse=0.55)
+        faces = pv.PolyData.from_regular_faces(lattice.points, lattice.joined)
+        plotter.add_mesh(faces, color=lattice.colour, ambient=0.5, diffuse=0.55)
 
 
 def _draw_box(plotter: pv.Plotter, box: np.ndarray) -> None:

@@ -27,7 +27,7 @@ FARTHEST = 1e15  # [m]: what is drawn has single precision, and its squares must
 
 
 @dataclass(frozen=True)
-class Subject:
+class Drawable:
     """A body and the scene that says what stands beside it.
 
     name      : of its file, for messages
@@ -97,13 +97,13 @@ class Subject:
         return overlays_at(self.scene, time, self.rest, nodes, bodies, camera, self.solids)
 
 
-def subject_of_result(run: Result) -> Subject:
+def drawable_of_result(run: Result) -> Drawable:
     """Return what a result shows. Raises InputError where it cannot be drawn."""
     scene = read_scene(run)
     refuse_what_cannot_be_drawn(run, scene)
     if len(run.frames.time) == 0:
         raise InputError(f"{run.path} has no finished frame")
-    return Subject(
+    return Drawable(
         name=str(run.path),
         scene=scene,
         rest=Rest(
@@ -123,7 +123,7 @@ def subject_of_result(run: Result) -> Subject:
     )
 
 
-def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
+def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     """Return what a scene is before its first step, from the model that one process built of it."""
     from scipy.sparse import csr_array
 
@@ -137,7 +137,7 @@ def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
         "lattice/springs": lattice.global_numbers[lattice.springs],
         "lattice/rest_length": lattice.rest_length,
     }
-    return Subject(
+    return Drawable(
         name=str(path),
         scene=with_painted_points(scene),
         rest=Rest(
@@ -157,20 +157,20 @@ def subject_of_model(path: Path, scene: "Scene", model: "Model") -> Subject:
     )
 
 
-def subject_of_surface(
+def drawable_of_surface(
     path: Path,
     surface: Surface,
     scene: SceneFile | None = None,
     body: np.ndarray | None = None,
     solids: Mapping[int, Surface] | None = None,
-) -> Subject:
+) -> Drawable:
     """Return a mesh as it lies in its file, in the file's own unit; or the surface of a scene without its lattice.
 
     body   : (v,) numbers of the bodies of its points; None: there is but one
-    solids : of its obstacles, as Subject has them
+    solids : of its obstacles, as Drawable has them
     """
     no_cells, body = np.empty((0, 8), int), np.zeros(len(surface.points), int) if body is None else body
-    return Subject(
+    return Drawable(
         name=str(path),
         scene=scene,
         rest=SurfaceAtRest(surface.points, no_cells, surface.points, body, body),

@@ -15,6 +15,9 @@ from msmpetsc.output.reader import Result
 
 EXPORT = "msmpetsc.output.export."
 
+CELL_TYPES = {"surface": "triangle", "lattice": "hexahedron"}
+BARE = (".obj", ".ply", ".stl")  # formats of points and triangles alone
+
 
 class Format(NamedTuple):
     """A format of files.
@@ -36,7 +39,7 @@ class Format(NamedTuple):
         return getattr(import_module(EXPORT + module), function)
 
 
-ONE_FRAME = ("one_frame", "write_one_frame")
+ONE_FRAME = ("formats", "write_one_frame")
 USD = Format(("usd", "write_usd"), True, ("surface",), "Blender, Houdini, Omniverse, usdview")
 FORMATS = {
     ".glb": Format(("gltf", "write_glb"), True, ("surface",), "Blender, browsers"),
@@ -96,3 +99,16 @@ def _frames(run: Result, path: Path, chosen: Format, frames: Frames | None, ever
     if np.any(np.diff(numbers) <= 0):
         raise InputError("frames to be exported must follow each other in time, each once")
     return numbers
+
+
+def write_one_frame(moments: Moments, path: Path) -> None:
+    """Write the one frame by meshio, with its data where the format has them."""
+    import meshio
+
+    (frame,) = moments.frames
+    cells = [(CELL_TYPES[moments.mesh], moments.cells)]
+    of_points, of_cells = moments.data_of_points(frame), moments.data_of_cells(frame)
+    if path.suffix.lower() in BARE:
+        of_points, of_cells = {}, {}
+    in_blocks = {name: [values] for name, values in of_cells.items()}
+    meshio.write(path, meshio.Mesh(moments.points(frame), cells, of_points, in_blocks))

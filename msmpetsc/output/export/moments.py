@@ -42,7 +42,7 @@ class Moments:
         return self.run.embedding @ self.run.frames.position[frame]
 
     def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what changes at the points from frame to frame.
+        """Return what is known at the points: of the lattice masses, and which are pinned, too.
 
         displacement : from rest, (n, 3) [m]
         velocity     : the mean since the frame before, (n, 3) [m/s]; 0 at the first
@@ -52,24 +52,19 @@ class Moments:
         if frame > 0:
             before, now = self.run.frames.time[frame - 1 : frame + 1]
             velocity = (points - self.points(frame - 1)) / (now - before)
-        return {"displacement": (points - self.rest).astype(points.dtype), "velocity": velocity.astype(points.dtype)}
-
-    def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what changes in the cells: of the lattice their strain, (c, 6) [-]."""
-        return {"strain": green_strain(self.rest, self.cells, self.points(frame))} if self.mesh == "lattice" else {}
-
-    def constant_data_of_points(self) -> dict[str, np.ndarray]:
-        """Return what stays as it is at the nodes: their masses, and which are pinned."""
+        data = {"displacement": (points - self.rest).astype(points.dtype), "velocity": velocity.astype(points.dtype)}
         if self.mesh == "surface":
-            return {}
+            return data
         pinned = np.zeros(len(self.rest), np.uint8)
         if "pinned" in self.run.lattice:
             pinned[self.run.lattice.pinned[:]] = 1
-        return {"pinned": pinned} | self._constant("n", "nodes")
+        return data | {"pinned": pinned} | self._constant("n", "nodes")
 
-    def constant_data_of_cells(self) -> dict[str, np.ndarray]:
-        """Return what stays as it is in the cells: all numbers that the file has of each."""
-        return self._constant("c", "cells") if self.mesh == "lattice" else {}
+    def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
+        """Return what is known of the lattice's cells: strain, (c, 6) [-], and all that the file has of each."""
+        if self.mesh == "surface":
+            return {}
+        return {"strain": green_strain(self.rest, self.cells, self.points(frame))} | self._constant("c", "cells")
 
     def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
         arrays = self.run.lattice

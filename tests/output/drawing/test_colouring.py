@@ -8,10 +8,18 @@ from ball_result import BARE, HEIGHTS, write_ball
 
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.output.drawing.colouring import COLOURINGS, Colouring, colouring_of, opened_reference, scaled
-from msmpetsc.output.drawing.colours import SCALE, on_scale, rgb
+from msmpetsc.output.drawing.colours import (
+    COLOURINGS,
+    SCALE,
+    Colouring,
+    colouring_of,
+    on_scale,
+    opened_reference,
+    rgb,
+    scaled,
+)
 from msmpetsc.output.drawing.overlays import Rest
-from msmpetsc.output.drawing.subject import subject_of_result, subject_of_surface
+from msmpetsc.output.drawing.subject import drawable_of_result, drawable_of_surface
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import toml_of
@@ -20,7 +28,7 @@ from msmpetsc.scene.toml import toml_of
 @pytest.fixture
 def subject(tmp_path):
     with Result(write_ball(tmp_path / "ball.h5", surface=True)) as run:
-        yield subject_of_result(run)
+        yield drawable_of_result(run)
 
 
 def test_displacement_of_a_fall_is_its_height(subject):
@@ -41,7 +49,7 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
     subject = replace(
-        subject_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
+        drawable_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
         nodes=lambda _: moved,
         array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
     )

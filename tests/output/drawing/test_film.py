@@ -1,4 +1,4 @@
-"""Films: their pace, their pictures as they come out of the file, and what cannot be filmed."""
+"""Films: their playback, their pictures as they come out of the file, and what cannot be filmed."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.output.drawing.camera import camera_facing, turned
-from msmpetsc.output.drawing.pace import paced, usual_speed
+from msmpetsc.output.drawing.playback import playback_of, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
@@ -45,15 +45,15 @@ def middle_of_body(picture: np.ndarray) -> float:
 
 
 def test_pace_in_real_time_shows_each_frame_at_its_time():
-    pace = paced(4 * TIMES)  # ten frames in four seconds are fewer than a film has at the most
-    assert pace.numbers.tolist() == list(range(11)) and pace.fps == pytest.approx(2.5) and pace.speed == 1
-    assert pace.words == ""
+    playback = playback_of(4 * TIMES)  # ten frames in four seconds are fewer than a film has at the most
+    assert playback.numbers.tolist() == list(range(11)) and playback.fps == pytest.approx(2.5) and playback.speed == 1
+    assert playback.words == ""
 
 
 def test_pace_leaves_frames_out_where_they_come_faster_than_pictures():
-    pace = paced(np.arange(4001) / 1000)  # four seconds of four thousand frames
-    assert pace.fps == 30 and len(pace.numbers) == 121
-    assert pace.numbers[[0, 3, -1]].tolist() == [0, 100, 4000]
+    playback = playback_of(np.arange(4001) / 1000)  # four seconds of four thousand frames
+    assert playback.fps == 30 and len(playback.numbers) == 121
+    assert playback.numbers[[0, 3, -1]].tolist() == [0, 100, 4000]
 
 
 @pytest.mark.parametrize("span", [*np.geomspace(1e-6, 1e6, 50), 2.999, 3.0, 8.0, 8.001])
@@ -64,9 +64,9 @@ def test_a_film_lasts_three_to_eight_seconds_where_nothing_is_said(span: float):
 
 
 def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
-    pace = paced(np.arange(41) / 120)
-    assert 3 <= pace.seconds <= 8 and pace.words == "10 times slower than real"
-    assert paced(np.arange(61.0)).words == "10 times faster than real"
+    playback = playback_of(np.arange(41) / 120)
+    assert 3 <= playback.seconds <= 8 and playback.words == "10 times slower than real"
+    assert playback_of(np.arange(61.0)).words == "10 times faster than real"
 
 
 def test_a_film_fills_its_frame_and_says_its_speed(result, tmp_path, caplog):
@@ -84,21 +84,21 @@ def test_a_film_fills_its_frame_and_says_its_speed(result, tmp_path, caplog):
 
 
 def test_slow_motion_shows_all_frames_for_longer():
-    slow = paced(TIMES, speed=0.1)
+    slow = playback_of(TIMES, speed=0.1)
     assert slow.fps == pytest.approx(1) and slow.seconds == pytest.approx(11)
-    both = paced(TIMES, fps=20, speed=0.1)  # 0.005 s a picture, so twenty pictures a frame
+    both = playback_of(TIMES, fps=20, speed=0.1)  # 0.005 s a picture, so twenty pictures a frame
     assert len(both.numbers) == 201 and (abs(np.bincount(both.numbers)[1:-1] - 20) <= 1).all()
 
 
 def test_pictures_a_second_alone_are_of_a_frame_each():
-    pace = paced(TIMES, fps=25)
-    assert pace.numbers.tolist() == list(range(11)) and pace.speed == pytest.approx(2.5)
+    playback = playback_of(TIMES, fps=25)
+    assert playback.numbers.tolist() == list(range(11)) and playback.speed == pytest.approx(2.5)
 
 
 def test_frames_out_of_order_have_no_speed():
-    assert paced(TIMES[[5, 2, 0]], fps=4).numbers.tolist() == [0, 1, 2]
+    assert playback_of(TIMES[[5, 2, 0]], fps=4).numbers.tolist() == [0, 1, 2]
     with pytest.raises(InputError, match="--speed needs frames in order of time"):
-        paced(TIMES[[5, 2, 0]], speed=1)
+        playback_of(TIMES[[5, 2, 0]], speed=1)
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])

@@ -16,13 +16,13 @@ from test_page import restored
 
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
-from msmpetsc.cli.commands.render import subject_of_file
+from msmpetsc.cli.commands.render import drawable_of_file
 from msmpetsc.errors import InputError
 from msmpetsc.output.drawing.camera import camera_facing
-from msmpetsc.output.drawing.fabric import BOUNDARY, INTERIOR, cut_open
+from msmpetsc.output.drawing.mesh import BOUNDARY, INTERIOR, cut_open
 from msmpetsc.output.drawing.page import write_page
-from msmpetsc.output.drawing.shots import Style
-from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.drawing.playback import Style
+from msmpetsc.output.drawing.subject import Drawable
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FALL, EYE = 0.2, (0.0, -1.0, 0.0)  # [m] a frame
@@ -30,13 +30,13 @@ TABLES = {"output": {"surface": True}, "time": {"step": 0.01, "duration": 0.1}}
 
 
 @pytest.fixture
-def falling(tmp_path: Path) -> Subject:
+def falling(tmp_path: Path) -> Drawable:
     """A cube of four cells along each side, which falls for three frames beside a ball that is drawn as a mesh."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     ball.apply_translation([0.6, 0.25, 0.25])
     ball.export(tmp_path / "ball.ply")
     obstacle = {"shape": "mesh", "mesh": {"source": "ball.ply"}}
-    subject, _ = subject_of_file(block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), obstacle=[obstacle], **TABLES), [])
+    subject, _ = drawable_of_file(block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), obstacle=[obstacle], **TABLES), [])
 
     def fallen(points: np.ndarray, index: int) -> np.ndarray:
         return points - np.array([0, 0, FALL * index])
@@ -57,12 +57,12 @@ def stream(data: dict, name: str) -> bytes:
     return zlib.decompress(base64.b64decode(data["streams"][name]))
 
 
-def written(folder: Path, subject: Subject, *shown: str) -> Path:
+def written(folder: Path, subject: Drawable, *shown: str) -> Path:
     write_page(subject, folder / "x.html", [0, 1, 2], Style(eye=EYE, shown=shown))
     return folder / "x.html"
 
 
-def test_the_page_holds_the_half_of_the_lattice_behind_the_middle(tmp_path: Path, falling: Subject):
+def test_the_page_holds_the_half_of_the_lattice_behind_the_middle(tmp_path: Path, falling: Drawable):
     data = data_of(written(tmp_path, falling, "cells", "springs"))
     about = data["lattice"]
     low, high = np.array(about["box"])
@@ -81,7 +81,7 @@ def test_the_page_holds_the_half_of_the_lattice_behind_the_middle(tmp_path: Path
     assert [entry["text"] for entry in data["legend"][:3]] == ["boundary cell", "interior cell", "spring"]
 
 
-def test_what_is_not_asked_for_is_not_there(tmp_path: Path, falling: Subject):
+def test_what_is_not_asked_for_is_not_there(tmp_path: Path, falling: Drawable):
     data = data_of(written(tmp_path, falling))
     assert data["lattice"] is None and "nodes" not in data["streams"]
     data = data_of(written(tmp_path, falling, "springs"))
@@ -96,7 +96,7 @@ def test_a_scene_that_was_not_run_has_its_cells_on_a_page(tmp_path: Path):
 
 
 @pytest.mark.parametrize("wrong", [-1, 10**6])
-def test_springs_of_no_nodes_are_damage(tmp_path: Path, falling: Subject, wrong: int):
+def test_springs_of_no_nodes_are_damage(tmp_path: Path, falling: Drawable, wrong: int):
     springs = falling.springs.copy()
     springs[3, 1] = wrong
     damaged = replace(falling, array=lambda name: springs if name == "lattice/springs" else falling.array(name))
@@ -112,7 +112,7 @@ def red_rows(browser: Browser) -> np.ndarray:
 
 @in_browser
 @pytest.mark.timeout(120)
-def test_cells_and_springs_are_switched_and_move_with_the_frames(tmp_path: Path, falling: Subject):
+def test_cells_and_springs_are_switched_and_move_with_the_frames(tmp_path: Path, falling: Drawable):
     path = written(tmp_path, falling, "cells", "springs")
     with Browser(path) as browser:
         first = red_rows(browser)

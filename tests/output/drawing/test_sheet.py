@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from ball_result import BARE, HEIGHTS, write_ball
 from conftest import ROOT
+from msmpetsc.output.drawing.shots import Style
 from PIL import Image, ImageDraw
 
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
-from msmpetsc.output.drawing import legend, moments, overlays, sheet, stage, subject
+from msmpetsc.output.drawing import annotations, overlays, sheet, stage, subject
 from msmpetsc.output.drawing.camera import YAW, camera_facing
-from msmpetsc.output.drawing.shots import Style
 from msmpetsc.output.reader import Result
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Region
@@ -34,12 +34,12 @@ def result(tmp_path) -> Path:
 
 def test_moments_tell_the_story(result):
     with Result(result) as run:
-        five = moments.choose_moments(run, 5)
+        five = sheet.choose_moments(run, 5)
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
-        assert list(moments.choose_moments(run, 3)) == [0, 5, 10]
-        assert list(moments.choose_moments(run, 1)) == [0]
-        assert list(moments.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
-        assert list(moments.choose_moments(run, 99)) == list(range(11))
+        assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
+        assert list(sheet.choose_moments(run, 1)) == [0]
+        assert list(sheet.choose_moments(run, 6)) == [0, 1, 3, 5, 8, 10]  # the first of the longest gaps is halved
+        assert list(sheet.choose_moments(run, 99)) == list(range(11))
 
 
 def test_surface_that_was_not_stored_is_computed(result, tmp_path):
@@ -99,7 +99,7 @@ def test_the_eye_chooses_the_side(tmp_path):
     dark = []
     for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
         picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
-        ball = picture[: -sheet.CAPTION - legend.LINE].astype(int)
+        ball = picture[: -sheet.CAPTION - annotations.LINE].astype(int)
         dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
     assert dark[0] > 0.5 and dark[1] < 0.1
 

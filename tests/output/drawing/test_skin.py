@@ -8,13 +8,13 @@ import trimesh
 from scipy.sparse import csr_array
 
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.output.drawing.annotations import rounded
 from msmpetsc.output.drawing.camera import camera_facing
-from msmpetsc.output.drawing.colouring import plain_colouring
-from msmpetsc.output.drawing.lettering import rounded
+from msmpetsc.output.drawing.colours import plain_colouring
+from msmpetsc.output.drawing.mesh import CORNERS, drawn, split_at_edges, subdivided
 from msmpetsc.output.drawing.overlays import Overlays, Rest
-from msmpetsc.output.drawing.skin import CORNERS, drawn, split_at_edges, subdivided
-from msmpetsc.output.drawing.stage import Panel, Stage
-from msmpetsc.output.drawing.subject import Subject, subject_of_surface
+from msmpetsc.output.drawing.stage import Panel, Renderer
+from msmpetsc.output.drawing.subject import Drawable, drawable_of_surface
 
 CELLS, H = np.array([16, 2, 2]), 1 / 16  # of a block of 1 x 1/8 x 1/8 m
 
@@ -24,7 +24,7 @@ def bent(points: np.ndarray) -> np.ndarray:
     return points - 0.3 * points[:, [0]] ** 2 * [0, 0, 1]
 
 
-def block() -> Subject:
+def block() -> Drawable:
     """A block of 12 triangles and its 64 cells, at rest and bent."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], H * CELLS])
     points, triangles = np.array(box.vertices), np.array(box.faces)
@@ -35,7 +35,7 @@ def block() -> Subject:
     W = csr_array((np.linalg.norm(points[:, None] - nodes, axis=2) < 1e-9).astype(float))
     zeros = np.zeros(len(points), int)
     return replace(
-        subject_of_surface("block.ply", Surface(points, triangles)),
+        drawable_of_surface("block.ply", Surface(points, triangles)),
         rest=Rest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
         times=np.arange(2.0),
         nodes=lambda index: bent(nodes) if index else nodes,
@@ -89,7 +89,7 @@ def test_a_mesh_whose_triangles_share_no_points_is_drawn_smooth():
     """As an STL has them."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     loose = Surface(np.array(ball.triangles.reshape(-1, 3)), np.arange(3 * len(ball.faces)).reshape(-1, 3))
-    assert len(np.unique(drawn(subject_of_surface("ball.stl", loose)).triangles)) == len(ball.vertices)
+    assert len(np.unique(drawn(drawable_of_surface("ball.stl", loose)).triangles)) == len(ball.vertices)
 
 
 def test_pins_are_coloured_by_face():
@@ -98,9 +98,9 @@ def test_pins_are_coloured_by_face():
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
     triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
     panel = Panel(points, np.where(points[:, 0] < 1.5, 1.0, 0.3), Overlays([], [], [], [], []), ("", ""))
-    with Stage(300, 100, triangles) as stage:
-        stage.face(camera_facing(points, None, (0, 0, 1)), np.array([2.5, 0.5, 0]), 3, 6)
-        row = stage.picture(panel)[50].astype(int)
+    with Renderer(300, 100, triangles) as renderer:
+        renderer.face(camera_facing(points, None, (0, 0, 1)), np.array([2.5, 0.5, 0]), 3, 6)
+        row = renderer.picture(panel)[50].astype(int)
     colours = row[(row < 250).any(axis=1)][3:-3]  # without the rim
     steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
     assert len(steps) and np.ptp(steps) <= 1, "one edge, which antialiasing may widen by a pixel"

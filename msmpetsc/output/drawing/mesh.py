@@ -1,6 +1,7 @@
-"""The surface as it is drawn: triangles larger than cells follow the cells that carry them, and sharp edges are sharp.
+"""The meshes that are drawn: the surface, and cells and springs of the half of the lattice behind its middle.
 
-Drawn points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
+Triangles of the surface that are larger than cells follow the cells that carry them, and sharp edges are sharp. Drawn
+points are those of the file, in their order, then those put into long edges, then copies along sharp edges.
 """
 
 from dataclasses import dataclass, replace
@@ -10,9 +11,15 @@ from scipy.sparse import csr_array, eye_array, vstack
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from msmpetsc.errors import InputError
+from msmpetsc.output.drawing.camera import Camera
+from msmpetsc.output.drawing.colours import BOUNDARY_CELL, INTERIOR_CELL, SPRING
 from msmpetsc.output.drawing.overlays import Rest
-from msmpetsc.output.drawing.subject import Subject
+from msmpetsc.output.drawing.subject import Drawable
 from msmpetsc.output.gaps import unit_vectors
+
+# The surface
+
 
 SHARP = np.cos(np.radians(30))  # of the angle between the normals of two triangles: beyond it their edge is sharp
 HELD = 0.5  # share of a point that is fixed: a triangle is whose corners all have more
@@ -20,12 +27,12 @@ MOST = 30_000  # triangles, roughly: however small the cells, edges are not divi
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])  # of a cell, VTK's order
 
 
-def drawn(subject: Subject) -> Subject:
+def drawn(subject: Drawable) -> Drawable:
     """Return the subject with its surface as it is drawn."""
     return _split(_refined(subject))
 
 
-def _refined(subject: Subject) -> Subject:
+def _refined(subject: Drawable) -> Drawable:
     """Return the subject with no edge of its surface longer than a cell, new points carried by the cells."""
     rest, W = subject.rest, subject.embedding
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max()) if len(rest.cells) else 0.0
@@ -110,7 +117,7 @@ def trilinear(rest: Rest, points: np.ndarray, body: np.ndarray) -> csr_array:
     return csr_array((weights.ravel(), corners.ravel(), starts), (len(points), len(rest.nodes)))
 
 
-def _split(subject: Subject) -> Subject:
+def _split(subject: Drawable) -> Drawable:
     """Return the subject with a copy of each point for every smooth piece of the surface around it."""
     rest, W = subject.rest, subject.embedding
     _, first, equal = np.unique(
@@ -161,3 +168,65 @@ def split_at_edges(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
     number = np.empty(pieces, int)
     number[first], number[others] = kept, len(points) + np.arange(len(others))
     return np.concatenate([np.arange(len(points)), of_piece[others]]), number[piece].reshape(-1, 3)
+
+
+# The lattice
+
+
+SHOWN = ("cells", "springs")
+BOUNDARY, INTERIOR = 1, 2  # lattice/cell_kind
+SHRUNK = 0.86  # of a cell's size, so that neighbours are told apart
+THROUGH = 0.3  # opacity of a body whose lattice is shown
+FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])  # VTK's order
+KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
+
+
+@dataclass(frozen=True)
+class LatticeMesh:
+    """Faces (f, 4) or lines (s, 2) between points (p, 3) [m], of one colour."""
+
+    points: np.ndarray
+    joined: np.ndarray
+    colour: str
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What is left of the lattice when the half before its middle is taken away.
+
+    cells   : (c, 8) by their kind
+    springs : (s, 2), both ends of which lie behind
+    """
+
+    cells: dict[int, np.ndarray]
+    springs: np.ndarray
+
+    def meshes(self, nodes: np.ndarray) -> tuple[LatticeMesh, ...]:
+        """Return cells and springs at positions (n, 3) of the nodes."""
+        parts = [_cells(nodes, cells, KINDS[kind][0]) for kind, cells in self.cells.items()]
+        return (*parts, LatticeMesh(nodes, self.springs, SPRING)) if len(self.springs) else tuple(parts)
+
+
+def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
+    """Return the half of the lattice behind the middle of the body at rest. Raises InputError where there is none."""
+    if not len(subject.rest.cells):
+        raise InputError(f"--show: {subject.name} is a mesh without cells")
+    nodes, cells = subject.rest.nodes, subject.rest.cells
+    depth = nodes @ camera.to_eye
+    middle = (depth.min() + depth.max()) / 2
+    behind = depth[cells].mean(axis=1) <= middle
+    kind = subject.array("lattice/cell_kind")
+    parts = {number: cells[behind & (kind == number)] for number in KINDS} if "cells" in shown else {}
+    springs = np.empty((0, 2), int)
+    if "springs" in shown:
+        springs = subject.springs
+        springs = springs[(depth[springs] <= middle).all(axis=1)]
+    return Cut({number: part for number, part in parts.items() if len(part)}, springs)
+
+
+def _cells(nodes: np.ndarray, cells: np.ndarray, colour: str) -> LatticeMesh:
+    corners = nodes[cells]
+    middles = corners.mean(axis=1, keepdims=True)
+    points = (middles + SHRUNK * (corners - middles)).reshape(-1, 3)
+    faces = (8 * np.arange(len(cells))[:, None, None] + FACES).reshape(-1, 4)
+    return LatticeMesh(points, faces, colour)

@@ -1,21 +1,74 @@
-"""The legend of a picture: what its colours mean, what is dark, what the arrows are, and how long a length is."""
+"""What is written in pictures: captions, labels and the legend, all in one typeface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msmpetsc.output.drawing.colouring import Colouring
-from msmpetsc.output.drawing.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
-from msmpetsc.output.drawing.fabric import KINDS
-from msmpetsc.output.drawing.lettering import font as letters_of
+from msmpetsc.output.drawing.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, Colouring, on_scale
+from msmpetsc.output.drawing.mesh import KINDS
 from msmpetsc.output.drawing.overlays import Overlays
 from msmpetsc.scene.schema import SceneFile
 
-if TYPE_CHECKING:  # a page has the entries without them
+if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
+
+
+CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
+LABEL = 11  # [px]
+
+
+@cache
+def typeface(size: int) -> "FreeTypeFont":
+    """Return DejaVu Sans, which comes with matplotlib, in a size [px]."""
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
+
+
+def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> np.ndarray:
+    """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
+    for text, (size, middle) in zip(caption, LINES, strict=True):
+        at = width / 2, letters * middle
+        ImageDraw.Draw(picture).text(at, text, INK, typeface(round(letters * size)), anchor="mm")
+    return np.array(picture)
+
+
+def labelled(picture: np.ndarray, labels: list[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the top left], and the
+    ways (2,) that lead from there out of what is labelled."""
+    from PIL import Image, ImageDraw
+
+    drawn = Image.fromarray(picture)
+    for text, at, way in labels:
+        half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
+        middle = np.clip(at + half * way, half, np.array(drawn.size) - half)
+        ImageDraw.Draw(drawn).text(tuple(middle), text, INK, typeface(LABEL), anchor="mm")
+    return np.array(drawn)
+
+
+def rounded(low: float, high: float) -> tuple[str, str]:
+    """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
+    span = max(high - low, abs(high) * 1e-12, 1e-300)
+    digits = 2 - int(np.floor(np.log10(span)))
+    first, last = (f"{round(end, digits) + 0.0:.{max(digits, 0)}f}" for end in (low, high))
+    return (_bare(first), _bare(last)) if digits > 0 else (first, last)
+
+
+def _bare(number: str) -> str:
+    return number.rstrip("0").rstrip(".")
+
+
+# The legend
+
 
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
@@ -57,9 +110,9 @@ def entries_of(
     if fixed and scene is not None:
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
-    if any(shot.arrows for shot in overlays):
+    if any(view.arrows for view in overlays):
         entries.append(Entry("arrow", "force", ARROW, 30))
-    if entries and any(shot.glass or shot.balls or shot.shapes for shot in overlays):
+    if entries and any(view.glass or view.balls or view.shapes for view in overlays):
         entries.append(Entry("glass", "obstacle", GLASS))
     return entries
 
@@ -83,7 +136,7 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
     from PIL import Image, ImageDraw
 
     room_of_line = round(width / letters)
-    font = letters_of(FINE * LETTERS)
+    font = typeface(FINE * LETTERS)
     lines: list[list[Entry]] = []
     room = 0.0
     for entry in entries:

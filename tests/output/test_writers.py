@@ -30,7 +30,7 @@ from msmpetsc.output.export.formats import FORMATS, export
 from msmpetsc.output.reader import Result
 from msmpetsc.output.xdmf import write_xdmf
 from msmpetsc.study.baselines import baseline
-from msmpetsc.study.charts.plot import Chart, curve_styles, save_png
+from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
 from msmpetsc.study.scene_lines import put_into
@@ -72,7 +72,9 @@ def page(result: Path, path: Path) -> None:
 
 
 def chart(path: Path) -> None:
-    save_png(Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"])), path.parent)
+    made = Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"]))
+    made.panel("", log_axis("x", [1, 10], COUNT), log_axis("y", [1, 10], COUNT)).line([1, 10], [1, 10])
+    save_png(made, path.parent)
 
 
 def writers(sources: Path) -> dict[str, Writer]:

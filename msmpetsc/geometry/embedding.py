@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.block import ITSELF
@@ -34,9 +35,9 @@ class Embedding:
     indptr, indices, weights : CSR of this rank's rows; the columns are global node numbers
     """
 
-    indptr: np.ndarray
-    indices: np.ndarray
-    weights: np.ndarray
+    indptr: Indices
+    indices: Indices
+    weights: Floats
 
     @property
     def points(self) -> int:
@@ -44,9 +45,7 @@ class Embedding:
         return len(self.indptr) - 1
 
 
-def embed(
-    points: Sequence[np.ndarray], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0
-) -> Embedding:
+def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
     """Return W for the surface points of all bodies, one after the other (collective).
 
     points    : of each body (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells of the body
@@ -65,7 +64,7 @@ def embed(
     return _gather_rows(comm, rows, columns, weights, total, nodes.total)
 
 
-def _to_cells(points: Sequence[np.ndarray], cages: Cages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
     """Send each point to its cell's rank: its number there, its cell (p, 3), its coordinates in the cell (p, 3)."""
     at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
     cells = [np.floor(of_body).astype(np.int64) for of_body in at]
@@ -80,24 +79,22 @@ def _parts(count: int) -> list[slice]:
 
 
 def _entries(
-    u: np.ndarray,
-    neighbours: np.ndarray,
-    numbers: np.ndarray,
-    cell: np.ndarray,
-    row: np.ndarray,
+    u: Rows,
+    neighbours: Mask,
+    numbers: Indices,
+    cell: Indices,
+    row: Indices,
     kind: str,
     smoothing: float,
     part: slice,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Indices, Indices, Floats]:
     """Return the nonzero weights of some points as rows, columns and values."""
     weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
     point, node = np.nonzero(weights)
     return row[part][point], numbers[cell[part]][point, node], weights[point, node]
 
 
-def _gather_rows(
-    comm: MPI.Comm, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, total: int, nodes: int
-) -> Embedding:
+def _gather_rows(comm: MPI.Comm, rows: Indices, columns: Indices, weights: Floats, total: int, nodes: int) -> Embedding:
     """Bring rows to the ranks that keep them: equal contiguous ranges."""
     first = total * np.arange(comm.size + 1) // comm.size
     route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
@@ -107,7 +104,7 @@ def _gather_rows(
     return Embedding(csr.indptr, csr.indices, csr.data)
 
 
-def stencil_weights(kind: str, u: np.ndarray, neighbours: np.ndarray, smoothing: float = 1.0) -> np.ndarray:
+def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:
     """Return the weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
 
     u          : (p,3) coordinates in the cell, in [0,1]

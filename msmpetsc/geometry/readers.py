@@ -13,17 +13,19 @@ from io import BytesIO, StringIO
 from logging import CRITICAL, getLogger
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
+from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.errors import InputError, one_line
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.reading import lies_below
 
-Arrays = tuple[np.ndarray, np.ndarray]  # points (v, 3), faces (f, 3 or 4)
+Arrays = tuple[Array, Array]  # points (v, 3), faces (f, 3 or 4)
 
 MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
 MOST_INSTANCED, LEAST_ROWS = 10, 2**20  # the rows of a glTF: so many times its bytes, or so many
@@ -56,7 +58,7 @@ def read_surface(path: str | Path) -> Surface:
     return Surface(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(faces, np.int64))
 
 
-def _check_arrays(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
+def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
     """Raise InputError unless the arrays make a mesh."""
     if len(triangles) == 0:
         raise InputError(f"{path}: holds no triangles")
@@ -140,7 +142,7 @@ def _refuse_claims(kind: str, data: bytes) -> None:
         raise ValueError("it repeats its meshes too often")
 
 
-def _gltf(kind: str, data: bytes) -> dict:
+def _gltf(kind: str, data: bytes) -> dict[str, Any]:
     return json.loads(data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
 
 
@@ -149,7 +151,7 @@ def _instanced_rows(kind: str, data: bytes) -> int:
     tree = _gltf(kind, data)
     counts = [accessor["count"] for accessor in tree.get("accessors", [])]
 
-    def rows_of(part: dict) -> int:
+    def rows_of(part: dict[str, Any]) -> int:
         points, corners = part["attributes"]["POSITION"], part.get("indices")
         return counts[points] + (0 if corners is None else counts[corners])
 
@@ -276,7 +278,7 @@ def _read_meshio(path: Path, data: bytes) -> Arrays:
     return mesh.points[used], triangles.reshape(-1, 3)
 
 
-def _outer_triangles(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+def _outer_triangles(points: Positions, tetrahedra: Indices) -> Indices:
     """Return the faces (f, 3) of one tetrahedron only, wound outwards, of tetrahedra (c, 4)."""
     a, b, c, d = points[tetrahedra].swapaxes(0, 1)
     inverted = np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) < 0

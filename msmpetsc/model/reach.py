@@ -12,6 +12,7 @@ from itertools import chain
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Mask, Positions
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.model.lattice import Lattice
@@ -22,7 +23,7 @@ from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.schema import Scene
 
 NODES = ("pin", "anchor", "force")  # tables whose regions mean nodes
-Regions = Mapping[str, np.ndarray]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
+Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Reach:
     kind: str
 
 
-def regions(scene: Scene, lattice: Lattice, finder: Finder, points: np.ndarray) -> dict[str, np.ndarray]:
+def regions(scene: Scene, lattice: Lattice, finder: Finder, points: Positions) -> dict[str, Mask]:
     """Return the nodes of each pin, anchor and force (collective). Raises InputError for a region without nodes.
 
     points : (l, 3) of the bodies that nodes are nearest to [m]
@@ -59,7 +60,7 @@ def reach_of(
     Raises InputError on all ranks for an anchor or a force that does nothing.
     """
 
-    def count(where: np.ndarray) -> int:
+    def count(where: Mask) -> int:
         return comm.allreduce(int(where[: lattice.owned].sum()))
 
     reaches, pinned = [], np.zeros_like(lattice.pinned)
@@ -106,7 +107,7 @@ def _warn_of_overruled(reach: Reach, pinned: int, prescribed: int) -> None:
     log.warning("%s, which it does not lead", text)
 
 
-def _held_while(force: Force, pinned: np.ndarray, anchors: list[Anchor]) -> np.ndarray:
+def _held_while(force: Force, pinned: Mask, anchors: list[Anchor]) -> Mask:
     """Return the nodes (l,) bool that are not free at any time at which the force acts."""
     until = math.inf if force.stop is None else force.stop
     lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
+
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
 
@@ -16,9 +18,7 @@ def pieces(count: int, dtype: np.dtype, shape: tuple[int, ...]) -> Iterator[slic
     return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
 
-def gather_rows(
-    comm: MPI.Comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int, np.ndarray], None]
-) -> None:
+def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[int, Array], None]) -> None:
     """Hand store(start, piece), on rank 0, the rows of all ranks, one after the other (collective).
 
     rows   : (counts[rank], ...) this rank's, contiguous
@@ -45,9 +45,7 @@ def gather_rows(
         raise failure
 
 
-def scatter_rows(
-    comm: MPI.Comm, rows: np.ndarray, counts: Sequence[int], load: Callable[[slice], Any]
-) -> Exception | None:
+def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]) -> Exception | None:
     """Fill each rank's rows with what load(part) gives on rank 0; return there what could not be read (collective).
 
     rows   : (counts[rank], ...) this rank's, to be filled

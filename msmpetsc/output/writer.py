@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
@@ -100,7 +101,7 @@ class ResultFile:
             with suppress(InputError), plain_errors(self.path):
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
-    def write(self, name: str, rows: np.ndarray) -> None:
+    def write(self, name: str, rows: Array) -> None:
         """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes".
 
         A file that begins in place has it; raises InputError where its shape is another.
@@ -176,7 +177,7 @@ class ResultFile:
                 self._flush(self._file)
         self.finished += 1
 
-    def newest_surface(self) -> np.ndarray | None:
+    def newest_surface(self) -> Positions | None:
         """Return the surface points (v, 3) [m] of the newest frame on rank 0; None on others, or if none is stored."""
         if self._file is None or not self._points or not self.finished:
             return None
@@ -322,21 +323,19 @@ class ResultFile:
         if self._points:
             self._check_rows("surface", frame.surface, self._points)
 
-    def _check_rows(
-        self, name: str, rows: np.ndarray | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)
-    ) -> None:
+    def _check_rows(self, name: str, rows: Array | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)) -> None:
         planned, given = (counts[self._comm.rank], *shape), () if rows is None else np.shape(rows)
         if given != planned:
             raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
 
     def _collect(
-        self, rows: np.ndarray, dtype: np.dtype, counts: Sequence[int], name: str, index: int | None = None
+        self, rows: Array, dtype: np.dtype, counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)
         file: Any = self._file  # on rank 0, which alone stores
 
-        def store(start: int, piece: np.ndarray) -> None:
+        def store(start: int, piece: Array) -> None:
             part = slice(start, start + len(piece))
             file[name][part if index is None else (index, part)] = piece
 

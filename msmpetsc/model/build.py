@@ -18,6 +18,7 @@ from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.model.clamp import clamped
 from msmpetsc.model.contact.build import build_obstacles, surfaces_of
+from msmpetsc.model.contact.friction import STICK
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside, nearest_of_body
 from msmpetsc.model.contact.penalty import Penalty
@@ -34,7 +35,6 @@ from msmpetsc.scene.schema import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
-STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 

@@ -125,10 +125,7 @@ class Environment:
 
     def last_change(self, until: float) -> float:
         """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
-        times: list[float | None] = [time for load in self.pulling for time in load.events]
-        times += [time for anchor in self.anchors for time in (*anchor.path.times.tolist(), anchor.stop)]
-        times += [time for o in self.obstacles for time in (*o.path.times.tolist(), o.start, o.stop)]
-        return max((time for time in times if time is not None and time <= until), default=0.0)
+        return max((time for time in self.events() if time <= until), default=0.0)
 
     def contact_faces(
         self,

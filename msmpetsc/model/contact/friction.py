@@ -14,6 +14,8 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.model.contact.solids import TINY
 
+STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
+
 Pressed = tuple[Indices, Floats, Rows]
 
 

@@ -59,8 +59,15 @@ def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: st
     around = decode_morton(cell_keys)[:, None, :]
     neighbours = cages.table.find(encode_morton(around + CELLS_AROUND)) >= 0
     numbers = nodes.find(encode_morton(around + NODES_AROUND))
-    entries = [_entries(u, neighbours, numbers, cell, row, kind, smoothing, part) for part in _parts(len(u))]
-    rows, columns, weights = (np.concatenate(part) for part in zip(*entries, strict=True))
+
+    def entries(part: slice) -> tuple[Indices, Indices, Floats]:
+        """Return the nonzero weights of some points as rows, columns and values."""
+        weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
+        point, node = np.nonzero(weights)
+        return row[part][point], numbers[cell[part]][point, node], weights[point, node]
+
+    parts = (slice(start, start + CHUNK) for start in range(0, max(len(u), 1), CHUNK))
+    rows, columns, weights = (np.concatenate(part) for part in zip(*map(entries, parts), strict=True))
     return _gather_rows(comm, rows, columns, weights, total, nodes.total)
 
 
@@ -72,26 +79,6 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
     ijk = np.concatenate([of_body + cages.grids.first(body) for body, of_body in enumerate(cells)])
     route = Route(cages.table.comm, cages.table.owner(encode_morton(ijk)))
     return route.send(np.arange(len(u))), route.send(ijk), route.send(u)
-
-
-def _parts(count: int) -> list[slice]:
-    return [slice(start, start + CHUNK) for start in range(0, max(count, 1), CHUNK)]
-
-
-def _entries(
-    u: Rows,
-    neighbours: Mask,
-    numbers: Indices,
-    cell: Indices,
-    row: Indices,
-    kind: str,
-    smoothing: float,
-    part: slice,
-) -> tuple[Indices, Indices, Floats]:
-    """Return the nonzero weights of some points as rows, columns and values."""
-    weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
-    point, node = np.nonzero(weights)
-    return row[part][point], numbers[cell[part]][point, node], weights[point, node]
 
 
 def _gather_rows(comm: MPI.Comm, rows: Indices, columns: Indices, weights: Floats, total: int, nodes: int) -> Embedding:

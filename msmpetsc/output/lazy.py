@@ -58,7 +58,7 @@ class LazyArray:
             return self[:][keys]
         return self._read_rows(keys)
 
-    def _read_rows(self, keys: tuple) -> Array:
+    def _read_rows(self, keys: tuple[Any, ...]) -> Array:
         """Read with a list or an array among the keys: row by row, for all together may be more than fits."""
         first, rest = keys[0], keys[1:]
         rows = np.arange(len(self))[first]
@@ -70,7 +70,7 @@ class LazyArray:
             values = np.array([self[int(row)][rest] for row in rows.flat])
         return values.reshape(*rows.shape, *values.shape[1:])
 
-    def _read(self, keys: tuple) -> Array:
+    def _read(self, keys: tuple[Any, ...]) -> Array:
         """Read with numbers and slices for keys."""
         parts: list[int | range] = [
             range(size)[int(k) if isinstance(k, np.integer) else k] for k, size in zip(keys, self.shape, strict=True)
@@ -85,7 +85,7 @@ class LazyArray:
         return values[tuple(slice(None, None, -1 if part.step < 0 else 1) for part in ranges)] if ranges else values
 
 
-class Arrays(Mapping):
+class Arrays(Mapping[str, LazyArray]):
     """The arrays of one group by their names: ``frames["time"]`` or ``frames.time``."""
 
     def __init__(self, group: str, arrays: dict[str, LazyArray]):
@@ -112,7 +112,7 @@ class Arrays(Mapping):
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
 
 
-def _key_per_axis(key: Any, ndim: int) -> tuple:
+def _key_per_axis(key: Any, ndim: int) -> tuple[Any, ...]:
     """Return the key with its ... and what is left out written as slices."""
     keys = list(key) if isinstance(key, tuple) else [key]
     dots = [axis for axis, k in enumerate(keys) if k is Ellipsis]

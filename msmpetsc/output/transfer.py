@@ -12,7 +12,7 @@ from msmpetsc.backend.arrays import Array
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
 
-def pieces(count: int, dtype: np.dtype, shape: tuple[int, ...]) -> Iterator[slice]:
+def pieces(count: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[slice]:
     """Return parts of `count` rows of this type and shape, of at most PIECE_BYTES each."""
     most = max(1, PIECE_BYTES // max(1, dtype.itemsize * math.prod(shape)))
     return (slice(start, min(start + most, count)) for start in range(0, count, most))

@@ -186,7 +186,7 @@ class ResultFile:
     def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
         rows, numbers = self._layout.rows, self._layout.numbers
-        if (saved.rows.keys(), tuple(saved.numbers)) != (rows.keys(), numbers):
+        if set(saved.rows) != set(rows) or tuple(saved.numbers) != numbers:
             raise ValueError(f"planned were checkpoints of {list(rows)} and {list(numbers)}")
         for name, values in saved.rows.items():
             self._check_rows(name, values, self._nodes, rows[name])
@@ -329,7 +329,7 @@ class ResultFile:
             raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
 
     def _collect(
-        self, rows: Array, dtype: np.dtype, counts: Sequence[int], name: str, index: int | None = None
+        self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)

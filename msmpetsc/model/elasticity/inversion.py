@@ -15,7 +15,7 @@ from functools import partial
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.elasticity.springs import Product
 from msmpetsc.model.lattice import Lattice
@@ -373,7 +373,7 @@ class CellGather(Cells):
     """
 
     around: Indices
-    corner: Indices
+    corner: Array
 
     @classmethod
     def of_lattice(cls, lattice: Lattice, resistance: Floats, volume: float) -> "CellGather":
@@ -401,7 +401,7 @@ class CellGather(Cells):
         _cell_bound_around(self.around.shape[1], q, *self._all, blocks)
 
     @property
-    def _all(self) -> tuple[Indices, Floats, float, Indices, Indices]:
+    def _all(self) -> tuple[Indices, Floats, float, Indices, Array]:
         return *self.law, self.around, self.corner
 
 

@@ -336,7 +336,7 @@ class SpringGather:
     """
 
     neighbour: Indices
-    kind: Indices
+    kind: Array
     stiffness: Floats
     lengths: Floats
     stiffening: float
@@ -361,7 +361,7 @@ class SpringGather:
         return cls(neighbour, kinds, stiffness, lengths, lattice.stiffening)
 
     @property
-    def _all(self) -> tuple[Indices, Indices, Floats, Floats, float]:
+    def _all(self) -> tuple[Indices, Array, Floats, Floats, float]:
         return self.neighbour, self.kind, self.stiffness, self.lengths, self.stiffening
 
     def energy(self, q: Positions) -> float:

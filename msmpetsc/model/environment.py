@@ -256,14 +256,10 @@ class Environment:
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
-            if not p.obstacle.acts_at(time):
-                continue
             way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time)))
-            if p.friction > 0 and way > 0:
-                for (q, sides), when in ((before, time - time_step), (after, time)):
-                    side = (self.no_sides if sides is None else sides)[row, : len(q)]
-                    inside, _ = p.state_at(when, side).depths(q)
-                    work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
+            if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
+                for state, when in ((before, time - time_step), (after, time)):
+                    work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
         return work
 
     def change_of_push(
@@ -279,13 +275,18 @@ class Environment:
         """
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
-            depths = []
-            for (q, sides), when in ((before, time - time_step), (after, time)):
-                side = (self.no_sides if sides is None else sides)[row, : len(q)]
-                acts = p.obstacle.acts_at(when)
-                depths.append(np.maximum(p.state_at(when, side).depths(q)[0], 0) if acts else np.zeros_like(change))
+            depths = [
+                self._pushed(row, state, when) if p.obstacle.acts_at(when) else np.zeros_like(change)
+                for state, when in ((before, time - time_step), (after, time))
+            ]
             change += p.stiffness * np.abs(depths[1] - depths[0])
         return change
+
+    def _pushed(self, row: int, state: tuple[Positions, Indices | None], time: float) -> Floats:
+        """Return how deep nodes (owned,) of a state are in a penalty's obstacle at a time [s], 0 outside [m]."""
+        q, sides = state
+        side = (self.no_sides if sides is None else sides)[row, : len(q)]
+        return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
 
     def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
         sides = (self.no_sides if sides is None else sides)[self.pressing]

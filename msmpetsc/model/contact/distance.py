@@ -24,7 +24,7 @@ class DistanceSolid(ABC):
         self._last: tuple[Positions, Floats, Indices] | None = None
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """As of every Solid."""
+        """Return how deep positions lie (n,) [m] and their faces (n,), known of the positions asked for last."""
         on_host = to_host(q)
         if self._last is None or not np.array_equal(self._last[0], on_host):
             self._last = (on_host.copy(), *self._find(on_host))
@@ -32,12 +32,14 @@ class DistanceSolid(ABC):
         return like(q, depths.copy()), like(q, face.copy())
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """As of every Solid."""
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return like(q, self._behind(to_host(q), to_host(face))[1])
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """As of every Solid; over a short way by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface
-        bends by 1 / r.
+        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m].
+
+        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface bends by
+        1 / r.
         """
         face, way = to_host(face), to_host(moved)
         (depth, normal), (depth_before, normal_before) = (self._behind(to_host(x), face) for x in (q, q - moved))
@@ -47,7 +49,7 @@ class DistanceSolid(ABC):
         return like(q, np.where(near, slope, depth - depth_before))
 
     def sent(self, send: Send) -> "DistanceSolid":
-        """As of every Solid: nothing is sent."""
+        """Return the solid itself: what is asked on the CPU stays there."""
         return self
 
     @abstractmethod
@@ -92,7 +94,7 @@ class FunctionSolid(DistanceSolid):
         return distance, gradient
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """As of every DistanceSolid, by marching cubes; open where it goes on beyond what is shown."""
+        """Return its surface by marching cubes, open where it goes on beyond what is shown."""
         import igl
 
         margin = BEYOND * (high - low).max()

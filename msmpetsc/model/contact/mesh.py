@@ -37,7 +37,7 @@ class MeshSolid(DistanceSolid):
         finalize(self, self._trees.clear)  # at the end of Python, too, where igl's binding complains of what is left
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """As of every DistanceSolid: all triangles, each wound outwards."""
+        """Return the whole mesh, each triangle wound outwards."""
         return Surface(self.points, self.triangles)
 
     def _find(self, q: Positions) -> tuple[Floats, Indices]:

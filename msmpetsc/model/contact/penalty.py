@@ -141,7 +141,7 @@ class Contact:
         return self.change_at_nodes(q, base) + (self.surface.change(q, base) if self.surface else 0.0)
 
     def change_at_nodes(self, q: Positions, base: Positions) -> float:
-        """Return the same of obstacles alone."""
+        """Return the energy of obstacles alone at q less that at base, friction included [J]."""
         total = 0.0
         for state in self.states:
             total += state.change(q[: self.owned], base[: self.owned])
@@ -164,7 +164,7 @@ class Contact:
         return [state.friction.all_secant() if state.friction else None for state in self.states]
 
     def passes_kinks(self, q: Positions, base: Positions) -> Secants:
-        """Return the same for the nodes alone whose friction has a kink on their way from base to q."""
+        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
         return [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
 
     def hessian(self, q: Positions, true: bool, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:

@@ -167,7 +167,7 @@ class Barrier:
         return _kept(self._share(start, end, candidates, self.folded))
 
     def sweep(self, start: Positions, moved: Rows, aside: float) -> tuple[float, "SweptPairs"]:
-        """Return the same of any way, and the pairs that come near on it, up to where points meet.
+        """Return the free share of any way, as ``free_share`` does, and the pairs near it, up to where points meet.
 
         aside : [m], as far as points may be from the way and have no other pairs
         """
@@ -190,7 +190,7 @@ class Barrier:
         return candidates
 
     def free_share_in_creases(self, start: Positions, moved: Rows) -> float:
-        """Return the same where no others can meet."""
+        """Return the free share of a way on which only pairs in creases can meet."""
         return _kept(self._share(start, start + moved, self.folded))
 
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:

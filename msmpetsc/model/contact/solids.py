@@ -84,18 +84,18 @@ class Faces:
         return len(self.points) > 1
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """As of every Solid."""
+        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         depths, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
         sides = no_sides(q) if sides is None else sides
         _depths_of(len(q), q, self.points, self.normals_of_faces, sides, depths, face)
         return depths, face
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """As of every Solid."""
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return self.normals_of_faces[face]
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """As of every Solid."""
+        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m]."""
         return -(moved * self.normals_of_faces[face]).sum(axis=1)
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
@@ -105,7 +105,7 @@ class Faces:
         return sides
 
     def sent(self, send: Send) -> "Faces":
-        """As of every Solid."""
+        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, points=send(self.points), normals_of_faces=send(self.normals_of_faces))
 
 
@@ -118,23 +118,23 @@ class BallSolid:
     has_sides = False
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """As of every Solid."""
+        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         return self.radius - np.linalg.norm(q - self.center, axis=1), one_face(q)
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """As of every Solid."""
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         out = q - self.center
         return out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """As of every Solid: |u| - |v| = (u - v) (u + v) / (|u| + |v|)."""
+        """Return how much deeper positions within lie: |u| - |v| = (u - v) (u + v) / (|u| + |v|), (n,) [m]."""
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
         return -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
 
     def sent(self, send: Send) -> "BallSolid":
-        """As of every Solid."""
+        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, center=send(self.center))
 
 

@@ -7,12 +7,13 @@ low faces, so a face of the body that lies in a grid plane marks one layer of ce
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Indices, Rows
 from msmpetsc.geometry.clipping import clip_to_layer, extent, grown
 
 SLACK = 1e-12  # of the largest coordinate: above the rounding of an interpolated one, below anything that matters
 
 
-def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def touched_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
     """Return every cell that a triangle touches: exact up to rounding, and conservative within it.
 
     corners   : (f, 3, 3) triangles in cell units
@@ -22,7 +23,7 @@ def touched_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
     return _touched(corners, low.astype(np.int64), high.astype(np.int64))
 
 
-def sampled_cells(corners: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def sampled_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
     """Return the cells of the paper's sample points v3 + (i/n)(v1 - v3) + (j/n)(v2 - v3), n = ceil(longest side).
 
     Misses cells that a triangle only grazes. Arguments and result as in ``touched_cells``.

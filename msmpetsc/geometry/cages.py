@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.boundary import sampled_cells, touched_cells
@@ -39,7 +40,7 @@ class Body:
     comm: MPI.Comm
     surface: Surface | None
     report: SurfaceReport
-    bounds: np.ndarray
+    bounds: Rows
 
 
 @dataclass(frozen=True)
@@ -54,16 +55,16 @@ class Cages:
 
     grids: BodyGrids
     table: SortedKeys
-    kind: np.ndarray
-    share: np.ndarray | None = None
+    kind: Array
+    share: Rows | None = None
     fills: tuple[bool, ...] = (False,)
 
     @property
-    def ijk(self) -> np.ndarray:
+    def ijk(self) -> Indices:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
-    def share_of(self, ijk: np.ndarray) -> np.ndarray | None:
+    def share_of(self, ijk: Indices) -> Rows | None:
         """Return the shares (c, 2, 2, 2) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
         return None if self.share is None else self.table.rows_of(encode_morton(ijk), self.share)
 
@@ -77,8 +78,8 @@ class SlabCells:
     columns  : what the triangles cut out of cells; None where that was not asked for or the surface does not tell
     """
 
-    boundary: np.ndarray
-    gaps: np.ndarray
+    boundary: Indices
+    gaps: Indices
     columns: Columns | None
 
     def count(self, comm: MPI.Comm) -> int:
@@ -112,9 +113,7 @@ def fill(
     return Cages(grids, table, route.send(kind)[order], share, fills)
 
 
-def _cells_of(
-    body: Body, grid: Grid, cells: SlabCells, boundary: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _cells_of(body: Body, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Rows | None]:
     """Return grid index (n, 3), kind (n,) and shares (n, 2, 2, 2) of this rank's cells of a body (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
@@ -123,7 +122,7 @@ def _cells_of(
     return ijk, kind, None if share is None else np.concatenate([share, np.ones((len(interior), 2, 2, 2))])
 
 
-def _share(body: Body, grid: Grid, cells: SlabCells) -> np.ndarray | None:
+def _share(body: Body, grid: Grid, cells: SlabCells) -> Rows | None:
     """Return the shares (b, 2, 2, 2) of boundary cells; None, with a warning, if the surface does not tell."""
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
@@ -171,14 +170,14 @@ def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: st
     return cells
 
 
-def _columns(body: Body, corners: np.ndarray, shape: np.ndarray, slab: Slab) -> Columns | None:
+def _columns(body: Body, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
     """Return what the triangles cut out of this rank's cells, None if they are not wound one way (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
     return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
 
 
-def _limits(shape: np.ndarray, slab: Slab) -> tuple[np.ndarray, np.ndarray]:
+def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
     """Return the first cell of a slab, and the one after its last, along each axis."""
     return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
 
@@ -197,7 +196,7 @@ def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
             raise InputError(f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}")
 
 
-def _axes(body: Body) -> np.ndarray:
+def _axes(body: Body) -> Indices:
     return np.roll([0, 1, 2], -int(np.argmax(body.bounds[1] - body.bounds[0])))
 
 
@@ -209,7 +208,7 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
         )
 
 
-def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
+def _slab_triangles(body: Body, grid: Grid, axes: Indices) -> Rows:
     """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
@@ -223,7 +222,7 @@ def _slab_triangles(body: Body, grid: Grid, axes: np.ndarray) -> np.ndarray:
     return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
 
 
-def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np.ndarray:
+def _mark(corners: Rows, shape: Indices, slab: Slab, method: str) -> Indices:
     """Return the distinct boundary cells (b, 3) of the slab in lexicographic order.
 
     The paper's samples of a triangle may lie in another slab than its rank's, but then the
@@ -236,7 +235,7 @@ def _mark(corners: np.ndarray, shape: np.ndarray, slab: Slab, method: str) -> np
     return unpacked(np.unique(np.concatenate(keys)))
 
 
-def _gaps_by_winding(body: Body, grid: Grid, axes: np.ndarray, slab: Slab, boundary: np.ndarray) -> np.ndarray:
+def _gaps_by_winding(body: Body, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
     """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
 
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.

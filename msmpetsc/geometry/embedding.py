@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.block import ITSELF
@@ -34,9 +35,9 @@ class Embedding:
     indptr, indices, weights : CSR of this rank's rows; the columns are global node numbers
     """
 
-    indptr: np.ndarray
-    indices: np.ndarray
-    weights: np.ndarray
+    indptr: Indices
+    indices: Indices
+    weights: Floats
 
     @property
     def points(self) -> int:
@@ -44,9 +45,7 @@ class Embedding:
         return len(self.indptr) - 1
 
 
-def embed(
-    points: Sequence[np.ndarray], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0
-) -> Embedding:
+def embed(points: Sequence[Positions], cages: Cages, nodes: SortedKeys, kind: str, smoothing: float = 1.0) -> Embedding:
     """Return W for the surface points of all bodies, one after the other (collective).
 
     points    : of each body (v, 3) [m] on rank 0, (0, 3) on the others: all must lie in valid cells of the body
@@ -60,12 +59,19 @@ def embed(
     around = decode_morton(cell_keys)[:, None, :]
     neighbours = cages.table.find(encode_morton(around + CELLS_AROUND)) >= 0
     numbers = nodes.find(encode_morton(around + NODES_AROUND))
-    entries = [_entries(u, neighbours, numbers, cell, row, kind, smoothing, part) for part in _parts(len(u))]
-    rows, columns, weights = (np.concatenate(part) for part in zip(*entries, strict=True))
+
+    def entries(part: slice) -> tuple[Indices, Indices, Floats]:
+        """Return the nonzero weights of some points as rows, columns and values."""
+        weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
+        point, node = np.nonzero(weights)
+        return row[part][point], numbers[cell[part]][point, node], weights[point, node]
+
+    parts = (slice(start, start + CHUNK) for start in range(0, max(len(u), 1), CHUNK))
+    rows, columns, weights = (np.concatenate(part) for part in zip(*map(entries, parts), strict=True))
     return _gather_rows(comm, rows, columns, weights, total, nodes.total)
 
 
-def _to_cells(points: Sequence[np.ndarray], cages: Cages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
     """Send each point to its cell's rank: its number there, its cell (p, 3), its coordinates in the cell (p, 3)."""
     at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
     cells = [np.floor(of_body).astype(np.int64) for of_body in at]
@@ -75,29 +81,7 @@ def _to_cells(points: Sequence[np.ndarray], cages: Cages) -> tuple[np.ndarray, n
     return route.send(np.arange(len(u))), route.send(ijk), route.send(u)
 
 
-def _parts(count: int) -> list[slice]:
-    return [slice(start, start + CHUNK) for start in range(0, max(count, 1), CHUNK)]
-
-
-def _entries(
-    u: np.ndarray,
-    neighbours: np.ndarray,
-    numbers: np.ndarray,
-    cell: np.ndarray,
-    row: np.ndarray,
-    kind: str,
-    smoothing: float,
-    part: slice,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the nonzero weights of some points as rows, columns and values."""
-    weights = stencil_weights(kind, u[part], neighbours[cell[part]], smoothing)
-    point, node = np.nonzero(weights)
-    return row[part][point], numbers[cell[part]][point, node], weights[point, node]
-
-
-def _gather_rows(
-    comm: MPI.Comm, rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, total: int, nodes: int
-) -> Embedding:
+def _gather_rows(comm: MPI.Comm, rows: Indices, columns: Indices, weights: Floats, total: int, nodes: int) -> Embedding:
     """Bring rows to the ranks that keep them: equal contiguous ranges."""
     first = total * np.arange(comm.size + 1) // comm.size
     route = Route(comm, np.searchsorted(first[1:], rows, side="right"))
@@ -107,7 +91,7 @@ def _gather_rows(
     return Embedding(csr.indptr, csr.indices, csr.data)
 
 
-def stencil_weights(kind: str, u: np.ndarray, neighbours: np.ndarray, smoothing: float = 1.0) -> np.ndarray:
+def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:
     """Return the weights (p,64) of the nodes around points in valid cells; lengths in units of the cell size.
 
     u          : (p,3) coordinates in the cell, in [0,1]

@@ -10,6 +10,7 @@ from functools import cached_property
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.errors import InputError
 
 BITS = 21  # an axis: three of them fill 63 bits of a key
@@ -23,12 +24,12 @@ SAME = 1e-9  # cells: a body that is this close to a whole number of cells long 
 class Grid:
     """Cubes of side ``cell_size`` [m] from ``origin`` (3,) [m]; ``shape`` (3,) of them cover the body."""
 
-    origin: np.ndarray
+    origin: Floats
     cell_size: float
-    shape: np.ndarray
+    shape: Indices
 
     @classmethod
-    def covering(cls, bounds: np.ndarray, cell_size: float) -> "Grid":
+    def covering(cls, bounds: Rows, cell_size: float) -> "Grid":
         """Return the grid that starts at the low corner of ``bounds`` (2, 3) [m].
 
         Raises InputError for a cell size too small to number the cells along an axis.
@@ -41,16 +42,16 @@ class Grid:
             )
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 
-    def to_cells(self, points: np.ndarray) -> np.ndarray:
+    def to_cells(self, points: Positions) -> Rows:
         """Return points (..., 3) [m] in units of cells, kept within the grid: its last cells own its far faces."""
         inside = np.nextafter(self.shape.astype(float), 0)
         return np.clip((points - self.origin) / self.cell_size, 0, inside)
 
-    def node_positions(self, ijk: np.ndarray) -> np.ndarray:
+    def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
 
-    def nearest_nodes(self, points: np.ndarray) -> np.ndarray:
+    def nearest_nodes(self, points: Positions) -> Indices:
         """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
         return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
 
@@ -67,7 +68,7 @@ class BodyGrids:
     grids: tuple[Grid, ...]
 
     @classmethod
-    def covering(cls, bounds: Sequence[np.ndarray], cell_size: float) -> "BodyGrids":
+    def covering(cls, bounds: Sequence[Rows], cell_size: float) -> "BodyGrids":
         """Return the grids of bodies in these bounding boxes (2, 3) [m].
 
         Raises InputError for a cell size too small to number the cells.
@@ -92,25 +93,25 @@ class BodyGrids:
         return 2 << longest.bit_length() if len(self.grids) > 1 else 0
 
     @cached_property
-    def _origins(self) -> np.ndarray:
+    def _origins(self) -> Indices:
         return np.array([grid.origin for grid in self.grids])
 
-    def first(self, body: int | np.ndarray) -> np.ndarray:
+    def first(self, body: int | Indices) -> Indices:
         """Return the grid index (..., 3) of a body's first cell."""
         return np.asarray(body)[..., None] * np.array([self.room, 0, 0])
 
-    def body_of(self, ijk: np.ndarray) -> np.ndarray:
+    def body_of(self, ijk: Indices) -> Indices:
         """Return the number (...,) of the body that grid indices (..., 3) are of."""
         return (ijk[..., 0] // self.room).astype(np.int64) if self.room else np.zeros(ijk.shape[:-1], np.int64)
 
-    def node_positions(self, ijk: np.ndarray) -> np.ndarray:
+    def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
         if not self.room:
             return self.grids[0].node_positions(ijk)
         body = self.body_of(ijk)
         return self._origins[body] + (ijk - self.first(body)) * self.cell_size
 
-    def nearest_nodes(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+    def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
         """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
         if not self.room:
             return self.grids[0].nearest_nodes(points)
@@ -153,17 +154,17 @@ def _decode(keys, ijk):
         ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)
 
 
-def packed(ijk: np.ndarray) -> np.ndarray:
+def packed(ijk: Indices) -> Indices:
     """Return one key (n,) for each grid index (n, 3), which sorts as (i, j, k) does."""
     return ijk @ PACK
 
 
-def unpacked(keys: np.ndarray) -> np.ndarray:
+def unpacked(keys: Indices) -> Indices:
     """Return the grid index (n, 3) of each key of ``packed``."""
     return np.stack([keys // PACK[0], keys // PACK[1] % LIMIT, keys % LIMIT], axis=1)
 
 
-def encode_morton(ijk: np.ndarray) -> np.ndarray:
+def encode_morton(ijk: Indices) -> Indices:
     """Return the Morton key of each grid index, (..., 3) int -> (...,) int64; -1 outside 0..LIMIT - 1."""
     rows = np.ascontiguousarray(ijk, np.int64).reshape(-1, 3)
     keys = np.empty(len(rows), np.int64)
@@ -171,7 +172,7 @@ def encode_morton(ijk: np.ndarray) -> np.ndarray:
     return keys.reshape(np.shape(ijk)[:-1])
 
 
-def decode_morton(keys: np.ndarray) -> np.ndarray:
+def decode_morton(keys: Indices) -> Indices:
     """Return the grid index of each Morton key, (...,) int64 -> (..., 3) int64."""
     flat = np.ascontiguousarray(keys, np.int64).reshape(-1)
     ijk = np.empty((len(flat), 3), np.int64)

@@ -2,18 +2,19 @@
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.scene.body import Region
 
 EDGE = 1e-6  # of the longest side: what is this near to a region is on its edge; many meshes have single precision
 
 
-def frame_of(region: Region, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def frame_of(region: Region, bounds: Rows) -> tuple[Floats, Floats, float]:
     """Return the origin (3,), the scale (3,) and the length [m] that a region's numbers are in."""
     sides = bounds[1] - bounds[0]
     return (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
 
 
-def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
     """Return which points (n, 3) [m] lie in a region or on its edge, (n,) bool.
 
     Sides of a box at the body's bounding box, or beyond it, are open outwards: cells stick out there.
@@ -35,9 +36,7 @@ def inside(region: Region, points: np.ndarray, bounds: np.ndarray) -> np.ndarray
     return (points - point) @ np.asarray(region.half_space.normal) >= -edge
 
 
-def inside_bodies(
-    region: Region, points: np.ndarray, bounds: np.ndarray, body: np.ndarray, meant: int | None
-) -> np.ndarray:
+def inside_bodies(region: Region, points: Positions, bounds: Rows, body: Indices, meant: int | None) -> Mask:
     """Return which points (n, 3) [m] of bodies lie in a region, (n,) bool.
 
     bounds : (b, 2, 3) each body's bounding box at rest [m]

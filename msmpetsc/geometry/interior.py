@@ -14,6 +14,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from msmpetsc.backend.arrays import Indices, Mask
 from msmpetsc.comm import Route
 
 EXTERIOR = 0
@@ -34,14 +35,14 @@ class Slab:
         return cls(planes * min(rank, used) // used, planes * min(rank + 1, used) // used, planes)
 
     @staticmethod
-    def owner(plane: np.ndarray, size: int, planes: int) -> np.ndarray:
+    def owner(plane: Indices, size: int, planes: int) -> Indices:
         """Return the rank whose slab holds each plane."""
         used = min(size, planes)
         edges = planes * np.arange(1, used, dtype=np.int64) // used
         return np.searchsorted(edges, plane, side="right")
 
 
-def enclosed_gaps(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarray:
+def enclosed_gaps(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
     """Return the gaps that no path of face neighbours joins with the outside (collective).
 
     boundary : (b, 3) int64 distinct boundary cells of this rank's slab, in lexicographic order
@@ -55,7 +56,7 @@ def enclosed_gaps(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarra
     return gaps[own][label[own] != EXTERIOR]
 
 
-def cells_of_gaps(gaps: np.ndarray) -> np.ndarray:
+def cells_of_gaps(gaps: Indices) -> Indices:
     """Return the cells of gaps (i, j, k first, k last), (c, 3) int64."""
     length = gaps[:, 3] - gaps[:, 2] + 1
     cells = np.repeat(gaps[:, :3], length, axis=0)
@@ -63,17 +64,17 @@ def cells_of_gaps(gaps: np.ndarray) -> np.ndarray:
     return cells
 
 
-def _to_previous(comm: MPI.Comm, rows: np.ndarray) -> np.ndarray:
+def _to_previous(comm: MPI.Comm, rows: Indices) -> Indices:
     """Send rows to the rank before this one; rank 0 has none and sends nothing."""
     rows = rows if comm.rank > 0 else rows[:0]
     return Route(comm, np.full(len(rows), comm.rank - 1)).send(rows)
 
 
-def _next_plane(comm: MPI.Comm, boundary: np.ndarray, slab: Slab) -> np.ndarray:
+def _next_plane(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
     return _to_previous(comm, boundary[boundary[:, 0] == slab.first])
 
 
-def _join(comm: MPI.Comm, gaps: np.ndarray, label: np.ndarray, own: np.ndarray, slab: Slab) -> np.ndarray:
+def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) -> Indices:
     """Return the labels made global and equal wherever components of neighbouring slabs are one."""
     count = int(label.max(initial=EXTERIOR))
     offset = comm.exscan(count) or 0  # type: ignore[attr-defined]  # an intracommunicator

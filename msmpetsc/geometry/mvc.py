@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
 
 FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with its leading terms removed
@@ -26,9 +27,9 @@ FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with 
 class View(NamedTuple):
     """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
 
-    planes: np.ndarray  # (3,4) heights of the block's grid planes over p
-    angles: np.ndarray  # (144,) g_jk of the grid edges; 0 = not yet
-    squares: np.ndarray  # (108,4) weights of the grid squares; NaN = not yet
+    planes: Array  # (3,4) heights of the block's grid planes over p
+    angles: Array  # (144,) g_jk of the grid edges; 0 = not yet
+    squares: Array  # (108,4) weights of the grid squares; NaN = not yet
 
 
 @numba.njit(cache=True)

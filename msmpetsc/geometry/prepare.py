@@ -1,12 +1,13 @@
 """Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask
 from msmpetsc.errors import InputError, as_expected
 from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, compact, edge_use, examine, first_of_equal, merged_triangles
@@ -22,7 +23,7 @@ FARTHEST = 1e12  # in the file's own unit
 
 def prepare(
     surface: Surface,
-    steps: Sequence[str | dict],
+    steps: Sequence[str | dict[str, Any]],
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
@@ -134,7 +135,7 @@ def orient(surface: Surface) -> Surface:
     return Surface(surface.points, triangles)
 
 
-def rotate(surface: Surface, turn: dict) -> Surface:
+def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
     """Turn about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
     from scipy.spatial.transform import Rotation  # a slow import for what few scenes do
 
@@ -172,13 +173,13 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
     return result
 
 
-def _bounds(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(surface: Surface) -> tuple[Floats, Floats]:
     """Return the lowest and highest coordinates of the points in use, (3,) each."""
     points = surface.points[np.unique(surface.triangles)]
     return points.min(axis=0), points.max(axis=0)
 
 
-def part_labels(surface: Surface) -> np.ndarray:
+def part_labels(surface: Surface) -> Indices:
     """Return the number (f,) of the connected part of each triangle; points of equal position connect."""
     triangles = first_of_equal(surface.points)[surface.triangles]
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
@@ -209,7 +210,7 @@ def _two_triangles_an_edge(surface: Surface) -> bool:
     return bool((used == 2).all())
 
 
-def _consistent_winding(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _consistent_winding(triangles: Indices) -> tuple[Indices, Mask]:
     """Return for each of the (f, 3) merged triangles its patch, and whether to flip it.
 
     Every triangle stands twice in a graph, as it is and flipped; neighbours are linked in the

@@ -61,7 +61,7 @@ class NamedMesh:
     credit: str
     downloads: tuple[Download, ...] = ()
     packaged: Packaged | None = None
-    steps: tuple[str | dict, ...] = ()
+    steps: tuple[str | dict[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class MeshFile:
     """A file that holds a model, and the steps it still needs."""
 
     path: Path
-    steps: tuple[str | dict, ...]
+    steps: tuple[str | dict[str, Any], ...]
     where: str
 
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Indices, Rows
 from msmpetsc.geometry.clipping import clip_to_layer, extent, grown
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
@@ -44,12 +45,12 @@ class Columns:
     below   : (c, 2, 2) winding number below the cell, a mean over its base weighted by each corner's bilinear function
     """
 
-    keys: np.ndarray
-    corners: np.ndarray
-    below: np.ndarray
+    keys: Indices
+    corners: Rows
+    below: Rows
 
     @classmethod
-    def crossed(cls, triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> "Columns":
+    def crossed(cls, triangles: Rows, low: Indices, high: Indices) -> "Columns":
         """Return those of triangles (f, 3, 3) within low <= cell < high, (3,) int."""
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
@@ -66,7 +67,7 @@ class Columns:
         lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
         return float(np.abs(self.below[lowest]).max(initial=0.0))
 
-    def corner_shares(self, cells: np.ndarray) -> np.ndarray:
+    def corner_shares(self, cells: Indices) -> Rows:
         """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3)."""
         if len(self.keys) == 0:
             return np.zeros((len(cells), 2, 2, 2))
@@ -78,7 +79,7 @@ class Columns:
         return np.where((found == keys)[:, None, None, None], self.corners[place], uncut[..., None])
 
 
-def _sums_of_keys(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
     """Return the distinct keys (c,) in ascending order, and the sums (c, 12) of the rows (p, 12) of each."""
     distinct, place = np.unique(keys, return_inverse=True)
     return distinct, np.stack([np.bincount(place, rows, len(distinct)) for rows in values.T], axis=1)
@@ -152,7 +153,7 @@ def _add_sums(p, q, r, cell, sums):
             sums[8 + edge] += part * 0.5 * z * z
 
 
-def sampled_shares(surface: Surface, grid: Grid, cells: np.ndarray) -> np.ndarray:
+def sampled_shares(surface: Surface, grid: Grid, cells: Indices) -> Rows:
     """Return the shares (c, 2, 2, 2) of the corners of the grid's cells (c, 3), by samples in an open surface."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis

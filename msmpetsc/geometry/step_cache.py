@@ -46,7 +46,7 @@ def _folder() -> Path:
     return Path(pooch.os_cache("msmpetsc")) / "prepared"
 
 
-def _key(step: Callable[..., Surface], surface: Surface, values: tuple) -> str:
+def _key(step: Callable[..., Surface], surface: Surface, values: tuple[object, ...]) -> str:
     """Return a hash of all that the result depends on: mesh, step, values, our sources and the libraries."""
     digest = hashlib.sha256(json.dumps([step.__name__, values, [_version(name) for name in LIBRARIES]]).encode())
     for array in (surface.points, surface.triangles):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
@@ -21,8 +22,8 @@ class Surface:
     triangles : (f, 3) int64, corners of each triangle as rows of ``points``
     """
 
-    points: np.ndarray
-    triangles: np.ndarray
+    points: Positions
+    triangles: Array
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface | None:
@@ -34,13 +35,13 @@ def joined(surfaces: Sequence[Surface]) -> Surface | None:
     return Surface(np.concatenate([surface.points for surface in surfaces]), np.concatenate(triangles))
 
 
-def compact(points: np.ndarray, triangles: np.ndarray) -> Surface:
+def compact(points: Positions, triangles: Indices) -> Surface:
     """Return the surface of these triangles and only their points, in the order they had."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
-def bounds_of(surface: Surface) -> np.ndarray:
+def bounds_of(surface: Surface) -> Rows:
     """Return the bounding box (2, 3) [m] of all points."""
     return np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
 
@@ -134,14 +135,14 @@ def _warnings(report: SurfaceReport) -> list[str]:
     return warnings
 
 
-def is_inside(surface: Surface, points: np.ndarray) -> np.ndarray:
+def is_inside(surface: Surface, points: Positions) -> Mask:
     """Return which points (n, 3) are inside: their winding number is above 1/2 in size (Jacobson et al. 2013)."""
     import igl  # for open surfaces, and scenes with obstacles
 
     return np.abs(igl.fast_winding_number(surface.points, surface.triangles, points)) > 0.5
 
 
-def merged_triangles(surface: Surface) -> np.ndarray:
+def merged_triangles(surface: Surface) -> Indices:
     """Return the triangles (g, 3) over merged points.
 
     Equal positions have the number of the first of them; triangles left with fewer than three corners are dropped.
@@ -151,7 +152,7 @@ def merged_triangles(surface: Surface) -> np.ndarray:
     return triangles[(a != b) & (b != c) & (c != a)]
 
 
-def first_of_equal(points: np.ndarray) -> np.ndarray:
+def first_of_equal(points: Positions) -> Indices:
     """Return for each point (v,) the lowest number of a point of exactly the same position."""
     order = np.lexsort(points.T)  # stable: equal points stay in the order of their numbers
     sorted_points = points[order]
@@ -162,7 +163,7 @@ def first_of_equal(points: np.ndarray) -> np.ndarray:
     return first
 
 
-def edge_use(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def edge_use(triangles: Indices) -> tuple[Indices, Indices]:
     """Return for each undirected edge (e,) how many triangles use it, and how many of those run along it upwards.
 
     Upwards is from its lower to its higher point number.

@@ -15,6 +15,7 @@ explicit step need be shorter. What is inside weighs what it should.
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Rows
 from msmpetsc.model.material import CELLS_AROUND, ISOTROPIC
 
 # corners of a cell in VTK's hexahedron order, which is also the order in the file
@@ -26,11 +27,11 @@ MEAN = MEANT / MEANT.sum(axis=2, keepdims=True)
 STRENGTH = np.where(KIND > 0, ISOTROPIC[KIND] / np.maximum(CELLS_AROUND[KIND], 1), 0.0)  # (8, 8) of a cell's springs
 
 
-def shares_of_pairs(share: np.ndarray) -> np.ndarray:
+def shares_of_pairs(share: Rows) -> Rows:
     """Return the shares (c, 8, 8) of a whole cell's springs, by their two ends, from those of corners (c, 8)."""
     return np.einsum("cv,abv->cab", share, MEAN, optimize=True)
 
 
-def shares_of_mass(of_pairs: np.ndarray) -> np.ndarray:
+def shares_of_mass(of_pairs: Rows) -> Rows:
     """Return the share (c, 8) of an eighth of a whole cell's mass that each corner has, from the springs' (c, 8, 8)."""
     return np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(axis=1)

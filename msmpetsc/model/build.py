@@ -7,6 +7,7 @@ from functools import cached_property, reduce
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
@@ -17,6 +18,7 @@ from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.model.clamp import clamped
 from msmpetsc.model.contact.build import build_obstacles, surfaces_of
+from msmpetsc.model.contact.friction import STICK
 from msmpetsc.model.contact.obstacle import Obstacle
 from msmpetsc.model.contact.outside import distance_outside, nearest_of_body
 from msmpetsc.model.contact.penalty import Penalty
@@ -33,7 +35,6 @@ from msmpetsc.scene.schema import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
-STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
 FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
 USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
 
@@ -69,7 +70,7 @@ class Model:
     obstacles: tuple[Obstacle, ...] = ()
 
     @property
-    def body_of_point(self) -> np.ndarray:
+    def body_of_point(self) -> Indices:
         """Number (v,) of the body of each surface point, on rank 0."""
         points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
         return np.repeat(np.arange(len(points)), points)
@@ -92,7 +93,7 @@ class Geometry:
         self.bodies = read_bodies(comm, scene)
         self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
-        self._nearest: np.ndarray | None = None
+        self._nearest: Positions | None = None
 
     def fits(self, scene: Scene) -> bool:
         """Return whether a scene has these meshes and these cages."""
@@ -105,7 +106,7 @@ class Geometry:
         _, _, cages = self.source
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
-    def nearest(self, lattice: Lattice) -> np.ndarray:
+    def nearest(self, lattice: Lattice) -> Positions:
         """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective).
 
         lattice : of this shape, of any material
@@ -114,7 +115,7 @@ class Geometry:
             self._nearest = nearest_of_body(self.bodies, self.cages, lattice)
         return self._nearest
 
-    def outside(self, lattice: Lattice) -> np.ndarray | None:
+    def outside(self, lattice: Lattice) -> Floats | None:
         """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective)."""
         return None if self.cages.share is None else distance_outside(lattice, self.nearest(lattice))
 
@@ -135,7 +136,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     anchors = _anchors(scene, lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
-    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
+    reaches = reach_of(comm, scene, lattice, anchors, masks)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     return Model(
@@ -158,7 +159,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     )
 
 
-def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
+def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
     """Return the model with the arrays that each step works with sent where ``send`` takes them.
 
     What only prepares steps stays in the memory of the CPU.
@@ -185,7 +186,7 @@ def to_device(model: Model, send: Callable[[np.ndarray], np.ndarray]) -> Model:
 def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[Body, ...]:
     """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
 
-    def read() -> tuple[list[Surface], list[tuple[SurfaceReport, np.ndarray]]]:
+    def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
         surfaces, reports = zip(*_prepared(scene), strict=True)
         return list(surfaces), list(zip(reports, map(bounds_of, surfaces), strict=True))
 
@@ -267,7 +268,7 @@ def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
     return anchors
 
 
-def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: np.ndarray, anchors: list[Anchor]) -> None:
+def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, anchors: list[Anchor]) -> None:
     if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
         what = "pin or anchor" if anchors else "pin"
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
@@ -311,7 +312,7 @@ def _exchanges(scene: Scene, obstacles: list[Obstacle]) -> list[Exchange]:
 
 
 def _penalties(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: np.ndarray, obstacles: list[Obstacle]
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: Rows, obstacles: list[Obstacle]
 ) -> list[Penalty]:
     pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response != "exchange"]
     if not pressing:

@@ -13,6 +13,7 @@ from itertools import chain
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Mask, Positions
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.reach import Regions
 from msmpetsc.model.region import Finder
@@ -21,10 +22,10 @@ from msmpetsc.scene.schema import Scene
 LEAST = 0.1  # free part of a spring: what is stiffer costs iterations, and short explicit steps
 HALVINGS = 20  # of the way to the edge
 
-Within = Callable[[np.ndarray], np.ndarray]  # points (n, 3) [m] -> (n,) bool
+Within = Callable[[Positions], Mask]  # points (n, 3) [m] -> (n,) bool
 
 
-def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: np.ndarray) -> Lattice:
+def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions) -> Lattice:
     """Return the lattice with the springs that pins, and anchors that never let go, cut.
 
     points : (l, 3) of the bodies that nodes are nearest to [m]
@@ -37,7 +38,7 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
     fast, free = np.where(held[a], (a, b), (b, a))[:, cut]
     body = lattice.body[free]
 
-    def within(x: np.ndarray) -> np.ndarray:
+    def within(x: Positions) -> Mask:
         return np.any([np.zeros(len(x), bool), *(finder.inside(table, x, body) for table in tables)], axis=0)
 
     start, end = lattice.nodes[free], lattice.nodes[fast]
@@ -47,7 +48,7 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
     return replace(lattice, stiffness=stiffness)
 
 
-def _free_part(within: Within, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _free_part(within: Within, start: Positions, end: Positions) -> Floats:
     """Return which part (n,) of the way from ``start`` to ``end`` (n, 3) lies before what is ``within``.
 
     It is LEAST at least, and 1 where the way does not lead in from outside.

@@ -3,10 +3,11 @@
 from dataclasses import replace
 from functools import reduce
 from itertools import compress
+from typing import Any
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
 from msmpetsc.model.build import Model
 from msmpetsc.model.contact.friction import Movers, apply_friction
 from msmpetsc.model.contact.obstacle import Obstacle
@@ -38,7 +39,7 @@ class Environment:
         self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
         self.strikes = bool(self.exchanges) or any(p.restitution is not None for p in self.penalties)
         nodes = self.lattice.nodes
-        self.no_sides = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
+        self.no_sides: Indices = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
         self._states_of_loads: list[bool | tuple[float, ...]] = []
         self._load = np.zeros((self.lattice.owned, 3), like=nodes)
 
@@ -50,7 +51,7 @@ class Environment:
         times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
         return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
 
-    def begin_step(self, q: np.ndarray, v: np.ndarray, time: float) -> None:
+    def begin_step(self, q: Positions, v: Rows, time: float) -> None:
         """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
 
         So a step is explicit in them: they are of first order in its length, whatever the integrator.
@@ -59,7 +60,7 @@ class Environment:
         for number, force in enumerate(self.own_forces):
             self._own[number] = like(q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time))
 
-    def load(self, time: float) -> np.ndarray:
+    def load(self, time: float) -> Rows:
         """Return the external force f_ext (owned, 3) [N], not to be written to."""
         load = self.given_load(time)
         for force, own in zip(self.own_forces, self._own, strict=True):
@@ -67,7 +68,7 @@ class Environment:
                 load = load + own
         return load
 
-    def given_load(self, time: float) -> np.ndarray:
+    def given_load(self, time: float) -> Rows:
         """Return the part of f_ext that has a potential, (owned, 3) [N]: gravity and forces that are no functions."""
         states = [load.state_at(time) for load in self.loads]
         if states != self._states_of_loads:
@@ -77,7 +78,7 @@ class Environment:
                 self._load += load.force_at(time)
         return self._load
 
-    def load_beyond(self, time: float, end: float) -> np.ndarray | None:
+    def load_beyond(self, time: float, end: float) -> Rows | None:
         """Return how much more forces (owned, 3) [N] that change pull at a time than at the end of its step; or None.
 
         None stands for a scene without such forces.
@@ -94,11 +95,11 @@ class Environment:
         """Return the anchors that have not let go."""
         return [anchor for anchor in self.anchors if anchor.holds_at(time)]
 
-    def fixed_at(self, time: float) -> np.ndarray:
+    def fixed_at(self, time: float) -> Mask:
         """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
         return reduce(np.logical_or, (anchor.where for anchor in self.anchors_at(time)), self.lattice.pinned)
 
-    def prescribed(self, q: np.ndarray, time: float) -> np.ndarray | None:
+    def prescribed(self, q: Positions, time: float) -> Positions | None:
         """Return q with the anchored nodes where they will be; None if there are none."""
         anchors = self.anchors_at(time)
         if not anchors:
@@ -111,7 +112,7 @@ class Environment:
     def is_same(self, begin: float, end: float) -> bool:
         """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
 
-        def at(time: float) -> list:
+        def at(time: float) -> list[Any]:
             loads = [load.state_at(time) for load in self.pulling]
             anchors = [anchor.holds_at(time) and tuple(anchor.path.displacement_at(time)) for anchor in self.anchors]
             return [
@@ -124,20 +125,17 @@ class Environment:
 
     def last_change(self, until: float) -> float:
         """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
-        times: list[float | None] = [time for load in self.pulling for time in load.events]
-        times += [time for anchor in self.anchors for time in (*anchor.path.times.tolist(), anchor.stop)]
-        times += [time for o in self.obstacles for time in (*o.path.times.tolist(), o.start, o.stop)]
-        return max((time for time in times if time is not None and time <= until), default=0.0)
+        return max((time for time in self.events() if time <= until), default=0.0)
 
     def contact_faces(
         self,
-        q: np.ndarray,
-        end: np.ndarray,
+        q: Positions,
+        end: Positions,
         time: float,
         time_step: float,
-        before: np.ndarray | None,
-        held: np.ndarray,
-    ) -> np.ndarray:
+        before: Indices | None,
+        held: Mask,
+    ) -> Indices:
         """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
 
         A plane has but one face, which needs no name.
@@ -154,7 +152,7 @@ class Environment:
                 sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
         return sides
 
-    def same_push(self, q: np.ndarray, time: float, sides_a: np.ndarray, sides_b: np.ndarray) -> bool:
+    def same_push(self, q: Positions, time: float, sides_a: Indices, sides_b: Indices) -> bool:
         """Return whether penalties press on this rank's nodes at q just the same with either sides (o, l)."""
         rows = q[: self.lattice.owned]
         states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
@@ -164,12 +162,12 @@ class Environment:
 
     def contact(
         self,
-        q: np.ndarray,
-        end: np.ndarray,
+        q: Positions,
+        end: Positions,
         time: float,
         time_step: float,
-        sides: np.ndarray,
-        before: np.ndarray | None = None,
+        sides: Indices,
+        before: Positions | None = None,
     ) -> Contact | None:
         """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
 
@@ -184,20 +182,20 @@ class Environment:
             surface = SurfaceContact(self._contacts, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
-    def touch(self, q: np.ndarray) -> Touch:
+    def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts of the surface with itself at q (collective)."""
         return self._contacts.touch(q) if self._contacts else Touch()
 
-    def push(self, time: float, sides: np.ndarray | None) -> Contact | None:
+    def push(self, time: float, sides: Indices | None) -> Contact | None:
         """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
         states = self._states(time, sides)
         return Contact(states, self.lattice.owned) if states else None
 
-    def _states(self, time: float, sides: np.ndarray | None) -> list[ContactState]:
+    def _states(self, time: float, sides: Indices | None) -> list[ContactState]:
         return [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
 
     def apply_friction(
-        self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: np.ndarray
+        self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: Indices
     ) -> None:
         """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to this rank's nodes.
 
@@ -210,9 +208,7 @@ class Environment:
                 pressed = p.state_at(time, side).pressed(nodes.q)
                 apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
 
-    def contact_stiffness_bound(
-        self, q: np.ndarray, speed: float, start: float, time: float, sides: np.ndarray
-    ) -> np.ndarray:
+    def contact_stiffness_bound(self, q: Positions, speed: float, start: float, time: float, sides: Indices) -> Floats:
         """Return (owned,) [N/m] no less than what obstacles add to a node's stiffness from start to ``time``.
 
         q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
@@ -227,7 +223,7 @@ class Environment:
                 stiffness += p.stiffness * ((inside > -reach) | (side > 0))
         return stiffness
 
-    def power(self, q: np.ndarray, time: float, begin: float, end: float, sides: np.ndarray) -> float:
+    def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
         """Return the power [W] of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m].
 
         begin, end : the substep [s] as in which obstacles move
@@ -240,15 +236,15 @@ class Environment:
                 power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
         return power
 
-    def energy_of_new_obstacles(self, q: np.ndarray, begin: float, end: float, sides: np.ndarray) -> float:
+    def energy_of_new_obstacles(self, q: Positions, begin: float, end: float, sides: Indices) -> float:
         """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
         new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
         return Contact(new, self.lattice.owned).energy(q) if new else 0.0
 
     def friction_work_bound(
         self,
-        before: tuple[np.ndarray, np.ndarray | None],
-        after: tuple[np.ndarray, np.ndarray | None],
+        before: tuple[Positions, Indices | None],
+        after: tuple[Positions, Indices | None],
         time: float,
         time_step: float,
     ) -> float:
@@ -260,44 +256,45 @@ class Environment:
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
-            if not p.obstacle.acts_at(time):
-                continue
             way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time)))
-            if p.friction > 0 and way > 0:
-                for (q, sides), when in ((before, time - time_step), (after, time)):
-                    side = (self.no_sides if sides is None else sides)[row, : len(q)]
-                    inside, _ = p.state_at(when, side).depths(q)
-                    work += p.friction * p.stiffness * float(np.maximum(inside, 0).sum()) * way
+            if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
+                for state, when in ((before, time - time_step), (after, time)):
+                    work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
         return work
 
     def change_of_push(
         self,
-        before: tuple[np.ndarray, np.ndarray | None],
-        after: tuple[np.ndarray, np.ndarray | None],
+        before: tuple[Positions, Indices | None],
+        after: tuple[Positions, Indices | None],
         time: float,
         time_step: float,
-    ) -> np.ndarray:
+    ) -> Floats:
         """Return by how much the push of penalties on this rank's nodes changes in a step, (owned,) [N].
 
         before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
         """
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
-            depths = []
-            for (q, sides), when in ((before, time - time_step), (after, time)):
-                side = (self.no_sides if sides is None else sides)[row, : len(q)]
-                acts = p.obstacle.acts_at(when)
-                depths.append(np.maximum(p.state_at(when, side).depths(q)[0], 0) if acts else np.zeros_like(change))
+            depths = [
+                self._pushed(row, state, when) if p.obstacle.acts_at(when) else np.zeros_like(change)
+                for state, when in ((before, time - time_step), (after, time))
+            ]
             change += p.stiffness * np.abs(depths[1] - depths[0])
         return change
 
-    def _pressing(self, time: float, sides: np.ndarray | None) -> list[tuple[Penalty, np.ndarray]]:
+    def _pushed(self, row: int, state: tuple[Positions, Indices | None], time: float) -> Floats:
+        """Return how deep nodes (owned,) of a state are in a penalty's obstacle at a time [s], 0 outside [m]."""
+        q, sides = state
+        side = (self.no_sides if sides is None else sides)[row, : len(q)]
+        return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
+
+    def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
         sides = (self.no_sides if sides is None else sides)[self.pressing]
         return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
 
     def strike(
-        self, q: np.ndarray, q_previous: np.ndarray, step: StepTaken, held: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, float]:
+        self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
+    ) -> tuple[Positions, Positions, float]:
         """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
 
         The arrays are the very same if nothing is struck.
@@ -322,7 +319,7 @@ class Environment:
                     q_previous = before
         return q, q_previous, work
 
-    def _impulse_work(self, obstacle: Obstacle, change: np.ndarray, step: StepTaken) -> float:
+    def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:
         """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""
         if not obstacle.path.leads_away:
             return 0.0

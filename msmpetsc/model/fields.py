@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple, get_type_hints
 
-import numpy as np
+from msmpetsc.backend.arrays import Floats, Positions
 
 SIZES = {
     "T": "frames, at least the finished ones",
@@ -63,8 +63,8 @@ class Frame:
 
     index: int
     time: Annotated[float, _number("f8", "s", "simulated time")]
-    position: Annotated[np.ndarray, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")]
-    surface: Annotated[np.ndarray | None, Field("f4", ("T", "v", 3), "m", "surface points", "surface/points")]
+    position: Annotated[Positions, Field("f8", ("T", "n", 3), "m", "node positions", "lattice/nodes")]
+    surface: Annotated[Positions | None, Field("f4", ("T", "v", 3), "m", "surface points", "surface/points")]
     step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")]
     iterations: Annotated[int, _number("i8", "1", "outer iterations")]
     ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")]
@@ -72,7 +72,7 @@ class Frame:
     elastic: Annotated[float, _number("f8", "J", "elastic energy")]
     potential: Annotated[float, _number("f8", "J", "energy in gravity and forces")]
     contact: Annotated[float, _number("f8", "J", "energy in the push of obstacles")]
-    momentum: Annotated[np.ndarray, Field("f8", ("T", 3), "kg m/s", "momentum")]
+    momentum: Annotated[Floats, Field("f8", ("T", 3), "kg m/s", "momentum")]
     wall_time: Annotated[float, _number("f8", "s", "computing time")]
     true_error: Annotated[float, _number("f8", "1", "true relative error of a step, in position")] = math.nan
     energy_error: Annotated[float, _number("f8", "1", "true relative error of a step, in energy")] = math.nan

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.motion import Start, Twist
 
-InitialState = tuple[np.ndarray, np.ndarray]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 
 
 def at_rest(lattice: Lattice) -> InitialState:
@@ -17,7 +18,7 @@ def at_rest(lattice: Lattice) -> InitialState:
 
 
 def initial_state(
-    comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: np.ndarray, bounds: np.ndarray
+    comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
 ) -> InitialState:
     """Return where nodes are, and how fast, as each body's start has it (collective).
 
@@ -41,7 +42,7 @@ def initial_state(
     return q, velocity
 
 
-def moved(start: Start, nodes: np.ndarray, numbers: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
     """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
     middle = bounds.mean(axis=0)
     q = middle + np.array(start.scale) * (nodes - middle)
@@ -53,7 +54,7 @@ def moved(start: Start, nodes: np.ndarray, numbers: np.ndarray, bounds: np.ndarr
     return q
 
 
-def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Positions:
     """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
 
     The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin, all degrees where
@@ -68,7 +69,7 @@ def twisted(q: np.ndarray, twist: Twist, nodes: np.ndarray, bounds: np.ndarray) 
     return middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
 
 
-def uniform(numbers: np.ndarray) -> np.ndarray:
+def uniform(numbers: Indices) -> Rows:
     """Return three random numbers in [0, 1) for each global node number (n,), (n, 3), whatever ranks there are.
 
     SplitMix64 (Steele, Lea and Flood 2014), its number 3 n + c.
@@ -79,7 +80,7 @@ def uniform(numbers: np.ndarray) -> np.ndarray:
     return ((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
 
 
-def centre_of_mass(comm: MPI.Comm, q: np.ndarray, mass: np.ndarray) -> np.ndarray:
+def centre_of_mass(comm: MPI.Comm, q: Positions, mass: Floats) -> Floats:
     """Return the centre of mass (3,) [m] of all ranks' nodes (collective).
 
     q, mass : (l, 3) [m]; (owned,) [kg]

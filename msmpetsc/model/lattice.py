@@ -12,10 +12,12 @@ import numba
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import SortedKeys, starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
-from msmpetsc.model.boundary_cells import CORNERS, shares_of_mass, shares_of_pairs
+from msmpetsc.model.boundary_cells import CORNERS as CORNERS
+from msmpetsc.model.boundary_cells import shares_of_mass, shares_of_pairs
 from msmpetsc.model.material import CellMaterial, calibrated_stiffness, edge_stiffness
 
 # the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
@@ -49,22 +51,22 @@ class Lattice:
 
     table: SortedKeys
     cell_size: float
-    nodes: np.ndarray
-    ghosts: np.ndarray
-    mass: np.ndarray
-    cells: np.ndarray
-    cell_kind: np.ndarray
-    springs: np.ndarray
+    nodes: Positions
+    ghosts: Indices
+    mass: Floats
+    cells: Indices
+    cell_kind: Array
+    springs: Indices
     springs_owned: int
-    rest_length: np.ndarray
-    stiffness: np.ndarray
-    pinned: np.ndarray
+    rest_length: Floats
+    stiffness: Floats
+    pinned: Mask
     stiffening: float = 0.0
-    local_cells: np.ndarray = field(default_factory=lambda: NO_CELLS)
+    local_cells: Indices = field(default_factory=lambda: NO_CELLS)
     cells_owned: int = 0
-    cell_stiffness: np.ndarray = field(default_factory=lambda: np.empty(0))
-    cell_share: np.ndarray = field(default_factory=lambda: np.empty(0))
-    first_of_body: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
+    cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
+    cell_share: Floats = field(default_factory=lambda: np.empty(0))
+    first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
 
     @property
     def owned(self) -> int:
@@ -72,16 +74,16 @@ class Lattice:
         return len(self.mass)
 
     @property
-    def global_numbers(self) -> np.ndarray:
+    def global_numbers(self) -> Indices:
         """Global number (l,) of each local node."""
         return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
 
-    def body_of(self, numbers: int | np.ndarray) -> np.ndarray:
+    def body_of(self, numbers: int | Indices) -> Indices:
         """Return the number of the body that each of some nodes, by their global numbers, belongs to."""
         return np.searchsorted(self.first_of_body, numbers, side="right") - 1
 
     @property
-    def body(self) -> np.ndarray:
+    def body(self) -> Indices:
         """Number (l,) of the body that each local node belongs to."""
         return self.body_of(self.global_numbers)
 
@@ -89,7 +91,7 @@ class Lattice:
         """Return the greatest stiffness of any spring [N/m] (collective)."""
         return comm.allreduce(self.stiffness.max(initial=0), MPI.MAX)
 
-    def pin(self, where: np.ndarray) -> "Lattice":
+    def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""
         return replace(self, pinned=self.pinned | where)
 
@@ -100,7 +102,7 @@ def build_lattice(
     young_modulus: float | None = None,
     stiffness: float | None = None,
     stiffening: float = 0.0,
-    of_cells: Callable[[np.ndarray], CellMaterial] | None = None,
+    of_cells: Callable[[Indices], CellMaterial] | None = None,
     topology: "Topology | None" = None,
 ) -> Lattice:
     """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
@@ -139,7 +141,7 @@ def build_lattice(
     )
 
 
-def _first_of_body(cages: Cages, ijk: np.ndarray) -> np.ndarray:
+def _first_of_body(cages: Cages, ijk: Indices) -> Indices:
     """Return the global number (b,) of the first node of each body; ijk (owned, 3) of the owned nodes (collective)."""
     bodies = len(cages.grids.grids)
     nodes = cages.table.comm.allreduce(np.bincount(cages.grids.body_of(ijk), minlength=bodies))
@@ -159,16 +161,16 @@ class Topology(NamedTuple):
     """
 
     table: SortedKeys
-    corners: np.ndarray
-    ijk: np.ndarray
-    octants: np.ndarray
-    ghosts: np.ndarray
-    cells: np.ndarray
-    share: np.ndarray | None
-    springs: np.ndarray
+    corners: Indices
+    ijk: Indices
+    octants: Mask
+    ghosts: Indices
+    cells: Indices
+    share: Rows | None
+    springs: Indices
     springs_owned: int
-    kind: np.ndarray
-    sharing: np.ndarray
+    kind: Indices
+    sharing: Indices
 
 
 def topology_of(cages: Cages) -> Topology:
@@ -186,8 +188,8 @@ def topology_of(cages: Cages) -> Topology:
 
 
 def _sums(
-    net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[np.ndarray], CellMaterial] | None
-) -> tuple[np.ndarray, float | np.ndarray, float | np.ndarray]:
+    net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[Indices], CellMaterial] | None
+) -> tuple[Floats, float | Floats, float | Floats]:
     """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
 
     given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
@@ -207,7 +209,7 @@ def _sums(
     return mass, of_spring, share.mean(axis=1) * made_of.spring
 
 
-def _kept_cells(local_cells: np.ndarray, owned: int, stiffening: float) -> tuple[np.ndarray, int]:
+def _kept_cells(local_cells: Indices, owned: int, stiffening: float) -> tuple[Indices, int]:
     """Return which cells a lattice keeps, those of this rank first, and how many these are.
 
     The others, of which an owned node is a corner, matter only where the law stiffens.
@@ -217,7 +219,7 @@ def _kept_cells(local_cells: np.ndarray, owned: int, stiffening: float) -> tuple
     return kept, int(first_owned.sum())
 
 
-def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
     """Return the cells around the owned nodes.
 
     They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
@@ -235,14 +237,12 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[np.ndarray, np.ndarra
     return decode_morton(keys), local, octants
 
 
-def _sums_of_nodes(cells: np.ndarray, values: np.ndarray, owned: int) -> np.ndarray:
+def _sums_of_nodes(cells: Indices, values: Rows, owned: int) -> Array:
     """Return the sum (owned,) of the ``values`` (c, 8) of the corners of cells (c, 8) that are each owned node."""
     return np.bincount(cells.ravel(), values.ravel(), owned)[:owned]
 
 
-def _sums_of_springs(
-    cells: np.ndarray, values: np.ndarray, share: np.ndarray, ijk: np.ndarray, springs: np.ndarray, owned: int
-) -> np.ndarray:
+def _sums_of_springs(cells: Indices, values: Floats, share: Rows, ijk: Indices, springs: Indices, owned: int) -> Floats:
     """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
 
     share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
@@ -312,9 +312,7 @@ BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
 BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
 
 
-def lattice_bytes(
-    cells: float | np.ndarray, nodes: float | np.ndarray, springs: float | np.ndarray
-) -> float | np.ndarray:
+def lattice_bytes(cells: float | Array, nodes: float | Array, springs: float | Array) -> float | Array:
     """Return the bytes of a lattice's arrays, of which there are so many; numbers, or arrays of a number a rank."""
     counts = ((cells, BYTES_OF_CELL), (nodes, BYTES_OF_NODE), (springs, BYTES_OF_SPRING))
     return sum(count * sum(sizes.values()) for count, sizes in counts)

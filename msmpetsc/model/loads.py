@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import ForceFunction
 from msmpetsc.scene.motion import ForceTable, Keyframe
@@ -23,7 +23,7 @@ def within(time: float, start: float, stop: float | None) -> bool:
     return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
 
 
-def interpolated(time: float, times: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def interpolated(time: float, times: Floats, vectors: Rows) -> Floats:
     """Return the vector (3,) at a time on straight lines through vectors (k, 3) at ascending times (k,)."""
     return np.array([np.interp(time, times, along) for along in vectors.T])
 
@@ -32,8 +32,8 @@ def interpolated(time: float, times: np.ndarray, vectors: np.ndarray) -> np.ndar
 class Motion:
     """Displacements (k, 3) [m] at ascending times (k,) [s], straight lines between them; none at time 0, the first."""
 
-    times: np.ndarray
-    displacements: np.ndarray
+    times: Floats
+    displacements: Rows
 
     @classmethod
     def through(cls, keyframes: Iterable[Keyframe]) -> "Motion":
@@ -46,11 +46,11 @@ class Motion:
         """Whether the motion leaves where it starts."""
         return len(self.times) > 1
 
-    def displacement_at(self, time: float) -> np.ndarray:
+    def displacement_at(self, time: float) -> Floats:
         """Return the displacement (3,) [m] at a time [s]; after the last time it is that of the last."""
         return interpolated(time, self.times, self.displacements)
 
-    def displacement_between(self, begin: float, end: float) -> np.ndarray:
+    def displacement_between(self, begin: float, end: float) -> Floats:
         """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
         return self.displacement_at(end) - self.displacement_at(begin)
 
@@ -63,7 +63,7 @@ class Anchor:
     path  : how they move while time < stop [s]; a stop of None never comes
     """
 
-    where: np.ndarray
+    where: Mask
     path: Motion
     stop: float | None
 
@@ -76,8 +76,8 @@ class Anchor:
 class LoadTable:
     """Total forces (k, 3) [N] at ascending times (k,) [s], straight lines between them."""
 
-    times: np.ndarray
-    totals: np.ndarray
+    times: Floats
+    totals: Rows
 
     @classmethod
     def of_scene(cls, total: Vector | ForceTable) -> "LoadTable":
@@ -86,7 +86,7 @@ class LoadTable:
             return cls(np.array(total.times), np.array(total.values))
         return cls(np.zeros(1), np.array([total]))
 
-    def total_at(self, time: float) -> np.ndarray:
+    def total_at(self, time: float) -> Floats:
         """Return the total force (3,) [N] at a time [s]; before the first and after the last time that of those."""
         return interpolated(time, self.times, self.totals)
 
@@ -98,7 +98,7 @@ class Load:
     force : (owned, 3) [N]; with a table each node's share (owned, 1) [-] of its total
     """
 
-    force: np.ndarray
+    force: Rows
     start: float
     stop: float | None
     table: LoadTable | None = None
@@ -107,7 +107,7 @@ class Load:
         """Return whether the force acts at a time [s]."""
         return within(time, self.start, self.stop)
 
-    def force_at(self, time: float) -> np.ndarray:
+    def force_at(self, time: float) -> Rows:
         """Return the force (owned, 3) [N] that acts at a time [s]."""
         return self.force if self.table is None else self.force * like(self.force, self.table.total_at(time))
 
@@ -135,8 +135,8 @@ class OwnForce:
 
     key: str
     function: ForceFunction
-    rows: np.ndarray
-    mass: np.ndarray
+    rows: Indices
+    mass: Floats
     start: float
     stop: float | None
 
@@ -153,7 +153,7 @@ class OwnForce:
         """Times [s] at which the force begins or ends."""
         return [self.start, *([] if self.stop is None else [self.stop])]
 
-    def force_at(self, q: np.ndarray, v: np.ndarray, time: float) -> np.ndarray:
+    def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""
         force = np.zeros((len(q), 3))
         if not len(self.rows):
@@ -171,7 +171,7 @@ class OwnForce:
         return force
 
 
-def spread_by_mass(comm: "MPI.Comm", total: Iterable[float], where: np.ndarray, mass: np.ndarray) -> np.ndarray:
+def spread_by_mass(comm: "MPI.Comm", total: Iterable[float], where: Mask, mass: Floats) -> Rows:
     """Spread a total force [N] over nodes in proportion to their mass, (owned, 3) [N] (collective).
 
     where, mass : (owned,) bool, the nodes; (owned,) [kg]

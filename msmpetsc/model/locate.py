@@ -3,26 +3,26 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
 from msmpetsc.model.elasticity.inversion import inverted_cells
 from msmpetsc.model.lattice import Lattice
 
 
-def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray, measure: np.ndarray) -> str:
+def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: Floats) -> str:
     """Describe the node where a measure is greatest, or not a number (collective).
 
     rows, measure : (k,) local nodes, and what is measured of each
     """
     rows, measure = to_host(rows), np.nan_to_num(to_host(measure), nan=np.inf)
     best = int(np.argmax(measure)) if len(rows) else 0
-    candidate: tuple[float, int, np.ndarray | None] = (-1.0, 0, None)
+    candidate: tuple[float, int, Floats | None] = (-1.0, 0, None)
     if len(rows):
         candidate = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
     _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
     return f"node {number}, {rest_point(lattice, number, point)}"
 
 
-def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int, str]:
+def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> tuple[int, str]:
     """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective)."""
     cells = lattice.local_cells[: lattice.cells_owned]
     count, worst, least = inverted_cells(q, cells)
@@ -36,7 +36,7 @@ def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> tuple[int
     return total, rest_point(lattice, number, point)
 
 
-def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> str:
+def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
     """Return ", 3 cells are inside out", and what to do about it; "" if none is (collective)."""
     count, _ = worst_inverted(comm, lattice, q)
     if not count:
@@ -45,7 +45,7 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: np.ndarray) -> str:
     return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
 
 
-def rest_point(lattice: Lattice, number: int, point: np.ndarray) -> str:
+def rest_point(lattice: Lattice, number: int, point: Floats) -> str:
     """Return a point (3,) [m] at rest in words, with the body of the node of this global number."""
     return f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Indices
+
 EDGE, FACE_DIAGONAL, SPACE_DIAGONAL = 1, 2, 3  # squared length in cells
 
 CELLS_AROUND = np.array([0, 4, 2, 1])  # cells that share a spring of each kind inside a body
@@ -24,13 +26,11 @@ class CellMaterial:
     spring  : (c,) Young's modulus [Pa], or stiffness [N/m] where the material gives that
     """
 
-    density: np.ndarray
-    spring: np.ndarray
+    density: Floats
+    spring: Floats
 
 
-def calibrated_stiffness(
-    young_modulus: float | np.ndarray, cell_size: float, kind: np.ndarray, cells: np.ndarray
-) -> np.ndarray:
+def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices) -> Floats:
     """Return the spring stiffness [N/m] of an isotropic lattice with Young's modulus E [Pa] at small strain.
 
     Assembled cell by cell, so a spring on the body's boundary has the weight of the cells it bounds.
@@ -43,7 +43,7 @@ def calibrated_stiffness(
     return edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
 
 
-def edge_stiffness(young_modulus: float | np.ndarray, cell_size: float) -> float | np.ndarray:
+def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | Floats:
     """Return k1 [N/m] of an edge inside a body of E [Pa], cells of h [m]."""
     return 4 / 7 * young_modulus * cell_size
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.comm import sample_of, splitters_of
 from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.interior import Slab
@@ -29,12 +30,12 @@ class Partition:
     neighbours   : ranks that its ghosts come from: messages that it gets in one exchange, and sends
     """
 
-    cells: np.ndarray
-    nodes: np.ndarray
-    ghosts: np.ndarray
-    inner: np.ndarray
-    cut: np.ndarray
-    neighbours: np.ndarray
+    cells: Array
+    nodes: Array
+    ghosts: Array
+    inner: Array
+    cut: Array
+    neighbours: Array
 
     @property
     def ranks(self) -> int:
@@ -42,12 +43,12 @@ class Partition:
         return len(self.nodes)
 
     @property
-    def springs(self) -> np.ndarray:
+    def springs(self) -> Array:
         """Number of springs (R,) that each rank keeps."""
         return self.inner + self.cut
 
     @property
-    def nonzeros(self) -> np.ndarray:
+    def nonzeros(self) -> Array:
         """Number of nonzeros (R,) of A: a row for each node, its diagonal and the far ends of its springs."""
         return self.nodes + 2 * self.inner + self.cut
 
@@ -137,7 +138,7 @@ def count_partition(bodies: Sequence[Body], cages: Cages, lattice: Lattice, rank
     return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
 
 
-def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> np.ndarray:
+def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> Indices:
     """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
     grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
     of_cell = grids.body_of(ijk)
@@ -148,18 +149,18 @@ def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> np.ndar
     return _cut(keys, [keys[part] for part in _parts(slab, ranks)], ranks)
 
 
-def _ranks_of_nodes(lattice: Lattice, cell_rank: np.ndarray, ranks: int) -> np.ndarray:
+def _ranks_of_nodes(lattice: Lattice, cell_rank: Indices, ranks: int) -> Indices:
     """Return the rank (n,) of each node; each rank first finds the corners of its cells."""
     keys = lattice.table.keys
     return _cut(keys, [keys[np.unique(lattice.cells[part])] for part in _parts(cell_rank, ranks)], ranks)
 
 
-def _parts(rank: np.ndarray, ranks: int) -> list[np.ndarray]:
+def _parts(rank: Indices, ranks: int) -> list[Indices]:
     """Return what each rank has, in ascending order."""
     return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank, minlength=ranks))[:-1])
 
 
-def _cut(keys: np.ndarray, brought: list[np.ndarray], ranks: int) -> np.ndarray:
+def _cut(keys: Indices, brought: list[Indices], ranks: int) -> Indices:
     """Return the rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
     total = sum(map(len, brought))
     sample = np.concatenate([sample_of(part, total, ranks) for part in brought])

@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.model.lattice import CORNERS, Lattice
+from msmpetsc.model.boundary_cells import CORNERS
+from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.material import CellMaterial
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Material, Region
@@ -38,11 +40,11 @@ class Finder:
         return self.bodies[0].comm
 
     @property
-    def bounds(self) -> np.ndarray:
+    def bounds(self) -> Rows:
         """Bounding box at rest (b, 2, 3) [m] of each body."""
         return np.array([body.bounds for body in self.bodies])
 
-    def find(self, table: OfBody, lattice: Lattice, points: np.ndarray) -> np.ndarray:
+    def find(self, table: OfBody, lattice: Lattice, points: Positions) -> Mask:
         """Return the local nodes that the region of a scene's table means, (l,) bool (collective).
 
         points : (l, 3) of the bodies that nodes are nearest to [m]: a node that sticks out is where its body is
@@ -67,11 +69,11 @@ class Finder:
             )  # fmt: skip
         return where
 
-    def inside(self, table: OfBody, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+    def inside(self, table: OfBody, points: Positions, body: Indices) -> Mask:
         """Return which points (n, 3) [m] of bodies (n,) lie in a table's region that is not painted, (n,) bool."""
         return inside_bodies(table.table.region, points, self.bounds, body, table.body)
 
-    def find_cells(self, table: OfBody, ijk: np.ndarray) -> np.ndarray:
+    def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
         """Return which cells (c,) bool have their middles in a region, or hold a painted point (collective).
 
         The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises InputError on all ranks if
@@ -95,12 +97,12 @@ class Finder:
         region = table.table.region
         return f": the body is {body}" + ("" if region.painted else f", the region {_extent(region, bounds[0])}")
 
-    def _painted_cells(self, table: OfBody) -> np.ndarray:
+    def _painted_cells(self, table: OfBody) -> Indices:
         """Return the cells (k, 3) that painted points of a body's surface lie in (collective)."""
         key, number = table.key, table.body or 0  # without a body there is but one: the scene's own
         surface, grid = self.bodies[number].surface, self.cages.grids.grids[number]
 
-        def cells() -> np.ndarray:
+        def cells() -> Indices:
             assert surface is not None  # it is on rank 0, which alone is asked
             points, numbers = surface.points, np.array(self._numbers(key, table.table.region.painted))
             if numbers.max() >= len(points):
@@ -128,18 +130,18 @@ class Finder:
         return numbers
 
 
-def _middles(share: np.ndarray) -> np.ndarray:
+def _middles(share: Rows) -> Rows:
     """Return the centre of mass (c, 3), in cells from the low corner, of what is inside cells by corners' shares."""
     whole = share.sum(axis=(1, 2, 3))
     return np.stack([share.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
 
 
-def _in_words(low: np.ndarray, high: np.ndarray) -> str:
+def _in_words(low: Floats, high: Floats) -> str:
     ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
     return "from ({}) to ({}) m".format(*ends)
 
 
-def _extent(region: Region, bounds: np.ndarray) -> str:
+def _extent(region: Region, bounds: Rows) -> str:
     """Return where a region that is not painted is [m], in words; bounds (2, 3) of its body."""
     origin, scale, length = frame_of(region, bounds)
     if region.box is not None:
@@ -153,7 +155,7 @@ def _extent(region: Region, bounds: np.ndarray) -> str:
     return f"beyond ({at}) m towards ({along})"
 
 
-def cell_materials(scene: Scene, finder: Finder) -> Callable[[np.ndarray], CellMaterial] | None:
+def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMaterial] | None:
     """Return the function from the grid index (c, 3) of cells to what they are made of (collective).
 
     It is None where all cells are of the same material.
@@ -167,7 +169,7 @@ def cell_materials(scene: Scene, finder: Finder) -> Callable[[np.ndarray], CellM
         for name in ("density", spring)
     )
 
-    def of_cells(ijk: np.ndarray) -> CellMaterial:
+    def of_cells(ijk: Indices) -> CellMaterial:
         body = finder.cages.grids.body_of(ijk)
         cells = CellMaterial(density[body], stiffness[body])
         for part in parts:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.model.fields import FRAME_FIELDS
 from msmpetsc.output.reader import Result
@@ -45,8 +46,8 @@ class FieldError:
     name: str
     unit: str
     scale: float = 0.0
-    errors: np.ndarray = field(default_factory=lambda: np.empty(0))
-    worst: np.ndarray = field(default_factory=lambda: np.empty(0, int))
+    errors: Floats = field(default_factory=lambda: np.empty(0))
+    worst: Indices = field(default_factory=lambda: np.empty(0, int))
 
     def first_above(self, rtol: float) -> int | None:
         """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
@@ -63,8 +64,8 @@ class Comparison:
     left_out : fields that only one run has
     """
 
-    pairs: np.ndarray
-    times: np.ndarray
+    pairs: Indices
+    times: Floats
     fields: list[FieldError]
     left_out: list[str]
 
@@ -77,8 +78,8 @@ class Distances(NamedTuple):
     size     : greatest size in any frame, from rest where the field is one of positions
     """
 
-    greatest: np.ndarray
-    worst: np.ndarray
+    greatest: Floats
+    worst: Indices
     size: float
 
 
@@ -117,13 +118,13 @@ def _chosen(a: Result, b: Result, names: Sequence[str] | None) -> tuple[list[str
     return list(dict.fromkeys(names)), []
 
 
-def rest_of(run: Result, name: str) -> np.ndarray | None:
+def rest_of(run: Result, name: str) -> Positions | None:
     """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
     at_rest = FRAME_FIELDS[name].at_rest if name in FRAME_FIELDS else ""
     return run[at_rest][:] if at_rest in run else None
 
 
-def _distances(a: Result, b: Result, name: str, pairs: np.ndarray) -> Distances:
+def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
@@ -141,7 +142,7 @@ def _distances(a: Result, b: Result, name: str, pairs: np.ndarray) -> Distances:
     return Distances(greatest, worst, float(size))
 
 
-def difference(a: np.ndarray, b: np.ndarray, digits: float) -> np.ndarray:
+def difference(a: Array, b: Array, digits: float) -> Floats:
     """Return |a - b| less what rounding to these relative `digits` may do.
 
     It is 0 of two NaN, inf of a NaN and a number.
@@ -152,7 +153,7 @@ def difference(a: np.ndarray, b: np.ndarray, digits: float) -> np.ndarray:
     return np.maximum(np.where(np.isnan(apart), np.inf, apart), 0.0)
 
 
-def _row_lengths(rows: np.ndarray) -> np.ndarray:
+def _row_lengths(rows: Array) -> Floats:
     """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
@@ -160,7 +161,7 @@ def _row_lengths(rows: np.ndarray) -> np.ndarray:
         return np.atleast_1d(np.linalg.norm(rows, axis=-1)).ravel()
 
 
-def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: np.ndarray) -> dict[str, float]:
+def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
     """Return what the errors of each field are relative to."""
     scales = {name: distance.size for name, distance in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
@@ -176,13 +177,13 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: np.nda
     return scales
 
 
-def longest_side(points: np.ndarray, body: np.ndarray) -> float:
+def longest_side(points: Positions, body: Indices) -> float:
     """Return the longest side [m] of the bounding box of any body's points (n, 3); ``body`` (n,) are their numbers."""
     of_bodies = (points[body == number] for number in np.unique(body))
     return float(max((np.ptp(own, axis=0).max() for own in of_bodies), default=0.0))
 
 
-def _largest(a: Result, b: Result, pairs: np.ndarray, names: Sequence[str]) -> float:
+def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
     """Return the largest size of these energies at the frames compared, of both runs."""
     runs = (a, pairs[:, 0]), (b, pairs[:, 1])
     energies = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
@@ -199,7 +200,7 @@ def _least_energy(run: Result) -> float:
     return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
 
 
-def rows_agree(a: np.ndarray, b: np.ndarray, slack: float) -> np.ndarray:
+def rows_agree(a: Array, b: Array, slack: float) -> Mask:
     """Tell which rows (n,) of a and b, (n, 3) or (n,) each, are apart by no more than `slack`."""
     return (np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)) <= slack
 
@@ -229,7 +230,7 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
         refuse("their springs join other nodes")
 
 
-def cell_size(run: Result, nodes: np.ndarray) -> float:
+def cell_size(run: Result, nodes: Positions) -> float:
     """Return the edge of a cell [m], from the first; 0 where the file has none."""
     if "cells" not in run.lattice or not len(run.lattice.cells):
         return 0.0
@@ -239,18 +240,18 @@ def cell_size(run: Result, nodes: np.ndarray) -> float:
     return float(np.ptp(nodes[corners], axis=0).max())
 
 
-def point_text(point: np.ndarray) -> str:
+def point_text(point: Floats) -> str:
     """Return a point (3,) [m] for a message."""
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
 
 
-def _sorted(springs: np.ndarray) -> np.ndarray:
+def _sorted(springs: Indices) -> Indices:
     """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
     springs = np.sort(springs, axis=1)
     return springs[np.lexsort(springs.T)]
 
 
-def common_times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def common_times(a: Floats, b: Floats) -> Indices:
     """Return the indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
     if not len(a) or not len(b):
         return np.empty((0, 2), int)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.loads import Motion, within
 from msmpetsc.scene.obstacle import ObstacleTable
@@ -28,12 +29,12 @@ class SurfaceGaps:
     reach     : gaps longer than this are not looked for [m]
     """
 
-    rest: np.ndarray
-    triangles: np.ndarray
-    body: np.ndarray
+    rest: Positions
+    triangles: Indices
+    body: Indices
     reach: float
 
-    def distances(self, points: np.ndarray) -> np.ndarray:
+    def distances(self, points: Positions) -> Floats:
         """Return the distance (v,) [m] of points (v, 3) to the nearest triangle in front of each that faces it.
 
         It is infinite beyond the reach. What was near at rest does not count: the other side of a crease.
@@ -49,7 +50,7 @@ class SurfaceGaps:
         gaps[gaps > self.reach] = np.inf
         return gaps
 
-    def _facing(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _facing(self, points: Positions) -> tuple[Indices, Indices, Rows]:
         """Return pairs (k,), (k,) of a point and a triangle that face each other and may be within reach, and the
         points' normals (v, 3).
 
@@ -71,14 +72,14 @@ class SurfaceGaps:
         return number[new], which[new], normals
 
 
-def unit_vectors(vectors: np.ndarray) -> np.ndarray:
+def unit_vectors(vectors: Rows) -> Rows:
     """Return vectors (k, 3) at length 1; those without a length stay 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1), TINY)[:, None]
 
 
 def gaps_to_obstacles(
-    obstacles: Sequence[ObstacleTable], solids: Mapping[int, Surface], points: np.ndarray, time: float
-) -> np.ndarray:
+    obstacles: Sequence[ObstacleTable], solids: Mapping[int, Surface], points: Positions, time: float
+) -> Floats:
     """Return the distance (n,) [m] of points (n, 3) to the nearest obstacle that is there at a time [s].
 
     It is negative within one, and infinite where there is none.
@@ -94,7 +95,7 @@ def gaps_to_obstacles(
     return gaps
 
 
-def _gaps(obstacle: ObstacleTable, points: np.ndarray) -> np.ndarray:
+def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
     """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first; infinite if unknown."""
     if obstacle.center is not None:
         return np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
@@ -107,7 +108,7 @@ def _gaps(obstacle: ObstacleTable, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
 
 
-def _gaps_to(surface: Surface, points: np.ndarray) -> np.ndarray:
+def _gaps_to(surface: Surface, points: Positions) -> Floats:
     """Return the distance (n,) [m] of points (n, 3) to a surface, negative behind the nearest of its triangles."""
     if not len(surface.triangles):
         return np.full(len(points), np.inf)

@@ -6,6 +6,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import InputError, one_line
 
 
@@ -37,16 +38,16 @@ class LazyArray:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __iter__(self) -> Iterator[np.ndarray]:
+    def __iter__(self) -> Iterator[Array]:
         return (self[row] for row in range(len(self)))
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.asarray(self[:], dtype)
 
     def __repr__(self) -> str:
         return f"<{self.name} {self.shape} {self.dtype} [{self.unit}]>"
 
-    def __getitem__(self, key: Any) -> np.ndarray:
+    def __getitem__(self, key: Any) -> Array:
         keys = _key_per_axis(key, self.ndim)
         arrays = [k for k in keys if not isinstance(k, int | np.integer | slice)]
         if len(arrays) > 1:
@@ -57,7 +58,7 @@ class LazyArray:
             return self[:][keys]
         return self._read_rows(keys)
 
-    def _read_rows(self, keys: tuple) -> np.ndarray:
+    def _read_rows(self, keys: tuple[Any, ...]) -> Array:
         """Read with a list or an array among the keys: row by row, for all together may be more than fits."""
         first, rest = keys[0], keys[1:]
         rows = np.arange(len(self))[first]
@@ -69,7 +70,7 @@ class LazyArray:
             values = np.array([self[int(row)][rest] for row in rows.flat])
         return values.reshape(*rows.shape, *values.shape[1:])
 
-    def _read(self, keys: tuple) -> np.ndarray:
+    def _read(self, keys: tuple[Any, ...]) -> Array:
         """Read with numbers and slices for keys."""
         parts: list[int | range] = [
             range(size)[int(k) if isinstance(k, np.integer) else k] for k, size in zip(keys, self.shape, strict=True)
@@ -84,7 +85,7 @@ class LazyArray:
         return values[tuple(slice(None, None, -1 if part.step < 0 else 1) for part in ranges)] if ranges else values
 
 
-class Arrays(Mapping):
+class Arrays(Mapping[str, LazyArray]):
     """The arrays of one group by their names: ``frames["time"]`` or ``frames.time``."""
 
     def __init__(self, group: str, arrays: dict[str, LazyArray]):
@@ -111,7 +112,7 @@ class Arrays(Mapping):
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
 
 
-def _key_per_axis(key: Any, ndim: int) -> tuple:
+def _key_per_axis(key: Any, ndim: int) -> tuple[Any, ...]:
     """Return the key with its ... and what is left out written as slices."""
     keys = list(key) if isinstance(key, tuple) else [key]
     dots = [axis for axis, k in enumerate(keys) if k is Ellipsis]

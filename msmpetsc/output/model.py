@@ -3,6 +3,7 @@
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.model.build import Model
 from msmpetsc.output.writer import ResultFile
@@ -44,7 +45,7 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     file.write("embedding/weights", embedding.weights)
 
 
-def obstacle_rows(solids: dict[int, Surface]) -> dict[str, np.ndarray]:
+def obstacle_rows(solids: dict[int, Surface]) -> dict[str, Array]:
     """Return what stands in the file of the surfaces of obstacles, all of them on rank 0."""
     whole = joined([*solids.values()]) or NOTHING
     counts = [len(solid.triangles) for solid in solids.values()]

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
+from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.errors import InputError, one_line, printable
 from msmpetsc.model.fields import FIELDS, FRAME_FIELDS
 from msmpetsc.output.lazy import Arrays, LazyArray, xarray_variable
@@ -39,8 +40,8 @@ class StoredState(NamedTuple):
     """The positions of a checkpoint, q_n and q_(n-1), (n, 3) [m] each, after `step` steps."""
 
     step: int
-    q: np.ndarray
-    q_previous: np.ndarray
+    q: Positions
+    q_previous: Positions
 
 
 class Result:
@@ -141,7 +142,7 @@ class Result:
             raise InputError(f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points")
         return W
 
-    def body_of(self, group: str) -> np.ndarray:
+    def body_of(self, group: str) -> Indices:
         """Return the number of the body of each node ("lattice", (n,)) or surface point ("surface", (v,))."""
         if f"{group}/body" in self:
             return self[f"{group}/body"][:].astype(np.int64)
@@ -242,7 +243,7 @@ def finished(file: h5py.File) -> int:
     return int(np.argmin(np.append(has_time, False)))
 
 
-def newest_slot(steps: np.ndarray) -> int | None:
+def newest_slot(steps: Indices) -> int | None:
     """Return the slot of the newest checkpoint from the steps (2,) of both; None if neither has one."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None

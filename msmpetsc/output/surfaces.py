@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import InputError
 from msmpetsc.output.compare import (
     LEAST_STRAIN,
@@ -38,11 +39,11 @@ class SurfaceDistance:
     moved    : greatest distance of a point of the reference from its place at rest, [m]; 0 if none moves
     """
 
-    pairs: np.ndarray
-    times: np.ndarray
-    rms: np.ndarray
-    greatest: np.ndarray
-    worst: np.ndarray
+    pairs: Indices
+    times: Floats
+    rms: Floats
+    greatest: Floats
+    worst: Indices
     moved: float
 
     @property
@@ -83,7 +84,7 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
     return SurfaceDistance(pairs, times[pairs[:, 0]], rms, greatest, worst, float(moved))
 
 
-def point_areas(run: Result) -> np.ndarray:
+def point_areas(run: Result) -> Array:
     """Return the area around each surface point at rest, (v,) [m^2]: a third of its triangles'."""
     points, triangles = run["surface/points"][:], run["surface/triangles"][:].astype(np.int64)
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):

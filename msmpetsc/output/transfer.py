@@ -15,18 +15,18 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
+
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
 
-def pieces(count: int, dtype: np.dtype, shape: tuple[int, ...]) -> Iterator[slice]:
+def pieces(count: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[slice]:
     """Return parts of `count` rows of this type and shape, of at most PIECE_BYTES each."""
     most = max(1, PIECE_BYTES // max(1, dtype.itemsize * math.prod(shape)))
     return (slice(start, min(start + most, count)) for start in range(0, count, most))
 
 
-def gather_rows(
-    comm: MPI.Comm, rows: np.ndarray, counts: Sequence[int], store: Callable[[int, np.ndarray], None]
-) -> None:
+def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[int, Array], None]) -> None:
     """Hand store(start, piece), on rank 0, the rows of all ranks, one after the other (collective).
 
     rows   : (counts[rank], ...) this rank's, contiguous
@@ -53,9 +53,7 @@ def gather_rows(
         raise failure
 
 
-def scatter_rows(
-    comm: MPI.Comm, rows: np.ndarray, counts: Sequence[int], load: Callable[[slice], Any]
-) -> Exception | None:
+def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]) -> Exception | None:
     """Fill each rank's rows with what load(part) gives on rank 0; return there what could not be read (collective).
 
     rows   : (counts[rank], ...) this rank's, to be filled

@@ -27,6 +27,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint
@@ -113,7 +114,7 @@ class ResultFile:
             with suppress(InputError), plain_errors(self.path):
                 self._finish(trim=not self._failed)  # a full disk is no place to change metadata
 
-    def write(self, name: str, rows: np.ndarray) -> None:
+    def write(self, name: str, rows: Array) -> None:
         """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes".
 
         A file that begins in place has it; raises InputError where its shape is another.
@@ -195,7 +196,7 @@ class ResultFile:
     def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
         rows, numbers = self._layout.rows, self._layout.numbers
-        if (saved.rows.keys(), tuple(saved.numbers)) != (rows.keys(), numbers):
+        if set(saved.rows) != set(rows) or tuple(saved.numbers) != numbers:
             raise ValueError(f"planned were checkpoints of {list(rows)} and {list(numbers)}")
         for name, values in saved.rows.items():
             self._check_rows(name, values, self._nodes, rows[name])
@@ -351,15 +352,13 @@ class ResultFile:
         if self._points:
             self._check_rows("surface", frame.surface, self._points)
 
-    def _check_rows(
-        self, name: str, rows: np.ndarray | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)
-    ) -> None:
+    def _check_rows(self, name: str, rows: Array | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)) -> None:
         planned, given = (counts[self._comm.rank], *shape), () if rows is None else np.shape(rows)
         if given != planned:
             raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
 
     def _collect(
-        self, rows: np.ndarray, dtype: np.dtype, counts: Sequence[int], name: str, index: int | None = None
+        self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
         """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
         rows = np.ascontiguousarray(rows, dtype)
@@ -368,7 +367,7 @@ class ResultFile:
             return
         file: Any = self._file  # on rank 0, which alone stores
 
-        def store(start: int, piece: np.ndarray) -> None:
+        def store(start: int, piece: Array) -> None:
             part = slice(start, start + len(piece))
             file[name][part if index is None else (index, part)] = piece
 

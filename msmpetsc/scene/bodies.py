@@ -52,7 +52,7 @@ def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
             yield OfBody(("body", body, kind, number), body, table)
 
 
-def as_the_material(cls, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
+def as_the_material(cls: Any, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
     """Refuse bodies and parts that do not go with the material (a validator of ``body`` and ``part``)."""
     known = {**info.data, str(info.field_name): tables}
     others: dict[str, OwnMaterial] = {f"part.{number}": part for number, part in enumerate(known.get("part", ()))}
@@ -64,7 +64,7 @@ def as_the_material(cls, tables: tuple[Any, ...], info: ValidationInfo) -> tuple
     return tables
 
 
-def no_moving_body(cls, bodies: tuple[BodyTable, ...], info: ValidationInfo) -> tuple[BodyTable, ...]:
+def no_moving_body(cls: Any, bodies: tuple[BodyTable, ...], info: ValidationInfo) -> tuple[BodyTable, ...]:
     """Refuse bodies that start in motion, or whose forces go by the state, in statics (a validator of ``body``)."""
     for number, body in enumerate(bodies):
         refuse_motion(body.start, info, f"body.{number}.start ")
@@ -72,7 +72,7 @@ def no_moving_body(cls, bodies: tuple[BodyTable, ...], info: ValidationInfo) -> 
     return bodies
 
 
-def of_all_bodies(cls, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
+def of_all_bodies(cls: Any, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
     """Refuse regions that are of one body in tables of all (a validator of these)."""
     for number, table in enumerate(tables if info.data.get("body") else ()):
         if table.region.relative or table.region.painted is not None:

@@ -64,7 +64,7 @@ def _painted(value: Any) -> str | tuple[int, ...]:
     return tuple(value)
 
 
-def after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
+def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | None:
     start = info.data.get("start")
     if stop is not None and start is not None and stop <= start:
         raise rule(f"must be > start = {start:g}", "start")
@@ -74,7 +74,7 @@ def after_start(cls, stop: float | None, info: ValidationInfo) -> float | None:
 def only_for(key: str, value: str) -> Callable[..., Any]:
     """Return the validator of what has a meaning only where another key of its table has this value."""
 
-    def check(cls, given: Any, info: ValidationInfo) -> Any:
+    def check(cls: Any, given: Any, info: ValidationInfo) -> Any:
         if info.data.get(key, value) != value:
             raise rule(f'is for {key} = "{value}" only', key)
         return given

@@ -149,10 +149,9 @@ def test_a_mesh_is_prepared_as_a_bodys_and_ranks_agree(tmp_path: Path):
     scene = block_scene(tmp_path, obstacle=obstacle, **FALLING)
     solid = build_model(MPI.COMM_SELF, load_scene(scene)).penalties[0].obstacle.solid
     np.testing.assert_allclose(solid.surface(None, None).points.mean(axis=0), CENTER, atol=1e-6)
-    for ranks in (1, 3):
-        done = run(ranks, "-m", "msmpetsc", "run", scene, "-o", tmp_path / f"{ranks}.h5", timeout=60)
-        assert done.returncode == 0, done.stderr
-    with msm.open(tmp_path / "1.h5") as one, msm.open(tmp_path / "3.h5") as three:
+    done = run(3, "-m", "msmpetsc", "run", scene, "-o", tmp_path / "3.h5", timeout=60)
+    assert done.returncode == 0, done.stderr
+    with msm.open(msm.run(scene, tmp_path / "1.h5", quiet=True)) as one, msm.open(tmp_path / "3.h5") as three:
         np.testing.assert_allclose(three.frames.position[-1], one.frames.position[-1], atol=1e-7)
         assert one.frames.contact[-1] > 0
         assert len(one["obstacle/triangles"]) == len(three["obstacle/triangles"]) == 1280

@@ -133,13 +133,13 @@ def against_a_plate(folder: Path, integrator: str, response: str, speed: float, 
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["the body moves", "the plate moves"])
-@pytest.mark.parametrize("speed", [2.0, 20.0, 100.0])
+@pytest.mark.parametrize("speed", [2.0, 100.0])
 @pytest.mark.parametrize("response", ["penalty", "reflect"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_no_node_gets_past_a_thin_plate(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, integrator: str, response: str, speed: float, moving: bool
 ):
-    """At 20 m/s and more it is folded over within a step; what it then gains is told."""
+    """At 100 m/s it is folded over within a step; what it then gains is told."""
     model, frames = play(against_a_plate(tmp_path, integrator, response, speed, moving))
     last, mass = frames[-1], model.lattice.mass
     top = -0.1 + (speed * last.time if moving else 0)

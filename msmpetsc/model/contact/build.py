@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import OBSTACLES
@@ -24,7 +25,7 @@ from msmpetsc.scene.schema import Scene
 MOST_OFF = 0.01  # by which the gradient of a distance may differ from a unit vector in length
 
 
-def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: np.ndarray | None) -> list[Obstacle]:
+def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None) -> list[Obstacle]:
     """Return the obstacles of a scene, for nodes (l,) that stick ``outside`` [m] so far (collective).
 
     Raises InputError on all ranks for a mesh that is not closed, and for a function that is no signed distance.
@@ -40,7 +41,7 @@ def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: np.
     return obstacles
 
 
-def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: np.ndarray) -> dict[int, Surface]:
+def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: Rows) -> dict[int, Surface]:
     """Return on rank 0 the surfaces of obstacles that are meshes or functions, by their numbers (collective).
 
     bounds : (b, 2, 3) corners of the box around each body at rest [m]
@@ -85,7 +86,7 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Soli
     return Faces(np.array([table.point]), np.array([table.normal]))
 
 
-def _check_is_distance(solid: FunctionSolid, points: np.ndarray) -> None:
+def _check_is_distance(solid: FunctionSolid, points: Positions) -> None:
     """Raise InputError unless the gradients at most of the points (n, 3) [m] are of length 1, as a distance's are."""
     if not len(points):
         return

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
@@ -21,23 +21,25 @@ class DistanceSolid(ABC):
     has_sides = False
 
     def __init__(self) -> None:
-        self._last: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._last: tuple[Positions, Floats, Indices] | None = None
 
-    def depths(self, q: np.ndarray, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """As of every Solid."""
+    def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
+        """Return how deep positions lie (n,) [m] and their faces (n,), known of the positions asked for last."""
         on_host = to_host(q)
         if self._last is None or not np.array_equal(self._last[0], on_host):
             self._last = (on_host.copy(), *self._find(on_host))
         _, depths, face = self._last
         return like(q, depths.copy()), like(q, face.copy())
 
-    def normals(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid."""
+    def normals(self, q: Positions, face: Indices) -> Rows:
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return like(q, self._behind(to_host(q), to_host(face))[1])
 
-    def deeper(self, q: np.ndarray, moved: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid; over a short way by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface
-        bends by 1 / r.
+    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m].
+
+        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface bends by
+        1 / r.
         """
         face, way = to_host(face), to_host(moved)
         (depth, normal), (depth_before, normal_before) = (self._behind(to_host(x), face) for x in (q, q - moved))
@@ -47,19 +49,19 @@ class DistanceSolid(ABC):
         return like(q, np.where(near, slope, depth - depth_before))
 
     def sent(self, send: Send) -> "DistanceSolid":
-        """As of every Solid: nothing is sent."""
+        """Return the solid itself: what is asked on the CPU stays there."""
         return self
 
     @abstractmethod
-    def surface(self, low: np.ndarray, high: np.ndarray) -> Surface:
+    def surface(self, low: Positions, high: Positions) -> Surface:
         """Return its surface, for pictures, around bodies that are between two corners (3,) [m]."""
 
     @abstractmethod
-    def _find(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find(self, q: Positions) -> tuple[Floats, Indices]:
         """Return depths and faces (n,) of positions (n, 3)."""
 
     @abstractmethod
-    def _behind(self, q: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
         """Return how far positions (n, 3) within lie behind faces (n,), (n,) [m], and the unit normals (n, 3)."""
 
 
@@ -73,7 +75,7 @@ class FunctionSolid(DistanceSolid):
         super().__init__()
         self.function, self.key = function, key
 
-    def distances(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distances(self, q: Positions) -> tuple[Floats, Rows]:
         """Return the signed distances (n,) [m] of positions (n, 3) [m], and their gradients (n, 3).
 
         Raises InputError where the function returns anything else.
@@ -91,8 +93,8 @@ class FunctionSolid(DistanceSolid):
             raise InputError(f"{self.key}.function: returned numbers that are not finite")
         return distance, gradient
 
-    def surface(self, low: np.ndarray, high: np.ndarray) -> Surface:
-        """As of every DistanceSolid, by marching cubes; open where it goes on beyond what is shown."""
+    def surface(self, low: Positions, high: Positions) -> Surface:
+        """Return its surface by marching cubes, open where it goes on beyond what is shown."""
         import igl
 
         margin = BEYOND * (high - low).max()
@@ -102,10 +104,10 @@ class FunctionSolid(DistanceSolid):
         points, triangles, _ = igl.marching_cubes(distance, grid, POINTS, POINTS, POINTS)
         return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
 
-    def _find(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find(self, q: Positions) -> tuple[Floats, Indices]:
         return (-self.distances(q)[0], one_face(q)) if len(q) else (np.zeros(0), one_face(q))
 
-    def _behind(self, q: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
         if not len(q):
             return np.zeros(0), np.zeros((0, 3))
         distance, gradient = self.distances(q)

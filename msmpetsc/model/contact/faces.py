@@ -3,12 +3,14 @@
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Positions, Rows
+
 OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
 ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
 
 
 @numba.njit(cache=True)
-def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) -> float:
+def behind(x: Positions, points: Positions, normals: Rows, face: int) -> float:
     """Return how far x (3,) lies behind a face [m]; negative in front of it."""
     distance = 0.0
     for c in range(3):
@@ -17,7 +19,7 @@ def behind(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 
 
 @numba.njit(cache=True)
-def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> tuple[float, int]:
+def depth(x: Positions, points: Positions, normals: Rows, side: int) -> tuple[float, int]:
     """Return how deep x (3,) lies behind the face of its ``side`` [m], and that face.
 
     Without a side: how deep in the solid, not positive outside, and the nearest face.
@@ -33,7 +35,7 @@ def depth(x: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> 
 
 
 @numba.njit(cache=True)
-def _stays(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) -> bool:
+def _stays(x: Positions, points: Positions, normals: Rows, face: int) -> bool:
     """Return whether x lies behind a face and has not slid off it past another.
 
     The opposite face is left aside: that of a thin plate may be passed.
@@ -50,7 +52,7 @@ def _stays(x: np.ndarray, points: np.ndarray, normals: np.ndarray, face: int) ->
 
 
 @numba.njit(cache=True)
-def side_of(x: np.ndarray, end: np.ndarray, points: np.ndarray, normals: np.ndarray, side: int) -> int:
+def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side: int) -> int:
     """Return 1 + the face by which a node is in contact on its straight way from x to ``end`` (3,), 0 if it meets none.
 
     side : by which it was before: it keeps that until it is out of the solid

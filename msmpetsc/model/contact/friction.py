@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.model.contact.solids import TINY
 
-Pressed = tuple[np.ndarray, np.ndarray, np.ndarray]
+STICK = 1e-2  # longest sides a second: friction holds but for a creep below this; 1e-3 took Newton 5 times as long
+
+Pressed = tuple[Indices, Floats, Rows]
 
 
 @dataclass(frozen=True)
@@ -27,19 +29,19 @@ class Friction:
     stick   : e [m]
     """
 
-    nodes: np.ndarray
-    normal: np.ndarray
-    carried: np.ndarray
-    limit: np.ndarray
+    nodes: Indices
+    normal: Rows
+    carried: Positions
+    limit: Floats
     stick: float
 
-    def slip(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slip(self, q: Positions) -> tuple[Rows, Floats]:
         """Return the slip u (a, 3) and its length (a,) [m]."""
         moved = q[self.nodes] - self.carried
         u = moved - (moved * self.normal).sum(axis=1)[:, None] * self.normal
         return u, np.linalg.norm(u, axis=1)
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return mu N (f(u) - f(u_0)) [J], from how far q is from base, so that a small change keeps its digits."""
         (u, length), (u_0, length_0), e = self.slip(q), self.slip(base), self.stick
         moved = (q - base)[self.nodes]  # u - u_0, but for a part along the normal, where u + u_0 has none
@@ -50,25 +52,25 @@ class Friction:
         beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
         return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
 
-    def slope(self, u: np.ndarray) -> np.ndarray:
+    def slope(self, u: Floats) -> Floats:
         """Return f'(u) / u, (a,) [1/m]."""
         return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 
-    def all_secant(self) -> np.ndarray:
+    def all_secant(self) -> Mask:
         """Return what ``blocks`` takes for all nodes to have their secants, (a,) bool."""
         return self.limit >= 0
 
-    def passes_kink(self, q: np.ndarray, base: np.ndarray) -> np.ndarray:
+    def passes_kink(self, q: Positions, base: Positions) -> Mask:
         """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""
         (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
         return ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
 
-    def blocks(self, q: np.ndarray, true: bool, secant: np.ndarray | None = None) -> np.ndarray:
+    def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].
 
         The second part is not positive; unless ``true``, or where ``secant`` (a,), it is left out. What is then left
@@ -85,7 +87,7 @@ class Friction:
         return self.limit[:, None, None] * blocks
 
 
-def squares(vectors: np.ndarray) -> np.ndarray:
+def squares(vectors: Rows) -> Rows:
     """Return v v^T of each of the vectors (a, 3), (a, 3, 3)."""
     return vectors[:, :, None] * vectors[:, None, :]
 
@@ -94,13 +96,13 @@ class Movers(NamedTuple):
     """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those that move as rows or
     (n,) bool, and 1 / mass (n,) [1/kg]."""
 
-    q: np.ndarray
-    v: np.ndarray
-    rows: np.ndarray
-    per_mass: np.ndarray
+    q: Positions
+    v: Rows
+    rows: Indices | Mask
+    per_mass: Floats
 
 
-def apply_friction(nodes: Movers, pressed: Pressed, carried: np.ndarray, impulse: float) -> None:
+def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:
     """Apply Coulomb friction as a change of velocity to the nodes that are inside.
 
     v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s], falls by no more than

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 from trimesh.triangles import closest_point, points_to_barycentric
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.contact.distance import DistanceSolid
 from msmpetsc.model.contact.solids import TINY
@@ -35,11 +36,11 @@ class MeshSolid(DistanceSolid):
         self._trees = [tree]
         finalize(self, self._trees.clear)  # at the end of Python, too, where igl's binding complains of what is left
 
-    def surface(self, low: np.ndarray, high: np.ndarray) -> Surface:
-        """As of every DistanceSolid: all triangles, each wound outwards."""
+    def surface(self, low: Positions, high: Positions) -> Surface:
+        """Return the whole mesh, each triangle wound outwards."""
         return Surface(self.points, self.triangles)
 
-    def _find(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find(self, q: Positions) -> tuple[Floats, Indices]:
         beyond = np.linalg.norm(q - np.clip(q, *self._bounds), axis=1)
         depths, face = -beyond, np.zeros(len(q), np.int64)
         rows = np.flatnonzero(beyond == 0)
@@ -50,14 +51,14 @@ class MeshSolid(DistanceSolid):
             depths[rows] = np.where(within, 1, -1) * np.sqrt(squares)
         return depths, face
 
-    def _behind(self, q: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
         out = closest_point(self.points[self.triangles[face]], q) - q
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]
         return depth, np.where(on_surface[:, None], self._normals[face], normals)
 
-    def _pseudonormals(self, on_surface: np.ndarray, face: np.ndarray) -> np.ndarray:
+    def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
         """Return directions (n, 3) outwards at points (n, 3) of triangles (n,)."""
         weights = points_to_barycentric(self.points[self.triangles[face]], on_surface)
         zero = weights < ON_AN_EDGE
@@ -68,7 +69,7 @@ class MeshSolid(DistanceSolid):
         return normals
 
 
-def _neighbours(mesh: trimesh.Trimesh) -> np.ndarray:
+def _neighbours(mesh: trimesh.Trimesh) -> Indices:
     """Return of each triangle the one across the edge that faces each corner, (t, 3); itself where there is none."""
     neighbours = np.repeat(np.arange(len(mesh.faces))[:, None], 3, axis=1)
     for own, other in ((0, 1), (1, 0)):

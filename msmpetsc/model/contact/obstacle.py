@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
 from msmpetsc.model.contact.solids import Faces, Send, Solid, no_sides
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.loads import Motion, within
@@ -31,17 +31,17 @@ class Obstacle:
     start: float = 0.0
     stop: float | None = None
     key: str = "obstacle"
-    outside: np.ndarray | None = None
+    outside: Floats | None = None
 
     def acts_at(self, time: float) -> bool:
         """Return whether the obstacle is there at a time [s]."""
         return within(time, self.start, self.stop)
 
-    def seen_from(self, q: np.ndarray, time: float) -> np.ndarray:
+    def seen_from(self, q: Positions, time: float) -> Positions:
         """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
         return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
 
-    def depths(self, q: np.ndarray, time: float, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def depths(self, q: Positions, time: float, sides: Indices | None = None) -> tuple[Floats, Indices]:
         """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).
 
         sides : (n or more,) by which face each node came in; None: the nearest counts
@@ -49,7 +49,7 @@ class Obstacle:
         depths, face = self.solid.depths(self.seen_from(q, time), sides)
         return depths if self.outside is None else depths - self.outside[: len(q)], face
 
-    def normals_at(self, q: np.ndarray, time: float, face: np.ndarray) -> np.ndarray:
+    def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
         """Return the unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
         return self.solid.normals(self.seen_from(q, time), face)
 
@@ -59,8 +59,8 @@ class Obstacle:
         return self.solid.has_sides
 
     def sides(
-        self, q: np.ndarray, end: np.ndarray, time: float, time_step: float, before: np.ndarray | None = None
-    ) -> np.ndarray:
+        self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None = None
+    ) -> Indices:
         """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3) [m] in a step ending at ``time``.
 
         before : (n,) the sides when it began. A node that the obstacle appears around gets the face nearest to it.
@@ -80,7 +80,7 @@ class Obstacle:
 
 
 def describe_overlap(
-    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: np.ndarray, held: np.ndarray, time: float
+    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
 ) -> str | None:
     """Describe the free nodes that lie inside an obstacle as it stands at a time [s]; None if none does (collective).
 

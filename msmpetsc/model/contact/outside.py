@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.comm import Route
 from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.grid import encode_morton
@@ -18,7 +19,7 @@ from msmpetsc.model.lattice import Lattice
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
 
 
-def nearest_of_body(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> np.ndarray:
+def nearest_of_body(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> Positions:
     """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
 
     It is the node itself but where that sticks out of the surface.
@@ -40,7 +41,7 @@ def nearest_of_body(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> n
     return np.concatenate([nearest, lattice.table.rows_of(ghosts, nearest)])
 
 
-def _drawn_in(surface: Surface, points: np.ndarray) -> np.ndarray:
+def _drawn_in(surface: Surface, points: Positions) -> Positions:
     """Return points (n, 3), those outside a surface moved to the nearest of it."""
     import igl  # for scenes with regions or obstacles
 
@@ -48,6 +49,6 @@ def _drawn_in(surface: Surface, points: np.ndarray) -> np.ndarray:
     return np.where(is_inside(surface, points)[:, None], points, closest)
 
 
-def distance_outside(lattice: Lattice, nearest: np.ndarray) -> np.ndarray:
+def distance_outside(lattice: Lattice, nearest: Positions) -> Floats:
     """Return how far each node (l,) sticks out of its body at rest [m], from the nearest points (l, 3) of that."""
     return np.linalg.norm(lattice.nodes - nearest, axis=1)

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.model.contact.friction import Friction, Pressed, squares
 from msmpetsc.model.contact.obstacle import Obstacle
 
 if TYPE_CHECKING:
     from msmpetsc.model.self_contact.term import SurfaceContact
 
-Secants = list[np.ndarray | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
+Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,17 @@ class Penalty:
     stick: float
     restitution: float | None = None
 
-    def state_at(self, time: float, sides: np.ndarray | None = None) -> "ContactState":
+    def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
         """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(
         self,
-        q: np.ndarray,
+        q: Positions,
         time: float,
         time_step: float,
-        sides: np.ndarray | None = None,
-        before: np.ndarray | None = None,
+        sides: Indices | None = None,
+        before: Positions | None = None,
     ) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
 
@@ -69,9 +69,7 @@ class Penalty:
             depth = self._depth_to_come(2 * q - before, time, sides, nodes, depth)
         return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
 
-    def _depth_to_come(
-        self, q: np.ndarray, time: float, sides: np.ndarray | None, nodes: np.ndarray, depth: np.ndarray
-    ) -> np.ndarray:
+    def _depth_to_come(self, q: Positions, time: float, sides: Indices | None, nodes: Indices, depth: Floats) -> Floats:
         """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
 
         Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just come in the way there
@@ -94,19 +92,19 @@ class ContactState:
     time: float
     stiffness: float
     friction: Friction | None
-    sides: np.ndarray | None = None
+    sides: Indices | None = None
 
-    def depths(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def depths(self, q: Positions) -> tuple[Floats, Indices]:
         """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
         return self.obstacle.depths(q, self.time, self.sides)
 
-    def pressed(self, q: np.ndarray) -> Pressed:
+    def pressed(self, q: Positions) -> Pressed:
         """Return which of the positions (n, 3) are pressed, rows (a,), how deep (a,) [m] and the normals (a, 3)."""
         depths, face = self.depths(q)
         rows = np.flatnonzero(depths > 0)
         return rows, depths[rows], self.obstacle.normals_at(q[rows], self.time, face[rows])
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return the energy of the push at q less that at base (n, 3) [J]."""
         (depths, face), (base_depths, base_face) = self.depths(q), self.depths(base)
         within = np.flatnonzero((depths > 0) & (base_depths > 0) & (face == base_face))
@@ -130,7 +128,7 @@ class Contact:
     def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
         self.states, self.owned, self.surface = states, owned, surface
 
-    def energy(self, q: np.ndarray) -> float:
+    def energy(self, q: Positions) -> float:
         """Return the energy [J] of the push of obstacles alone: friction stores none."""
         energy = 0.0
         for state in self.states:
@@ -138,12 +136,12 @@ class Contact:
             energy += 0.5 * state.stiffness * float(inside @ inside)
         return energy
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base, friction included [J]."""
         return self.change_at_nodes(q, base) + (self.surface.change(q, base) if self.surface else 0.0)
 
-    def change_at_nodes(self, q: np.ndarray, base: np.ndarray) -> float:
-        """Return the same of obstacles alone."""
+    def change_at_nodes(self, q: Positions, base: Positions) -> float:
+        """Return the energy of obstacles alone at q less that at base, friction included [J]."""
         total = 0.0
         for state in self.states:
             total += state.change(q[: self.owned], base[: self.owned])
@@ -151,7 +149,7 @@ class Contact:
                 total += float(state.friction.change(q, base))
         return total
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for state in self.states:
             rows, depth, normal = state.pressed(q[: self.owned])
@@ -165,13 +163,11 @@ class Contact:
         """Return what ``hessian`` takes for all friction to have its secant."""
         return [state.friction.all_secant() if state.friction else None for state in self.states]
 
-    def passes_kinks(self, q: np.ndarray, base: np.ndarray) -> Secants:
-        """Return the same for the nodes alone whose friction has a kink on their way from base to q."""
+    def passes_kinks(self, q: Positions, base: Positions) -> Secants:
+        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
         return [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
 
-    def hessian(
-        self, q: np.ndarray, true: bool, secants: Secants | None = None
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def hessian(self, q: Positions, true: bool, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
         """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
 
         The Hessian is the sum of all; each block is positive semidefinite. Across the
@@ -187,7 +183,7 @@ class Contact:
             if state.friction:
                 yield state.friction.nodes, state.friction.blocks(q, true, secant)
 
-    def bound(self, q: np.ndarray) -> np.ndarray:
+    def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""
         bound = np.zeros(self.owned, like=q)
         for state in self.states:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Indices, Positions, Rows, like
 from msmpetsc.model.contact.obstacle import Obstacle
 
 
@@ -24,7 +24,7 @@ class StepTaken:
 
     time: float
     length: float
-    sides: np.ndarray | None = None
+    sides: Indices | None = None
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Exchange:
     obstacle: Obstacle
     restitution: float
 
-    def exchanged(self, q: np.ndarray, q_previous: np.ndarray, step: StepTaken) -> tuple[np.ndarray, np.ndarray]:
+    def exchanged(self, q: Positions, q_previous: Positions, step: StepTaken) -> tuple[Positions, Positions]:
         """Return q_n and q_(n-1) after contact; (n, 3) [m] each.
 
         Where a node, on its way, has come to lie on or behind a face and its v_n = q_n - q_(n-1), as seen from
@@ -50,9 +50,7 @@ class Exchange:
         return q, q_previous
 
 
-def slowed(
-    obstacle: Obstacle, restitution: float, q: np.ndarray, q_previous: np.ndarray, step: StepTaken
-) -> np.ndarray:
+def slowed(obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken) -> Positions:
     """Return q_(n-1) (n, 3) [m] by which nodes that came to a face in this step have e times their velocity into it."""
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
@@ -64,9 +62,7 @@ def slowed(
     return q_previous
 
 
-def striking(
-    obstacle: Obstacle, q: np.ndarray, q_previous: np.ndarray, step: StepTaken
-) -> tuple[np.ndarray, np.ndarray]:
+def striking(obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken) -> tuple[Indices, Rows]:
     """Return the nodes (k,) on or behind the faces of their sides, and the part (k, 3) [m] of their way in the step
     that goes on into it, as seen from the obstacle; nothing where that is not there."""
     time, path = step.time, obstacle.path

@@ -9,12 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.contact.faces import depth, side_of
 
 TINY = 1e-300  # [m]
 
-Send = Callable[[np.ndarray], np.ndarray]
+Send = Callable[[Array], Array]
 
 
 class Solid(Protocol):
@@ -25,7 +26,7 @@ class Solid(Protocol):
         """Whether it matters by which of its faces a node came in: then there is a ``sides_of``, as of Faces."""
         ...
 
-    def depths(self, q: np.ndarray, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
         """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or else the nearest, and
         that face (n,).
 
@@ -33,11 +34,11 @@ class Solid(Protocol):
         """
         ...
 
-    def normals(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
+    def normals(self, q: Positions, face: Indices) -> Rows:
         """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         ...
 
-    def deeper(self, q: np.ndarray, moved: np.ndarray, face: np.ndarray) -> np.ndarray:
+    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
         """Return how much deeper positions within lie behind faces (n,) than ``moved`` (n, 3) [m] before, (n,) [m].
 
         A difference of depths would keep only the digits of a position.
@@ -68,11 +69,11 @@ class Faces:
     points, normals : (f, 3) a point of each face [m], its unit normal towards the free side
     """
 
-    points: np.ndarray
-    normals_of_faces: np.ndarray
+    points: Positions
+    normals_of_faces: Rows
 
     @classmethod
-    def of_box(cls, low: np.ndarray, high: np.ndarray) -> "Faces":
+    def of_box(cls, low: Positions, high: Positions) -> "Faces":
         """Return the box between two corners (3,) [m]."""
         points = np.repeat(np.array([low, high], float), 3, axis=0)  # the faces that meet at each of the two corners
         return cls(points, np.concatenate([-np.eye(3), np.eye(3)]))
@@ -82,29 +83,29 @@ class Faces:
         """Whether there are several faces."""
         return len(self.points) > 1
 
-    def depths(self, q: np.ndarray, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """As of every Solid."""
+    def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
+        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         depths, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
         sides = no_sides(q) if sides is None else sides
         _depths_of(len(q), q, self.points, self.normals_of_faces, sides, depths, face)
         return depths, face
 
-    def normals(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid."""
+    def normals(self, q: Positions, face: Indices) -> Rows:
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return self.normals_of_faces[face]
 
-    def deeper(self, q: np.ndarray, moved: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid."""
+    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m]."""
         return -(moved * self.normals_of_faces[face]).sum(axis=1)
 
-    def sides_of(self, q: np.ndarray, end: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
         """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3), ``before`` (n,) having sides."""
         sides = no_sides(q)
         _sides_of(len(q), q, end, self.points, self.normals_of_faces, before, sides)
         return sides
 
     def sent(self, send: Send) -> "Faces":
-        """As of every Solid."""
+        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, points=send(self.points), normals_of_faces=send(self.normals_of_faces))
 
 
@@ -112,36 +113,36 @@ class Faces:
 class BallSolid:
     """A ball: center (3,) and radius [m]. At its very center there is no normal."""
 
-    center: np.ndarray
+    center: Positions
     radius: float
     has_sides = False
 
-    def depths(self, q: np.ndarray, sides: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """As of every Solid."""
+    def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
+        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         return self.radius - np.linalg.norm(q - self.center, axis=1), one_face(q)
 
-    def normals(self, q: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid."""
+    def normals(self, q: Positions, face: Indices) -> Rows:
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         out = q - self.center
         return out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
 
-    def deeper(self, q: np.ndarray, moved: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """As of every Solid: |u| - |v| = (u - v) (u + v) / (|u| + |v|)."""
+    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return how much deeper positions within lie: |u| - |v| = (u - v) (u + v) / (|u| + |v|), (n,) [m]."""
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
         return -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
 
     def sent(self, send: Send) -> "BallSolid":
-        """As of every Solid."""
+        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, center=send(self.center))
 
 
-def one_face(q: np.ndarray) -> np.ndarray:
+def one_face(q: Positions) -> Indices:
     """Return the faces (n,) of positions (n, 3) in a solid that has but one."""
     return np.zeros(len(q), np.int64, like=q)
 
 
-def no_sides(q: np.ndarray) -> np.ndarray:
+def no_sides(q: Positions) -> Indices:
     """Return the sides (n,) of nodes (n, 3) that are in contact with nothing."""
     return np.zeros(len(q), np.int8, like=q)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.arrays import Array, Floats, Positions, Rows, on_host
 from msmpetsc.model.elasticity.inversion import CellGather, CellScatter, least_volumes
 from msmpetsc.model.elasticity.springs import Product, SpringGather, SpringScatter
 from msmpetsc.model.lattice import Lattice
@@ -75,20 +75,20 @@ class Elasticity:
             )
         self.parts = [part for part in (self.springs, self.cells) if part]
 
-    def energy(self, q: np.ndarray) -> float:
+    def energy(self, q: Positions) -> float:
         """Return E [J] of what this rank owns."""
         return sum(part.energy(q) for part in self.parts)
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of what this rank owns."""
         return sum(part.change(q, base) for part in self.parts)
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
         for part in self.parts:
             part.add_gradient(q, gradient)
 
-    def concavity(self, q: np.ndarray) -> np.ndarray:
+    def concavity(self, q: Positions) -> Floats:
         """Return the diagonal (owned,) [N/m] of a matrix: the springs' Hessian is no less than minus that.
 
         It is 0 at a node without compressed springs.
@@ -97,13 +97,13 @@ class Elasticity:
         self.springs.add_concavity(q, concavity)
         return concavity[: self.owned]
 
-    def resists(self, q: np.ndarray) -> bool:
+    def resists(self, q: Positions) -> bool:
         """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
         if self.cells is None or not len(self.cells.cells):
             return False
         return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
 
-    def hessian_at(self, q: np.ndarray, projected: bool = False, dtype: type = np.float64) -> "Hessian":
+    def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
 
         projected : without its negative parts, as of compressed springs
@@ -111,7 +111,7 @@ class Elasticity:
         """
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
 
-    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the owned rows of
         ``blocks`` (l, 9) [N/m].
 
@@ -128,7 +128,7 @@ class Hessian:
 
     parts: list[Product]
 
-    def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
+    def add_product(self, v: Array, product: Array) -> None:
         """Add Hessian v [N] to ``product`` (l, 3)."""
         for add in self.parts:
             add(v, product)

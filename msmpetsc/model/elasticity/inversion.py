@@ -15,7 +15,7 @@ from functools import partial
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.elasticity.springs import Product
 from msmpetsc.model.lattice import Lattice
@@ -53,7 +53,7 @@ def _sum(a, b, c):
 
 
 @numba.njit(cache=True)
-def edges(q: np.ndarray, cell: np.ndarray, frame: int) -> tuple[Vector, Vector, Vector]:
+def edges(q: Positions, cell: Indices, frame: int) -> tuple[Vector, Vector, Vector]:
     """Return the edges [m] from a corner of a cell to the far ends of its three edges."""
     corner = cell[FRAMES[frame, 0]]
     return (
@@ -151,7 +151,7 @@ def _turned(change, n, slope, w_1, e_2, e_1, w_2):
 
 
 @numba.njit(cache=True)
-def least_volume(q: np.ndarray, c: np.ndarray) -> float:
+def least_volume(q: Positions, c: Indices) -> float:
     """Return the least of the eight corner volumes of a cell [m^3]; each edge is read once."""
     x0, x1, x2, x3 = _between(q, c[0], c[1]), _between(q, c[3], c[2]), _between(q, c[4], c[5]), _between(q, c[7], c[6])
     y0, y1, y2, y3 = _between(q, c[0], c[3]), _between(q, c[1], c[2]), _between(q, c[4], c[7]), _between(q, c[5], c[6])
@@ -187,14 +187,14 @@ def _change_of(first, count, step, q, base, cells, resistance, least, parts):
         parts[i] = change
 
 
-def least_volumes(q: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def least_volumes(q: Positions, cells: Indices) -> Floats:
     """Return the least of the eight corner volumes of each cell (c,) [m^3]: not positive in an inverted one."""
     least = np.empty(len(cells), like=q)
     _least_volume_of(len(cells), q, cells, least)
     return least
 
 
-def inverted_cells(q: np.ndarray, cells: np.ndarray) -> tuple[int, int, float]:
+def inverted_cells(q: Positions, cells: Indices) -> tuple[int, int, float]:
     """Return how many cells are inverted, which has the least corner volume (-1 without cells), and that [m^3]."""
     if not len(cells):
         return 0, -1, np.inf
@@ -203,16 +203,14 @@ def inverted_cells(q: np.ndarray, cells: np.ndarray) -> tuple[int, int, float]:
     return int((least <= 0).sum()), worst, float(least[worst])
 
 
-def resistance_energy(q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float) -> float:
+def resistance_energy(q: Positions, cells: Indices, resistance: Floats, volume: float) -> float:
     """Return the energy [J]. resistance: K (c,) [J]; volume: J_0 h^3 [m^3]."""
     parts = np.empty(len(cells), like=q)
     _energy_of(len(cells), q, cells, resistance, volume, parts)
     return float(parts.sum())
 
 
-def resistance_change(
-    q: np.ndarray, base: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float
-) -> float:
+def resistance_change(q: Positions, base: Positions, cells: Indices, resistance: Floats, volume: float) -> float:
     """Return the energy at q less that at base [J], summed corner by corner so that a small change keeps its digits."""
     parts = np.empty(len(cells), like=q)
     _change_of(len(cells), q, base, cells, resistance, volume, parts)
@@ -236,9 +234,7 @@ def _add_corner(rows, cell, frame, factor, a, b, c):
 
 
 @numba.njit(cache=True)
-def add_resistance_gradient(
-    q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float, gradient: np.ndarray
-) -> None:
+def add_resistance_gradient(q: Positions, cells: Indices, resistance: Floats, volume: float, gradient: Rows) -> None:
     """Add the gradient [N] to ``gradient`` (l, 3)."""
     for i in range(len(cells)):
         for frame in range(8):
@@ -251,13 +247,13 @@ def add_resistance_gradient(
 
 @numba.njit(cache=True)
 def add_resistance_hessian(
-    q: np.ndarray,
-    cells: np.ndarray,
-    resistance: np.ndarray,
+    q: Positions,
+    cells: Indices,
+    resistance: Floats,
     volume: float,
     projected: bool,
-    v: np.ndarray,
-    product: np.ndarray,
+    v: Rows,
+    product: Rows,
 ) -> None:
     """Add (Hessian at q) v [N] to ``product`` (l, 3); ``projected`` leaves out what the curvature of J adds."""
     for i in range(len(cells)):
@@ -277,7 +273,7 @@ def corner_curvature(e: tuple[Vector, Vector, Vector], n: Vector, resistance: fl
 
 
 @numba.njit(cache=True)
-def add_square(block: np.ndarray, factor: float, g: Vector) -> None:
+def add_square(block: Floats, factor: float, g: Vector) -> None:
     """Add factor g g^T to a block (9,)."""
     for r in range(3):
         for c in range(3):
@@ -285,9 +281,7 @@ def add_square(block: np.ndarray, factor: float, g: Vector) -> None:
 
 
 @numba.njit(cache=True)
-def add_resistance_bound(
-    q: np.ndarray, cells: np.ndarray, resistance: np.ndarray, volume: float, blocks: np.ndarray
-) -> None:
+def add_resistance_bound(q: Positions, cells: Indices, resistance: Floats, volume: float, blocks: Rows) -> None:
     """Add twice the diagonal blocks of the Hessian at q, without what the curvature of J adds, to ``blocks`` (l, 9)."""
     for i in range(len(cells)):
         for frame in range(8):
@@ -319,25 +313,25 @@ class Cells:
     volume     : J_0 h^3 [m^3]
     """
 
-    cells: np.ndarray
+    cells: Indices
     cells_owned: int
-    resistance: np.ndarray
+    resistance: Floats
     volume: float
 
     @property
-    def _owned(self) -> tuple[np.ndarray, np.ndarray, float]:
+    def _owned(self) -> tuple[Indices, Floats, float]:
         return self.cells[: self.cells_owned], self.resistance[: self.cells_owned], self.volume
 
     @property
-    def law(self) -> tuple[np.ndarray, np.ndarray, float]:
+    def law(self) -> tuple[Indices, Floats, float]:
         """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
         return self.cells, self.resistance, self.volume
 
-    def energy(self, q: np.ndarray) -> float:
+    def energy(self, q: Positions) -> float:
         """Return the energy [J] of the cells that this rank owns."""
         return resistance_energy(q, *self._owned)
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base [J], of the cells that this rank owns."""
         return resistance_change(q, base, *self._owned)
 
@@ -347,24 +341,24 @@ class CellScatter(Cells):
     """The cells one after another, those that the rank owns first: how a CPU sums them."""
 
     @classmethod
-    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellScatter":
+    def of_lattice(cls, lattice: Lattice, resistance: Floats, volume: float) -> "CellScatter":
         """Return the cells of a lattice whose arrays are in the memory of the CPU."""
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume)
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to ``gradient`` (l, 3)."""
         add_resistance_gradient(q, *self.law, gradient)
 
-    def resisting(self, q: np.ndarray) -> np.ndarray:
+    def resisting(self, q: Positions) -> Indices:
         """Return which cells (r,) resist at q: few, so that products with the Hessian need not visit the others."""
         return np.flatnonzero(least_volumes(q, self.cells) < self.volume)
 
-    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
+    def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to its second argument."""
         few = self.resisting(q)
         return partial(add_resistance_hessian, q.copy(), self.cells[few], self.resistance[few], self.volume, projected)
 
-    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         few = self.resisting(q)
         add_resistance_bound(q, self.cells[few], self.resistance[few], self.volume, blocks)
@@ -378,11 +372,11 @@ class CellGather(Cells):
     corner : (8, owned) u1, which of its corners the node is
     """
 
-    around: np.ndarray
-    corner: np.ndarray
+    around: Indices
+    corner: Array
 
     @classmethod
-    def of_lattice(cls, lattice: Lattice, resistance: np.ndarray, volume: float) -> "CellGather":
+    def of_lattice(cls, lattice: Lattice, resistance: Floats, volume: float) -> "CellGather":
         """Return the cells of a lattice, in the memory that its nodes are in."""
         nodes, owned = to_host(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")
@@ -394,20 +388,20 @@ class CellGather(Cells):
         resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
         return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to the owned rows of ``gradient``."""
         _cell_gradient_around(self.around.shape[1], q, *self._all, gradient)
 
-    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
+    def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to the owned rows of its second argument."""
         return partial(_cell_product_around, self.around.shape[1], q.copy(), *self._all, projected)
 
-    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _cell_bound_around(self.around.shape[1], q, *self._all, blocks)
 
     @property
-    def _all(self) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, np.ndarray]:
+    def _all(self) -> tuple[Indices, Floats, float, Indices, Array]:
         return *self.law, self.around, self.corner
 
 

@@ -21,11 +21,11 @@ from functools import partial
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.model.lattice import Lattice
 
-Product = Callable[[np.ndarray, np.ndarray], None]  # adds (a Hessian) v [N] to the second argument
+Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
 
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
 
@@ -109,9 +109,9 @@ class SpringScatter:
     stiffening    : b of the law [-]
     """
 
-    springs: np.ndarray
-    rest_length: np.ndarray
-    stiffness: np.ndarray
+    springs: Indices
+    rest_length: Floats
+    stiffness: Floats
     stiffening: float
     springs_owned: int
 
@@ -121,45 +121,43 @@ class SpringScatter:
         return cls(lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening, lattice.springs_owned)
 
     @property
-    def _all(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def _all(self) -> tuple[Indices, Floats, Floats, float]:
         return self.springs, self.rest_length, self.stiffness, self.stiffening
 
     @property
-    def _owned(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def _owned(self) -> tuple[Indices, Floats, Floats, float]:
         owned = slice(self.springs_owned)
         return self.springs[owned], self.rest_length[owned], self.stiffness[owned], self.stiffening
 
-    def energy(self, q: np.ndarray) -> float:
+    def energy(self, q: Positions) -> float:
         """Return E [J] of the springs that this rank owns."""
         return elastic_energy(q, *self._owned)
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of the springs that this rank owns."""
         return elastic_change(q, base, *self._owned)
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
         add_elastic_gradient(q, *self._all, gradient)
 
-    def add_concavity(self, q: np.ndarray, concavity: np.ndarray) -> None:
+    def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
         add_spring_concavity(q, *self._all, concavity)
 
-    def hessian_at(self, q: np.ndarray, projected: bool, dtype: type = np.float64) -> Product:
+    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
-        blocks: np.ndarray = np.empty((len(self.springs), 4), dtype)
+        blocks: Rows = np.empty((len(self.springs), 4), dtype)
         elastic_hessian(q, *self._all, projected, blocks)
         return partial(add_elastic_product, self.springs, blocks)
 
-    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, *self._all, blocks)
 
 
 @numba.njit(cache=True)
-def elastic_energy(
-    q: np.ndarray, springs: np.ndarray, rest_length: np.ndarray, stiffness: np.ndarray, stiffening: float
-) -> float:
+def elastic_energy(q: Positions, springs: Indices, rest_length: Floats, stiffness: Floats, stiffening: float) -> float:
     """Return the sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
     energy = 0.0
     for s in range(len(springs)):
@@ -171,11 +169,11 @@ def elastic_energy(
 
 @numba.njit(cache=True)
 def elastic_change(
-    q: np.ndarray,
-    base: np.ndarray,
-    springs: np.ndarray,
-    rest_length: np.ndarray,
-    stiffness: np.ndarray,
+    q: Positions,
+    base: Positions,
+    springs: Indices,
+    rest_length: Floats,
+    stiffness: Floats,
     stiffening: float,
 ) -> float:
     """Return E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
@@ -192,12 +190,12 @@ def elastic_change(
 
 @numba.njit(cache=True)
 def add_elastic_gradient(
-    q: np.ndarray,
-    springs: np.ndarray,
-    rest_length: np.ndarray,
-    stiffness: np.ndarray,
+    q: Positions,
+    springs: Indices,
+    rest_length: Floats,
+    stiffness: Floats,
     stiffening: float,
-    gradient: np.ndarray,
+    gradient: Rows,
 ) -> None:
     """Add grad E [N] to ``gradient`` (l, 3); without stiffening it is L x - J d(x) (Eq. 14-15)."""
     for s in range(len(springs)):
@@ -214,12 +212,12 @@ def add_elastic_gradient(
 
 @numba.njit(cache=True)
 def add_spring_concavity(
-    q: np.ndarray,
-    springs: np.ndarray,
-    rest_length: np.ndarray,
-    stiffness: np.ndarray,
+    q: Positions,
+    springs: Indices,
+    rest_length: Floats,
+    stiffness: Floats,
     stiffening: float,
-    concavity: np.ndarray,
+    concavity: Floats,
 ) -> None:
     """Add to ``concavity`` (l,) [N/m], at both ends of each compressed spring, twice what it pushes across itself.
 
@@ -236,13 +234,13 @@ def add_spring_concavity(
 
 @numba.njit(cache=True)
 def elastic_hessian(
-    q: np.ndarray,
-    springs: np.ndarray,
-    rest_length: np.ndarray,
-    stiffness: np.ndarray,
+    q: Positions,
+    springs: Indices,
+    rest_length: Floats,
+    stiffness: Floats,
     stiffening: float,
     projected: bool,
-    blocks: np.ndarray,
+    blocks: Rows,
 ) -> None:
     """Write the Hessian of E at q as the c and e of ``spring_block`` into ``blocks`` (s, 4).
 
@@ -257,12 +255,12 @@ def elastic_hessian(
 
 @numba.njit(cache=True)
 def add_elastic_diagonal(
-    q: np.ndarray,
-    springs: np.ndarray,
-    rest_length: np.ndarray,
-    stiffness: np.ndarray,
+    q: Positions,
+    springs: Indices,
+    rest_length: Floats,
+    stiffness: Floats,
     stiffening: float,
-    blocks: np.ndarray,
+    blocks: Rows,
 ) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
     sums = np.zeros((len(blocks), 6))  # xx, xy, xz, yy, yz, zz
@@ -284,7 +282,7 @@ def add_elastic_diagonal(
 
 
 @numba.njit(cache=True)
-def add_spring_block(block: np.ndarray, c: float, ex: float, ey: float, ez: float) -> None:
+def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -> None:
     """Add c I + e e^T to a block (9,)."""
     block[0] += c + ex * ex
     block[1] += ex * ey
@@ -298,7 +296,7 @@ def add_spring_block(block: np.ndarray, c: float, ex: float, ey: float, ez: floa
 
 
 @numba.njit(cache=True)
-def add_elastic_product(springs: np.ndarray, blocks: np.ndarray, v: np.ndarray, product: np.ndarray) -> None:
+def add_elastic_product(springs: Indices, blocks: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian of E) v [N] to ``product`` (l, 3), its ``blocks`` those of elastic_hessian.
 
     Springs of the same first end follow each other: what they have in common is read and written once.
@@ -337,10 +335,10 @@ class SpringGather:
     lengths   : (k,) rest lengths [m]
     """
 
-    neighbour: np.ndarray
-    kind: np.ndarray
-    stiffness: np.ndarray
-    lengths: np.ndarray
+    neighbour: Indices
+    kind: Array
+    stiffness: Floats
+    lengths: Floats
     stiffening: float
 
     @classmethod
@@ -363,34 +361,34 @@ class SpringGather:
         return cls(neighbour, kinds, stiffness, lengths, lattice.stiffening)
 
     @property
-    def _all(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    def _all(self) -> tuple[Indices, Array, Floats, Floats, float]:
         return self.neighbour, self.kind, self.stiffness, self.lengths, self.stiffening
 
-    def energy(self, q: np.ndarray) -> float:
+    def energy(self, q: Positions) -> float:
         """Return E [J] of the half of each spring that is nearer to an owned node: all ranks' sum is the body's."""
         parts = np.empty(self.neighbour.shape[1], like=q)
         _energy_around(len(parts), q, *self._all, parts)
         return float(parts.sum())
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of the halves of springs that ``energy`` counts."""
         parts = np.empty(self.neighbour.shape[1], like=q)
         _change_around(len(parts), q, base, *self._all, parts)
         return float(parts.sum())
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to the owned rows of ``gradient``."""
         _gradient_around(self.neighbour.shape[1], q, *self._all, gradient)
 
-    def add_concavity(self, q: np.ndarray, concavity: np.ndarray) -> None:
+    def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to the owned rows of ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
         _concavity_around(self.neighbour.shape[1], q, *self._all, concavity)
 
-    def hessian_at(self, q: np.ndarray, projected: bool, _: type = np.float64) -> Product:
+    def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
         return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
 
-    def add_half_bound(self, q: np.ndarray, blocks: np.ndarray) -> None:
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
 

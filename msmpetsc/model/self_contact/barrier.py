@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Indices, Positions, Rows
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.self_contact.creases import creases, neighbours, together
 
@@ -87,7 +88,7 @@ class Barrier:
         stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
         return self.ipctk.BarrierPotential(self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness)
 
-    def leave_out_neighbours(self, points: np.ndarray) -> tuple[int, int]:
+    def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
         """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
         (p, 3) [m] at rest; how many these are, and how many do not push at all."""
         pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
@@ -99,14 +100,14 @@ class Barrier:
         self.potentials += [self._potential(distance) for distance in sets]
         return len(self.folded), dropped
 
-    def candidates(self, points: np.ndarray, reach: float) -> "ipctk.Candidates":
+    def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m], but
         for those in creases."""
         candidates = self.ipctk.Candidates()
         candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
-    def clear_reach(self, candidates: "ipctk.Candidates", points: np.ndarray, reach: float) -> tuple[float, float]:
+    def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
         """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
         from, and until any pair of the surface does; 0 where one is."""
         clear = [reach]
@@ -115,13 +116,13 @@ class Barrier:
             clear.append(reach if near.empty() else max(0.5 * (self._least(near, points) - distance), 0.0))
         return clear[1], min(clear)
 
-    def contacts(self, candidates: "ipctk.Candidates | None", points: np.ndarray) -> ContactSets:
+    def contacts(self, candidates: "ipctk.Candidates | None", points: Positions) -> ContactSets:
         """Return the pairs nearer than they push from, one set for each distance; of creases only without
         ``candidates``."""
         kinds = zip((candidates or self.ipctk.Candidates(), *self.creases), self.distances, strict=True)
         return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
 
-    def _pairs(self, candidates: Any, points: np.ndarray, distance: float) -> "ipctk.NormalCollisions":
+    def _pairs(self, candidates: Any, points: Positions, distance: float) -> "ipctk.NormalCollisions":
         pairs = self.ipctk.NormalCollisions()
         pairs.use_area_weighting = True
         pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
@@ -131,32 +132,32 @@ class Barrier:
         """Return the sets that are not empty, each with its barrier."""
         return [(p, pairs) for p, pairs in zip(self.potentials, contacts, strict=True) if not pairs.empty()]
 
-    def energy(self, contacts: ContactSets, points: np.ndarray) -> float:
+    def energy(self, contacts: ContactSets, points: Positions) -> float:
         """Return the barriers' energy [J]."""
         points = np.asfortranarray(points)
         return sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts))
 
-    def gradient(self, contacts: ContactSets, points: np.ndarray) -> np.ndarray:
+    def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
         """Return its gradient (p, 3) [N]."""
         gradient, points = np.zeros(points.size), np.asfortranarray(points)
         for potential, pairs in self.pushing(contacts):
             gradient += potential.gradient(pairs, self.mesh, points)
         return gradient.reshape(-1, 3)
 
-    def hessian(self, contacts: ContactSets, points: np.ndarray, projected: bool) -> "list[csc_matrix]":
+    def hessian(self, contacts: ContactSets, points: Positions, projected: bool) -> "list[csc_matrix]":
         """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
         kinds, points = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
         kind = kinds.CLAMP if projected else kinds.NONE
         return [potential.hessian(pairs, self.mesh, points, kind) for potential, pairs in self.pushing(contacts)]
 
-    def least(self, contacts: ContactSets, points: np.ndarray) -> float:
+    def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite where there are no contacts."""
         return min((self._least(pairs, points) for _, pairs in self.pushing(contacts)), default=np.inf)
 
-    def _least(self, pairs: "ipctk.NormalCollisions", points: np.ndarray) -> float:
+    def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
-    def free_share(self, start: np.ndarray, moved: np.ndarray, candidates: "ipctk.Candidates") -> float:
+    def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates") -> float:
         """Return the share, up to 1, of a straight way that points go from start (p, 3) by ``moved`` (p, 3) [m]
         without any meeting.
 
@@ -165,8 +166,8 @@ class Barrier:
         end = start + moved - moved.mean(axis=0)
         return _kept(self._share(start, end, candidates, self.folded))
 
-    def sweep(self, start: np.ndarray, moved: np.ndarray, aside: float) -> tuple[float, "SweptPairs"]:
-        """Return the same of any way, and the pairs that come near on it, up to where points meet.
+    def sweep(self, start: Positions, moved: Rows, aside: float) -> tuple[float, "SweptPairs"]:
+        """Return the free share of any way, as ``free_share`` does, and the pairs near it, up to where points meet.
 
         aside : [m], as far as points may be from the way and have no other pairs
         """
@@ -182,17 +183,17 @@ class Barrier:
                     return KEPT * (piece + share) / whole, SweptPairs(whole, pieces)
         return (1.0 if whole <= PIECES else PIECES / whole), SweptPairs(whole, pieces)
 
-    def _near_way(self, begin: np.ndarray, end: np.ndarray, reach: float) -> "ipctk.Candidates":
+    def _near_way(self, begin: Positions, end: Positions, reach: float) -> "ipctk.Candidates":
         """Return the pairs whose boxes meet on a way, each wider by ``reach`` [m]."""
         candidates = self.ipctk.Candidates()
         candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), reach, self.ipctk.LBVH())
         return candidates
 
-    def free_share_in_creases(self, start: np.ndarray, moved: np.ndarray) -> float:
-        """Return the same where no others can meet."""
+    def free_share_in_creases(self, start: Positions, moved: Rows) -> float:
+        """Return the free share of a way on which only pairs in creases can meet."""
         return _kept(self._share(start, start + moved, self.folded))
 
-    def _share(self, start: np.ndarray, end: np.ndarray, *candidates: "ipctk.Candidates") -> float:
+    def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
         return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
 
@@ -201,7 +202,7 @@ def _kept(share: float) -> float:
     return share if share >= 1 else KEPT * share
 
 
-def crossings(surface: Surface) -> np.ndarray:
+def crossings(surface: Surface) -> Indices:
     """Return the triangles (k,) that edges of others cross or that have such an edge, ascending."""
     barrier = Barrier(surface, BarrierLaw(1.0, 1.0, 0.0, 1.0))
     ipctk, mesh = barrier.ipctk, barrier.mesh

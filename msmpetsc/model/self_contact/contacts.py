@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.model.checkpoint import Checkpoint
@@ -60,11 +61,11 @@ class Pairs:
     points, candidates : S there (p, 3) [m] and the pairs, on rank 0
     """
 
-    q: np.ndarray
+    q: Positions
     reach: float
     apart: float
     clear: float
-    points: np.ndarray
+    points: Positions
     candidates: "ipctk.Candidates | None"
 
 
@@ -75,8 +76,8 @@ class Way:
     square : |moved|^2 of all ranks [m^2]
     """
 
-    q: np.ndarray
-    moved: np.ndarray
+    q: Positions
+    moved: Rows
     square: float
     sweep: SweptPairs | None
 
@@ -90,9 +91,9 @@ class ContactsAt:
     contacts : on rank 0
     """
 
-    q: np.ndarray
+    q: Positions
     count: int = 0
-    points: np.ndarray | None = None
+    points: Positions | None = None
     contacts: "ContactSets | None" = None
 
 
@@ -110,18 +111,18 @@ class NearPairs:
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self._newest: Pairs | None = None
 
-    def step(self, q: np.ndarray, end: np.ndarray) -> "Contacts":
+    def step(self, q: Positions, end: Positions) -> "Contacts":
         """Return the contacts of a step from q to about ``end``; pairs are looked for unless the known ones serve."""
         pairs = self._newest
         if not (pairs and max(self.moved(q, pairs), self.moved(end, pairs)) <= pairs.reach):
             self.look(q, AHEAD * self._farthest(end, q))
         return Contacts(self)
 
-    def around(self, q: np.ndarray) -> Pairs:
+    def around(self, q: Positions) -> Pairs:
         """Return the newest pairs; those at q if there are none yet."""
         return self._newest or self.look(q, self.law.distance)
 
-    def look(self, q: np.ndarray, reach: float) -> Pairs:
+    def look(self, q: Positions, reach: float) -> Pairs:
         """Look for pairs at q."""
         points, reach = self.points(q), min(max(reach, self.law.distance), FARTHEST * self.edge)
         candidates, ways = None, (0.0, 0.0)
@@ -132,11 +133,11 @@ class NearPairs:
         self._newest = Pairs(q[: self.owned].copy(), reach, apart, clear, points, candidates)
         return self._newest
 
-    def moved(self, q: np.ndarray, pairs: Pairs) -> float:
+    def moved(self, q: Positions, pairs: Pairs) -> float:
         """Return no less than how far any point at q is from where the pairs were looked for [m]."""
         return self._farthest(q, pairs.q)
 
-    def _farthest(self, end: np.ndarray, start: np.ndarray) -> float:
+    def _farthest(self, end: Positions, start: Positions) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
         ends = np.full(6, -np.inf)
         _extend(end[: self.owned], start, ends)
@@ -171,7 +172,7 @@ class Contacts:
         self._moments: list[ContactsAt] = []
         self._ways: list[Way] = []
 
-    def find(self, q: np.ndarray) -> ContactsAt:
+    def find(self, q: Positions) -> ContactsAt:
         """Return the contacts at positions q."""
         q = q[: self.owned]
         pairs = self.near.around(q)
@@ -188,7 +189,7 @@ class Contacts:
         self._moments = [ContactsAt(q.copy(), count, points, contacts), *self._moments[: REMEMBERED - 1]]
         return self._moments[0]
 
-    def _pairs_near(self, q: np.ndarray, points: np.ndarray, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
+    def _pairs_near(self, q: Positions, points: Positions, pairs: Pairs, bound: float) -> "ipctk.Candidates | None":
         """Return the pairs that may be near at q, besides those in creases, on rank 0.
 
         bound : no point is farther from where ``pairs`` were looked for [m]
@@ -204,7 +205,7 @@ class Contacts:
                 return near
         return self.near.look(q, FARTHEST * self.near.edge).candidates
 
-    def _share_of(self, way: Way, q: np.ndarray) -> float | None:
+    def _share_of(self, way: Way, q: Positions) -> float | None:
         """Return the share of a way that positions q are at; None where they are not on it."""
         gone = q - way.q
         share = self.comm.allreduce(float(np.vdot(gone, way.moved))) / way.square if way.square else 0.0
@@ -212,11 +213,11 @@ class Contacts:
         near = self.comm.allreduce(aside, MPI.MAX) <= ASIDE * self.law.distance / np.sqrt(3)
         return share if near and -ASIDE < share < 1 + ASIDE else None
 
-    def _is_same(self, a: np.ndarray, b: np.ndarray) -> bool:
+    def _is_same(self, a: Positions, b: Positions) -> bool:
         same = bool(np.array_equal(a, b))
         return self.comm.allreduce(same, MPI.LAND) if self.comm.size > 1 else same
 
-    def _serve(self, pairs: Pairs, points: np.ndarray) -> bool:
+    def _serve(self, pairs: Pairs, points: Positions) -> bool:
         """Return whether points S (p, 3) are within the pairs' reach, by what these themselves moved."""
         serve = True
         if self.barrier:
@@ -229,7 +230,7 @@ class Contacts:
         """Return the same with the points, which friction asks for."""
         return ContactsAt(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
-    def touch(self, q: np.ndarray) -> Touch:
+    def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts at q."""
         moment, touch = self.find(q), Touch()
         if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
@@ -237,7 +238,7 @@ class Contacts:
             touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
         return self.comm.bcast(touch)
 
-    def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
+    def free_share(self, q: Positions, end: Positions) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
         q, end = q[: self.owned], end[: self.owned]
         pairs = self.near.around(q)
@@ -253,7 +254,7 @@ class Contacts:
             share = self.barrier.free_share(start, moved, pairs.candidates)
         return self.comm.bcast(share)
 
-    def _swept(self, q: np.ndarray, end: np.ndarray, start: np.ndarray, moved: np.ndarray) -> float:
+    def _swept(self, q: Positions, end: Positions, start: Positions, moved: Rows) -> float:
         """Return the free share of a way that no known pairs serve for; those on it are kept."""
         share, sweep = 1.0, None
         if self.barrier:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import coo_array
 
+from msmpetsc.backend.arrays import Indices, Positions
+
 if TYPE_CHECKING:
     import ipctk
 
@@ -23,7 +25,7 @@ NEAREST = 1e-3  # of dhat: pairs nearer than that at rest may cross
 
 
 def neighbours(
-    candidates: "ipctk.Candidates", mesh: "ipctk.CollisionMesh", points: np.ndarray, distance: float
+    candidates: "ipctk.Candidates", mesh: "ipctk.CollisionMesh", points: Positions, distance: float
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than ``distance`` [m] at
     rest."""
@@ -42,12 +44,12 @@ def neighbours(
     return {(int(i), int(j)): False for i, j in np.unique(local, axis=0) if i < j}
 
 
-def _kinds(candidates: "ipctk.Candidates") -> list[tuple[list, int]]:
+def _kinds(candidates: "ipctk.Candidates") -> list[tuple[list[Any], int]]:
     """Return the pairs of a point and a triangle and those of two edges, and of how many points the first part is."""
     return [(candidates.fv_candidates, 1), (candidates.ee_candidates, 2)]
 
 
-def _cross_pairs(kind: list[Any], mesh: Any, points: np.ndarray, distance: float, split: int) -> np.ndarray:
+def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, split: int) -> Indices:
     """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the second part; of a point
     and a triangle there are three, one of them twice."""
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
@@ -58,7 +60,7 @@ def _cross_pairs(kind: list[Any], mesh: Any, points: np.ndarray, distance: float
 
 
 def creases(
-    apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: np.ndarray, distance: float
+    apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: Positions, distance: float
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
     """Return by distance [m], the greatest first, the pairs that are left out, and how many are too near for any.
 
@@ -113,7 +115,7 @@ def _left_out(
     ]
 
 
-def _corners(parts: np.ndarray, points: int) -> coo_array:
+def _corners(parts: Indices, points: int) -> coo_array:
     """Return which of the points are corners of parts (k, c), (k, points)."""
     rows = np.repeat(np.arange(len(parts)), parts.shape[1])
     return coo_array((np.ones(parts.size), (rows, parts.ravel())), shape=(len(parts), points)).tocsr()

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.model.self_contact.barrier import Barrier, ContactSets
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ class SurfaceFriction:
     stick    : slip [m] below which it fades to nothing
     """
 
-    def __init__(self, barrier: Barrier, contacts: ContactSets, start: np.ndarray, stick: float):
+    def __init__(self, barrier: Barrier, contacts: ContactSets, start: Positions, stick: float):
         library, self.mesh, self.start = barrier.ipctk, barrier.mesh, start
         self.contacts: list[ipctk.TangentialCollisions] = []
         for potential, pairs in barrier.pushing(contacts):
@@ -29,22 +30,22 @@ class SurfaceFriction:
             )  # its normals and pushes stay
         self.potential = library.FrictionPotential(stick)
 
-    def energy(self, points: np.ndarray) -> float:
+    def energy(self, points: Positions) -> float:
         """Return the potential [J] of points that came to S (p, 3) [m]."""
         slip = self._slip(points)
         return sum(self.potential(pairs, self.mesh, slip) for pairs in self.contacts)
 
-    def gradient(self, points: np.ndarray) -> np.ndarray:
+    def gradient(self, points: Positions) -> Rows:
         """Return its gradient (p, 3) [N]."""
         slip, gradient = self._slip(points), np.zeros(points.size)
         for pairs in self.contacts:
             gradient += self.potential.gradient(pairs, self.mesh, slip)
         return gradient.reshape(-1, 3)
 
-    def hessian(self, points: np.ndarray) -> "list[csc_matrix]":
+    def hessian(self, points: Positions) -> "list[csc_matrix]":
         """Return the terms (3p, 3p) [N/m] of its Hessian, which is positive semidefinite."""
         slip = self._slip(points)
         return [self.potential.hessian(pairs, self.mesh, slip) for pairs in self.contacts]
 
-    def _slip(self, points: np.ndarray) -> np.ndarray:
+    def _slip(self, points: Positions) -> Rows:
         return np.asfortranarray(points - self.start)

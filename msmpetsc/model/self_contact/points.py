@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 
+from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.comm import Route
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.model.lattice import Lattice
@@ -18,7 +19,7 @@ from msmpetsc.model.lattice import Lattice
 class Carried(NamedTuple):
     """Some of the points as this rank's nodes carry them: where they are among those, and their weights (k, owned)."""
 
-    at: np.ndarray
+    at: Indices
     weights: csr_array
 
 
@@ -45,7 +46,7 @@ class SurfacePoints:
         self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
         self.received = np.split(self.to_root.send(self.rows), np.cumsum(self.to_root.received)[:-1])
 
-    def __call__(self, q: np.ndarray) -> np.ndarray:
+    def __call__(self, q: Positions) -> Positions:
         """Return the points (total, 3) [m] of positions q (owned or more, 3) on rank 0; (0, 3) on the others."""
         parts = self.to_root.send(self.weights @ q[: self.weights.shape[1]])
         points = np.zeros((self.total if self.comm.rank == 0 else 0, 3))
@@ -55,7 +56,7 @@ class SurfacePoints:
             first += len(rows)
         return points
 
-    def carried(self, numbers: np.ndarray) -> Carried:
+    def carried(self, numbers: Indices) -> Carried:
         """Return what this rank's nodes carry of the points with these numbers (k,), ascending."""
         at = np.flatnonzero(np.isin(numbers, self.rows, assume_unique=True))
         return Carried(at, self.weights[np.searchsorted(self.rows, numbers[at])])

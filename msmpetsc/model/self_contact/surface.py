@@ -11,6 +11,7 @@ from msmpetsc.geometry.cages import Body, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined
+from msmpetsc.model.contact.friction import STICK
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.self_contact.barrier import BarrierLaw, crossings
 from msmpetsc.model.self_contact.contacts import CollisionSurface
@@ -19,7 +20,6 @@ from msmpetsc.scene.motion import SelfContactTable
 from msmpetsc.scene.schema import Scene
 
 NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
-STICK = 1e-2  # longest sides a second: friction holds but for a creep below this, as an obstacle's does
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
 FEWEST = 20  # triangles of a body
 HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off

@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.model.self_contact.contacts import Contacts, ContactsAt
 from msmpetsc.model.self_contact.friction import SurfaceFriction
 from msmpetsc.model.self_contact.points import Carried
@@ -31,7 +32,7 @@ class SurfaceHessian:
     carried: Carried
     points: csr_array
 
-    def add_product(self, v: np.ndarray, product: np.ndarray) -> None:
+    def add_product(self, v: Rows, product: Rows) -> None:
         """Add the Hessian times v (owned or more, 3) to the owned rows of ``product`` (collective)."""
         at, weights = self.carried
         moved = np.zeros((self.points.shape[0] // 3, 3))
@@ -44,7 +45,7 @@ class SurfaceHessian:
         product[: weights.shape[1]] += weights.T @ forces[at]
 
     @cached_property
-    def blocks(self) -> np.ndarray:
+    def blocks(self) -> Rows:
         """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
         at, weights = self.carried
         own = (3 * at[:, None] + np.arange(3)).ravel()
@@ -64,7 +65,7 @@ class SurfaceContact:
     friction : of the step, on rank 0
     """
 
-    def __init__(self, contacts: Contacts, start: np.ndarray | None = None, time_step: float = 0.0):
+    def __init__(self, contacts: Contacts, start: Positions | None = None, time_step: float = 0.0):
         """Without a ``start`` of the step there is no friction."""
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
@@ -78,18 +79,18 @@ class SurfaceContact:
         if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
             self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
 
-    def _acting(self, q: np.ndarray) -> ContactsAt | None:
+    def _acting(self, q: Positions) -> ContactsAt | None:
         """Return the contacts at q, with the points where there is friction; None where nothing acts."""
         moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
         return moment if moment.points is not None else self.contacts.with_points(moment)
 
-    def presses(self, q: np.ndarray) -> bool:
+    def presses(self, q: Positions) -> bool:
         """Return whether it acts at q."""
         return self._acting(q) is not None
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> float:
+    def change(self, q: Positions, base: Positions) -> float:
         """Return this rank's part of the energy at q less that at base, friction included [J].
 
         Of a small move it is the mean of the forces at both times that: a difference of energies would lose its digits.
@@ -102,7 +103,7 @@ class SurfaceContact:
             return sum(0.5 * self._work(moment, moved) for moment in (before, after))
         return self._energy(after) - self._energy(before)
 
-    def _work(self, moment: ContactsAt | None, moved: np.ndarray) -> float:
+    def _work(self, moment: ContactsAt | None, moved: Rows) -> float:
         """Return the gradient times a move of the points (p, 3) [m], on rank 0 [J]."""
         forces = self._forces(moment) if moment else None
         if forces is None:
@@ -118,7 +119,7 @@ class SurfaceContact:
             energy += barrier.energy(moment.contacts, moment.points)
         return energy + (self.friction.energy(moment.points) if self.friction else 0.0)
 
-    def add_gradient(self, q: np.ndarray, gradient: np.ndarray) -> None:
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         moment = self._acting(q)
         if moment is None:
@@ -127,7 +128,7 @@ class SurfaceContact:
         at, weights = self.contacts.points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces[at]
 
-    def _forces(self, moment: ContactsAt) -> tuple[np.ndarray, np.ndarray] | None:
+    def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
         """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
@@ -140,7 +141,7 @@ class SurfaceContact:
         touched = np.flatnonzero(forces.any(axis=1))
         return touched, forces[touched]
 
-    def hessian(self, q: np.ndarray, projected: bool) -> SurfaceHessian | None:
+    def hessian(self, q: Positions, projected: bool) -> SurfaceHessian | None:
         """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts."""
         moment = self._acting(q)
         if moment is None:
@@ -152,7 +153,7 @@ class SurfaceContact:
             self._hessians[projected] = known
         return known[1]
 
-    def concavity(self, q: np.ndarray) -> np.ndarray:
+    def concavity(self, q: Positions) -> Floats:
         """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
 
         With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w v)^2 is no more
@@ -165,7 +166,7 @@ class SurfaceContact:
         at, weights = kept.carried
         return self.contacts.points.spread * (np.abs(weights).T @ sums[at])
 
-    def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[np.ndarray, csr_array] | None:
+    def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
@@ -177,17 +178,17 @@ class SurfaceContact:
         numbers = (3 * touched[:, None] + np.arange(3)).ravel()
         return touched, csr_array(whole[numbers][:, numbers])
 
-    def bound(self, q: np.ndarray) -> np.ndarray:
+    def bound(self, q: Positions) -> Floats:
         """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
         hessian = self.hessian(q, True)
         return np.zeros(self.contacts.owned) if hessian is None else block_bound(hessian.blocks)
 
-    def free_share(self, q: np.ndarray, end: np.ndarray) -> float:
+    def free_share(self, q: Positions, end: Positions) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
         return self.contacts.free_share(q, end)
 
 
-def block_bound(blocks: np.ndarray) -> np.ndarray:
+def block_bound(blocks: Rows) -> Floats:
     """Return (n,) no less than each block (n, 9): powers of 4, which change seldom."""
     norms = np.abs(blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
     return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)

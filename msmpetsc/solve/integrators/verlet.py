@@ -250,7 +250,7 @@ class Verlet:
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
         kick(len(self.free), self.free, self.per_mass, load, self.gradient, duration, self.v)
-        if beyond is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
+        if beyond is not None and before is not None:  # f (v- + v+) / 2 is what a kick by f does to the kinetic energy
             self.work += 0.5 * duration * float(np.vdot(beyond[self.free], (before + self.v)[self.free]))
         self._damp(0.5 * duration)
         self.work += duration * self.environment.power(self.q, time, begin, end, self.sides)

@@ -43,13 +43,13 @@ class Trace:
 
     def follow(self, stepper: Stepper) -> None:
         """Take the iterates from now on, which is when the step begins."""
-        begin, before = perf_counter(), stepper.all_its()
+        begin, before = perf_counter(), stepper.work_so_far()
 
         def observe(q: np.ndarray) -> None:
             nonlocal begin
             now = perf_counter()
             self.iteration.append(len(self.iteration))
-            self.ksp_its.append(stepper.all_its() - before)
+            self.ksp_its.append((stepper.work_so_far() - before).ksp_its)
             self.seconds.append(now - begin)
             self.positions.append(q)
             begin += perf_counter() - now  # not of the step

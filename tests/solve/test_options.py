@@ -213,7 +213,7 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
     for error, budget in ((1e-1, None), (1e-3, None), (1e-6, None), (1e-12, 2)):
         stepper = Stepper(COMM, lattice, T, find_preset(preset), error, budget)
         stepper.step(StepProblem(lattice.nodes, lattice.nodes, weight(lattice)))
-        reason, corrected = stepper.snes.reason, stepper.control.now.corrected
+        reason, corrected = stepper.snes.reason, stepper.outcome.corrected
         stepper.destroy()
         rule = reasons.CONVERGED_SNORM_RELATIVE if corrected else reasons.CONVERGED_FNORM_RELATIVE
         assert reason == (reasons.CONVERGED_ITS if budget else rule)
@@ -232,7 +232,7 @@ def test_newton_starts_its_solves_where_the_user_says(petsc_options):
 
 def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):
     petsc_options(ksp_type="chebyshev")
-    assert all(result.error <= 1e-3 for result in swing("newton", 2, error=1e-3))
+    assert all(result.cost.step_error <= 1e-3 for result in swing("newton", 2, error=1e-3))
 
 
 def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):
@@ -347,7 +347,7 @@ def test_shown_options_given_back_change_nothing(petsc_options, preset: str):
     refuse_early(COMM, [])
     after = swing(preset, 2)
     np.testing.assert_array_equal(after[-1].position, before[-1].position)
-    assert [result.ksp_its for result in after] == [result.ksp_its for result in before]
+    assert [result.cost.ksp_its for result in after] == [result.cost.ksp_its for result in before]
 
 
 def test_options_are_shown_without_a_mesh_as_a_file_that_can_be_given(tmp_path: Path):

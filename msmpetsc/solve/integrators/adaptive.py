@@ -30,6 +30,7 @@ from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.work import Work
 
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
@@ -151,13 +152,13 @@ class Adaptive:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
         frame = round(time / self.time_step)
-        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, 0.0, 0, 0, steps=0)
+        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
         if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
             self.tick = wanted - self.ticks.length(0)
         while self.tick < wanted:
             result, state = self._step(state)
-            total = sum_of(total, result)
-        if self.tick > wanted or not total.steps:
+            total = replace(result, cost=total.cost + result.cost)
+        if self.tick > wanted or not total.cost.steps:
             total = self._within(total, state, (self.tick - wanted) / self.ticks.length(self.last), time)
         return replace(total, time_error=self.control.estimate), state
 
@@ -174,7 +175,7 @@ class Adaptive:
     def _step(self, state: State) -> tuple[StepResult, State]:
         """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
-        wasted = StepResult(state.q, state.q_previous, 0.0, 0, 0)
+        cost = Work()
         while True:
             level = self._next_level(state)
             before = self._begun(state, level, restarts)
@@ -188,10 +189,11 @@ class Adaptive:
                 if not self.control.shorten(level):
                     raise
             else:
-                wasted = sum_of(wasted, result)
+                cost += result.cost
             if stands:
                 self.control.pay(level, measure)
-                return self._taken(wasted, result, before, after, level)
+                result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
+                return self._taken(result, before, after, level)
             self.taken.again += 1
 
     def _next_level(self, state: State) -> int:
@@ -240,19 +242,15 @@ class Adaptive:
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 
-    def _taken(
-        self, wasted: StepResult, result: StepResult, before: State, after: State, level: int
-    ) -> tuple[StepResult, State]:
-        """A step that stands, as the scene's step has it, with the work of those that did not."""
+    def _taken(self, result: StepResult, before: State, after: State, level: int) -> tuple[StepResult, State]:
+        """A step that stands, as the scene's step has it."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
         self.taken.add(level)
         history = after.history or (before.q, before.velocity(t))
         previous = result.position - T / t * (result.position - result.previous)
-        result = replace(
-            result, previous=previous, iterations=wasted.iterations, ksp_its=wasted.ksp_its, products=wasted.products
-        )
+        result = replace(result, previous=previous)
         return result, replace(after, q_previous=after.q - T * after.velocity(t), history=history)
 
     def follow(self) -> None:
@@ -304,15 +302,3 @@ class Adaptive:
         self.mean.destroy()
         for integrator in self.kept.values():
             integrator.destroy()
-
-
-def sum_of(total: StepResult, result: StepResult) -> StepResult:
-    """A result with the work of another before it."""
-    return replace(
-        result,
-        error=max(total.error, result.error),
-        iterations=total.iterations + result.iterations,
-        ksp_its=total.ksp_its + result.ksp_its,
-        products=total.products + result.products,
-        steps=total.steps + result.steps,
-    )

@@ -37,6 +37,7 @@ from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step
@@ -229,7 +230,9 @@ class Verlet:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True, swing=swing)
+        result = StepResult(
+            self.known, previous, Work(iterations=count, steps=1), self.work, explicit=True, swing=swing
+        )
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:

@@ -177,6 +177,11 @@ class Environment:
             surface = term_of(self.self_contact, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
+    def forget(self) -> None:
+        """Know nothing of the steps before (collective)."""
+        if self.self_contact:
+            self.self_contact.forget()
+
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts of the surface with itself at q (collective)."""
         return self.self_contact.touch(q) if self.self_contact else Touch()

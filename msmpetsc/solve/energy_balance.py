@@ -17,7 +17,6 @@ In a linear body Verlet's, of substeps dt, swings just as dt^2/8 |M^(-1) (f_ext 
 Wanner, Geometric Numerical Integration, IX): only what was gained with and without that is worth a word.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import FINITE, Range
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
@@ -204,15 +203,10 @@ class EnergyBalance:
             return "a smaller time.substep" if explicit else "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the ledger."""
-        checkpoint.keep(numbers={**vars(self.ledger), "energy_gained": self.gained})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        most = sys.float_info.max
-        self.ledger = Ledger(**{name: checkpoint.number(name, 0.0, -most, most) for name in vars(Ledger())})
-        self.gained = checkpoint.numbers.get("energy_gained", 0.0)
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"ledger": FINITE, "gained": FINITE}
 
     def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import COUNT, Range
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
@@ -40,7 +40,7 @@ class Recovery:
     @property
     def is_on(self) -> bool:
         """Whether steps are under its care before they have failed."""
-        return self.level > 0
+        return self.level > 0 and self.on_failure == "substep"  # else it was another scene that asked for it
 
     @property
     def awaited(self) -> tuple[str, ...]:
@@ -63,20 +63,14 @@ class Recovery:
             return replace(result, cost=result.cost + Work(fallbacks=1)), after
         return self._in_pieces(state, time, max(self.level, 1) if failure else self.level)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on."""
-        checkpoint.keep(numbers={"level": self.level, "rescued": self.recovered})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        if self.on_failure == "substep":
-            self.level = checkpoint.count("level", DEEPEST)
-        if self.on_failure != "stop":  # else it was another scene that asked for it
-            self.recovered = checkpoint.count("rescued")
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"level": (0, DEEPEST), "recovered": COUNT}
 
     def sum_up(self) -> None:
         """Say at the end of a run how many steps were recovered."""
-        if self.recovered:
+        if self.recovered and self.on_failure != "stop":
             were = "s were" if self.recovered > 1 else " was"
             log.warning("%d step%s %s", self.recovered, were, WORDS[self.on_failure])
 
@@ -110,6 +104,7 @@ class Recovery:
         if level not in self.spare:
             self.spare[level] = self._new(short)
             self.spare[level].set_up()
+            self.spare[level].forget()  # as those that are kept
         before = state.over(self.time_step, short)
         result, after = self.spare[level].advance(before, time)
         self.balance.examine(before, result, after, time, short)

@@ -1,7 +1,7 @@
 """The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 
@@ -12,11 +12,10 @@ from msmpetsc.backend.arrays import on_host, to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, to_device
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
-from msmpetsc.model.self_contact.kinds import RunContacts
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -36,7 +35,9 @@ from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
 from msmpetsc.solve.rest import Rest
-from msmpetsc.solve.work import COUNTED, NO_WORK, Work
+from msmpetsc.solve.work import NO_WORK, Work
+
+REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
@@ -76,18 +77,10 @@ class Effort:
         """Take note of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the effort so far."""
-        checkpoint.keep(numbers={**vars(self.work), "true_error": self.true_error, "energy_error": self.energy_error})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        counts = {name: checkpoint.count(name) for name in COUNTED if name != "wall_time"}
-        seconds, error = (checkpoint.numbers.get(name, 0.0) for name in ("wall_time", "step_error"))
-        self.work = Work(step_error=error, wall_time=seconds, **counts)
-        self.true_error, self.energy_error = (
-            checkpoint.numbers.get(name, np.nan) for name in ("true_error", "energy_error")
-        )
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"work": ANY, "true_error": ANY, "energy_error": ANY}
 
 
 class Simulation:
@@ -125,6 +118,7 @@ class Simulation:
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.time_error = np.nan  # estimated, of the trajectory so far
+        self._saved = Checkpoint()
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
@@ -175,7 +169,10 @@ class Simulation:
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
-        return self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        frame = self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
+            self._saved = self._save()
+        return frame
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
         """A step that failed, taken another way (collective). Raises StepFailed, naming the step."""
@@ -190,27 +187,33 @@ class Simulation:
         self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
 
     def saved(self) -> Checkpoint:
-        """All that the next step depends on; to be stored or copied before that is taken."""
+        """The last step that the run may go on from: every ``REMEMBERED``-th, and that of a body at rest."""
+        rows = {name: to_host(rows) for name, rows in self._saved.rows.items()}
+        return replace(self._saved, rows=rows)
+
+    def _save(self) -> Checkpoint:
+        """Store the state, and forget what is no part of it: a resumed run would not have it."""
         checkpoint = Checkpoint(self.step)
         self.state.save(checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.has_sides)
-        self.integrator.save(checkpoint, self.state)
-        for part in self._remembering():
-            part.save(checkpoint)
-        checkpoint.rows = {name: to_host(rows) for name, rows in checkpoint.rows.items()}
+        self.integrator.save(checkpoint)
+        self.environment.forget()
+        for part in self._counting():
+            checkpoint.keep_counts(part)
         return checkpoint
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint (collective)."""
+        """Go on from a checkpoint, before any step is taken (collective)."""
         checkpoint.refuse_rows_unlike(self.comm, self.saved())
-        self.step = checkpoint.step
+        self._saved, self.step = checkpoint, checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
-        self.integrator.restore(checkpoint, self.state, self.step * self.time_step)
-        for part in self._remembering():
-            part.restore(checkpoint)
+        for part in self._counting():
+            checkpoint.restore_counts(part)
+        if self.step:
+            self.integrator.restore(checkpoint, self.step * self.time_step)
+            self.environment.forget()
 
-    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | Effort | Rest | RunContacts]:
-        parts = (self.rest, self.environment.self_contact)
-        return [self.balance, self.recovery, self.monitors, self.effort, *(part for part in parts if part)]
+    def _counting(self) -> list[Counting]:
+        return [self.balance, self.recovery, self.monitors, self.effort, *([self.rest] if self.rest else [])]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -247,6 +250,7 @@ class Simulation:
     def __enter__(self) -> "Simulation":
         try:
             self.integrator.set_up()
+            self._saved = self._save()
         except InputError:
             self.destroy()
             raise

@@ -14,6 +14,7 @@ from msmpetsc import open as msmpetsc_open
 from msmpetsc.model.build import Model, build_model
 from msmpetsc.model.self_contact.cell_contacts import CellContacts, OverlappingSurface
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve import simulate
 from msmpetsc.solve.simulate import Simulation
 
 COMM = MPI.COMM_SELF
@@ -153,7 +154,8 @@ def test_three_ranks_are_as_one(tmp_path, msmpetsc):
         np.testing.assert_allclose(three.frames.self_distance[:], one.frames.self_distance[:], rtol=1e-4)
 
 
-def test_a_resumed_run_is_the_same_to_the_last_bit(tmp_path):
+def test_a_resumed_run_is_the_same_to_the_last_bit(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate, "REMEMBERED", 12)
     scene = load_scene(double_skin(tmp_path), ("time.duration=0.14",))
     model = build_model(COMM, scene)
     with Simulation(COMM, scene, model) as simulation:

@@ -19,7 +19,6 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.self_contact.cells import Cells, Intrusions, Places, intrusions
 from msmpetsc.model.self_contact.contacts import Touch
 from msmpetsc.model.self_contact.points import Carried, SurfacePoints
@@ -56,11 +55,9 @@ class CellContacts:
     def expect(self, q: np.ndarray, end: np.ndarray) -> None:
         """There is nothing to make ready for a step."""
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """There is nothing to store."""
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self._known = []
 
     def during(self, q: np.ndarray) -> "CellContact":
         """Return what pushes in a step from q."""

@@ -14,7 +14,6 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, Sweep
 from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
@@ -207,17 +206,11 @@ class Contacts:
         """Return the same with the points, which friction asks for."""
         return Moment(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store where pairs were looked for: in their order contacts are summed."""
-        pairs = self._pairs
-        rows = np.zeros((self.owned, 3)) if pairs is None else pairs.q
-        checkpoint.keep({"pairs_q": rows}, {"pairs_reach": pairs.reach if pairs else 0.0})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self._pairs, reach = None, checkpoint.number("pairs_reach", 0.0, 0)
-        if reach > 0:
-            self._look(checkpoint.row("pairs_q"), reach)
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self._pairs = None
+        self._moments.clear()
+        self._ways.clear()
 
     def touch(self, q: np.ndarray) -> Touch:
         """Return what there is of contacts at q."""

@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import MOST_COUNT, Checkpoint, Range
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.motion import Time
@@ -138,6 +138,8 @@ class Adaptive:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
             self.kept[level].set_up()
+            if self.taken.steps:
+                self.kept[level].forget()  # as one that was kept and not used last
         elif level != next(reversed(self.kept)):
             self.kept[level] = self.kept.pop(level)
             self.kept[level].forget()
@@ -260,26 +262,22 @@ class Adaptive:
         """Unknown (NaN): a frame is no single step."""
         return np.full(2, np.nan), None
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        """Store the account, and what the integrator used last depends on."""
-        self.control.save(checkpoint)
-        counts = {f"taken_{name}": count for name, count in vars(self.taken).items()}
-        checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | counts)
-        self._integrator_last().save(checkpoint, state)
-        if self.environment.touches:  # as not every level's has it
-            checkpoint.rows.setdefault("contact_bound", np.zeros(self.lattice.owned))
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"tick": (0, self.ticks.ticks), "last": self.levels, "taken": (-99, MOST_COUNT)}
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        for part in (self, self.control):
+            checkpoint.keep_counts(part)
+        self._integrator_last().save(checkpoint)
 
     def _integrator_last(self) -> Integrator:
         return self.kept[next(reversed(self.kept))]
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        self.control.restore(checkpoint)
-        lowest, highest = self.levels
-        self.tick = int(checkpoint.number("tick", 0, 0, self.ticks.ticks))
-        self.last = int(checkpoint.number("last_level", 0, lowest, highest))
-        counts = {name: checkpoint.number(f"taken_{name}", value, -99, 2**53) for name, value in vars(Taken()).items()}
-        self.taken = Taken(**{name: int(count) for name, count in counts.items()})
-        self._integrator(self.last).restore(checkpoint, state, self._reached(self.tick))
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        for part in (self, self.control):
+            checkpoint.restore_counts(part)
+        self._integrator(self.last).restore(checkpoint, self._reached(self.tick))
 
     def forget(self) -> None:
         for integrator in self.kept.values():

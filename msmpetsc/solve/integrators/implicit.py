@@ -167,15 +167,18 @@ class ImplicitEuler:
             self.stepper, self.reference = self._new_stepper(time), None
             self.set_up()
 
-    def save(self, checkpoint: Checkpoint, _: State) -> None:
-        self.stepper.save(checkpoint)
+    def save(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.step:  # before the first there is nothing to forget
+            self.stepper.forget(modes=False)
+        self.stepper.minimum.curvature.save(checkpoint)
 
-    def restore(self, checkpoint: Checkpoint, _: State, time: float) -> None:
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
-        self.stepper.restore(checkpoint)
+        self.stepper.forget()
+        self.stepper.minimum.curvature.restore(checkpoint)
 
     def forget(self) -> None:
-        self.stepper.restore(Checkpoint())
+        self.stepper.forget()
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         names = self.stepper.options.names

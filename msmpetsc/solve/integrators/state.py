@@ -51,7 +51,7 @@ class State:
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
         """The state that a checkpoint holds (collective)."""
-        names = ("q", "q_previous", *HISTORY) if checkpoint.count("history", 1) else ("q", "q_previous")
+        names = ("q", "q_previous", *HISTORY) if checkpoint.number("history", 0, 0, 1) else ("q", "q_previous")
         q, q_previous, *last = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
         history = (last[0], last[1]) if last else None
         sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None

@@ -20,7 +20,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
@@ -103,13 +103,17 @@ class Static(ImplicitEuler):
             log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
         return result
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        super().save(checkpoint, state)
-        checkpoint.keep(numbers={"state_error": self.error})
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"error": ANY}
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        super().restore(checkpoint, state, time)
-        self.error = checkpoint.numbers.get("state_error", 0.0)
+    def save(self, checkpoint: Checkpoint) -> None:
+        super().save(checkpoint)
+        checkpoint.keep_counts(self)
+
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        super().restore(checkpoint, time)
+        checkpoint.restore_counts(self)
 
     @contextmanager
     def _hurried(self, soon: bool) -> Iterator[None]:

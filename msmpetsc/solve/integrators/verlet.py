@@ -21,12 +21,12 @@ from itertools import pairwise
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.arrays import greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.motion import Time
@@ -111,31 +111,16 @@ class Verlet:
         """Unknown (NaN): an explicit step solves nothing."""
         return np.full(2, np.nan), None
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        """Store the highest mode; grad E is computed again from q, if it is known of that."""
-        has_begun = self.anchors is not None  # it has taken a step
-        squared, known = (self.highest.squared, state.q is self.known) if has_begun else (-1.0, False)
-        mode = self.highest.mode.values[: self.lattice.owned]
-        numbers = {"squared": squared, "known": known, "substep": self.substep}
-        checkpoint.keep({"mode": mode}, {**numbers, "halvings": self.halvings, "springs_gained": self.gained})
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"substep": (sys.float_info.min, np.inf), "halvings": (0, HALVINGS), "gained": FINITE}
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        squared = checkpoint.number("squared", -1.0, -1.0, sys.float_info.max)
-        if squared < 0:
-            return
-        self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = like(self.v, checkpoint.row("mode"))
-        self.highest.mode.update()
-        self.highest.squared = squared
-        self.substep = checkpoint.number("substep", self.substep, sys.float_info.min)
-        self.halvings = checkpoint.count("halvings", HALVINGS)
-        self.gained = checkpoint.number("springs_gained", 0.0, -sys.float_info.max, sys.float_info.max)
-        if checkpoint.count("known", 1):
-            self.known = state.q
-            self.position.values[:] = state.q
-            sides = self.environment.no_sides if state.sides is None else state.sides
-            self.sides = sides[:, : self.lattice.owned]
-            self._pull(time)
+    def save(self, checkpoint: Checkpoint) -> None:
+        checkpoint.keep_counts(self)
+        self.known = self.anchors = None
+
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        checkpoint.restore_counts(self)
 
     def forget(self) -> None:
         self.known = self.anchors = None

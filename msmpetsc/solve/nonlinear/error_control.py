@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
@@ -133,10 +132,6 @@ class ErrorControl:
         """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
         return self.rounding.added_to(error, self.functional.distance(q), at_rounding)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step's judgements depend on."""
-        checkpoint.keep(numbers={"ratio": self.ratio})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        self.ratio = checkpoint.number("ratio", FIRST_RATIO, 0)
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self.ratio = FIRST_RATIO

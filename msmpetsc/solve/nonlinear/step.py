@@ -11,7 +11,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -206,18 +205,12 @@ class Stepper:
         if share < 1.0:
             self.unknowns.from_nodes(iterate.q + share * (balanced - iterate.q), self.x)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on beside its problem."""
-        for part in self._remembering():
-            part.save(checkpoint)
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
-        for part in self._remembering():
-            part.restore(checkpoint)
-
-    def _remembering(self) -> list:
-        return [self.first_guess, self.minimum.curvature, self.control, self.jacobian.preconditioner]
+    def forget(self, modes: bool = True) -> None:
+        """Let the steps so far leave no trace in the next; modes: of the lowest mode neither."""
+        for part in (self.first_guess, self.control, self.jacobian.preconditioner):
+            part.forget()
+        if modes:
+            self.minimum.curvature.forget()
 
     def work_so_far(self) -> Work:
         """Work of all steps so far, of their estimates and searches for negative curvature."""

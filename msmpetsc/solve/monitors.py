@@ -10,7 +10,8 @@ from msmpetsc.model.contact.obstacle import describe_overlap
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import worst_inverted
-from msmpetsc.solve.energy_balance import MUCH, Ledger
+from msmpetsc.solve.energy_balance import MUCH
+from msmpetsc.solve.integrators.state import Ledger
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 

@@ -106,8 +106,7 @@ class Recovery:
             self.spare[level].set_up()
             self.spare[level].forget()  # as those that are kept
         before = state.over(self.time_step, short)
-        result, after = self.spare[level].advance(before, time)
-        self.balance.examine(before, result, after, time, short)
+        result, after = self.balance.step(self.spare[level], before, time, short)
         previous = State(result.position, result.previous).over(short, self.time_step).q_previous
         return replace(result, previous=previous), after.over(short, self.time_step)
 

@@ -152,10 +152,10 @@ class Simulation:
         try:
             if self.recovery.is_on:
                 result, after = self.recovery.step(self.state, time, None)
+            elif self.adaptive:  # which has each of its own steps examined
+                result, after = self.adaptive.advance(self.state, time)
             else:
-                result, after = self.integrator.advance(self.state, time)
-                if not self.adaptive:  # which has each of its own examined
-                    self.balance.examine(self.state, result, after, time, self.time_step)
+                result, after = self.balance.step(self.integrator, self.state, time, self.time_step)
         except StepFailed as failure:
             result, after = self._recovered(index, time, failure)
         before, self.state = self.state, after
@@ -165,7 +165,7 @@ class Simulation:
             errors, trace = self.integrator.true_errors(index, result)
             self.effort.measure(errors)
             self.trace = trace or self.trace
-        self.monitors.gain(index, time, self.balance.ledger, self.balance.remedy(result.explicit))
+        self.monitors.gain(index, time, after.ledger, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
@@ -204,16 +204,16 @@ class Simulation:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint, before any step is taken (collective)."""
         checkpoint.refuse_rows_unlike(self.comm, self.saved())
-        self._saved, self.step = checkpoint, checkpoint.step
+        self.step = checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
         for part in self._counting():
             checkpoint.restore_counts(part)
         if self.step:
             self.integrator.restore(checkpoint, self.step * self.time_step)
-            self.environment.forget()
+        self._saved = self._save()
 
     def _counting(self) -> list[Counting]:
-        return [self.balance, self.recovery, self.monitors, self.effort, *([self.rest] if self.rest else [])]
+        return [self.recovery, self.monitors, self.effort, *([self.rest] if self.rest else [])]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -221,9 +221,11 @@ class Simulation:
 
     def _frame(self, index: int, q: np.ndarray) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
-        time, energies, effort, gained = index * self.time_step, self.balance.energies, self.effort, self.balance.gained
+        time, energies = index * self.time_step, self.balance.energies
+        effort, gained = self.effort, self.state.ledger.since_frame
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
-            self.effort, self.balance.gained = Effort(), 0.0
+            self.effort = Effort()
+            self.state = replace(self.state, ledger=replace(self.state.ledger, since_frame=0.0))
         self.monitors.error(index, time, effort.work.step_error)
         position = to_host(q[: self.model.lattice.owned])
         return Frame(

@@ -184,8 +184,6 @@ class Adaptive:
             try:
                 result, after, measure = self._try(before, level)
                 stands = self.control.accepts(level, measure)
-                if stands:
-                    self.balance.examine(before, result, after, self._end(level), self._length(level))
             except StepFailed:
                 stands = False
                 if not self.control.shorten(level):
@@ -221,7 +219,7 @@ class Adaptive:
 
     def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
         """A step of a level, and what it shows."""
-        result, after = self._integrator(level).advance(before, self._end(level))
+        result, after = self.balance.step(self._integrator(level), before, self._end(level), self._length(level))
         return result, after, self._measure(before, result, after, level)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:

@@ -7,8 +7,8 @@ from petsc4py import PETSc
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.bodies import Translations
 from msmpetsc.solve.multigrid.cycle import Multigrid
-from msmpetsc.solve.multigrid.translations import Translations
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against

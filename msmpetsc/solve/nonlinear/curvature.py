@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest, like, to_host
-from msmpetsc.model.checkpoint import ANY, COUNT, Checkpoint, Range
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
@@ -283,7 +283,7 @@ class LowestCurvature:
 
     @property
     def state(self) -> dict[str, Range]:
-        return {"searched": ANY, "knows_mode": COUNT}
+        return {"searched": ANY, "knows_mode": (0, 1)}
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -17,7 +16,7 @@ import tomli_w
 from block_scene import block_scene
 from conftest import WORKERS
 from mpi4py import MPI
-from stopped_runs import STEPS, assert_same, hanging, signal_after
+from stopped_runs import STEPS, assert_same, every_step_forgets, hanging, signal_after  # noqa: F401  # a fixture
 
 from msmpetsc.cli.main import main
 from msmpetsc.cli.running.resume import Resumed
@@ -42,14 +41,6 @@ PRESSING = [GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 
 THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}  # passed within a step
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
 pytestmark = pytest.mark.timeout(100)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def every_step_forgets() -> Iterator[None]:
-    """A checkpoint after each step, so that a run goes on from wherever it was stopped."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "REMEMBERED", 1)
-        yield
 
 
 def swing(**tables) -> dict:

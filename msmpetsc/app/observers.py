@@ -118,7 +118,7 @@ class Checkpoints:
 
     def __init__(self, file: ResultFile, simulation: "Simulation", interval: Interval, signals: "Signals"):
         self.file, self.simulation, self.interval, self.signals = file, simulation, interval, signals
-        self.signal = 0
+        self.signal, self._written = 0, -1
         self._seconds, self._frames, self._ended = interval.seconds, 0, perf_counter()
 
     def after_step(self, frame: Frame | None) -> bool:
@@ -128,7 +128,10 @@ class Checkpoints:
         due, number = self.signals.agree(due)
         if due:
             began = perf_counter()
-            self.file.write_checkpoint(simulation.saved())
+            saved = simulation.saved()
+            if saved.step != self._written:
+                self.file.write_checkpoint(saved)
+                self._written = saved.step
             self._frames, self._ended = 0, perf_counter()
             if self.interval.adapts:
                 self._seconds = (self._ended - began) / CHECKPOINT_TIME

@@ -1,11 +1,14 @@
-"""All that the next step depends on beside the scene: saved and restored, a run goes on as if it had never stopped.
+"""State of a run, which a file holds: positions, velocities, and what the run has counted so far.
 
-Each part of a run that remembers something has ``save`` and ``restore``, and names what it stores. What PETSc's
-solvers remember is not among it: they begin each step anew (solve.nonlinear.step).
+What solvers know of the steps before is no part of it. A run forgets that wherever a checkpoint may be
+(solve.simulate), so that the one that goes on and the one that is resumed are the same to the last bit.
 """
 
 import math
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -14,7 +17,31 @@ from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 
 MOST = 1e60  # of any number: its fourth power is still finite
-AT_REST = "at_rest"  # number of a run that ends at rest (time.until): whether it has come there
+MOST_COUNT = 2**53  # the whole numbers that a double holds
+AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has come there
+ROWS = {"q", "q_previous", "history_q", "history_v", "sides", "lowest_mode"}  # of any run's state
+Range = tuple[float, float]
+COUNT: Range = (0, MOST_COUNT)
+ANY: Range = (-math.inf, math.inf)
+FINITE: Range = (-sys.float_info.max, sys.float_info.max)
+LENGTH: Range = (0.0, sys.float_info.max)
+
+
+class Counting(Protocol):
+    """A part of a run that counts: its ``state`` names the attributes, numbers or dataclasses of numbers, that a
+    checkpoint holds, and the range of each."""
+
+    @property
+    def state(self) -> dict[str, Range]: ...
+
+
+def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers of a part by the names that they are stored under."""
+    for attribute in part.state:
+        value = getattr(part, attribute)
+        inner = vars(value) if is_dataclass(value) else {"": value}
+        for name, number in inner.items():
+            yield f"{type(part).__name__}.{attribute}.{name}".strip("."), number
 
 
 @dataclass
@@ -37,6 +64,29 @@ class Checkpoint:
         self.rows |= rows or {}
         self.numbers |= numbers or {}
 
+    def keep_counts(self, part: Counting) -> None:
+        """Store the numbers of a part."""
+        self.keep(numbers=dict(_numbers(part)))
+
+    def restore_counts(self, part: Counting) -> None:
+        """Give a part its numbers, those that are stored. Raises InputError for what no run can have had."""
+        stored = {name: self._like(name, value, part) for name, value in _numbers(part)}
+        for attribute in part.state:
+            value, begin = getattr(part, attribute), f"{type(part).__name__}.{attribute}"
+            if is_dataclass(value) and not isinstance(value, type):
+                setattr(part, attribute, replace(value, **{name: stored[f"{begin}.{name}"] for name in vars(value)}))
+            else:
+                setattr(part, attribute, stored[begin])
+
+    def _like(self, name: str, value: Any, part: Counting) -> Any:
+        """The number of a name, of the kind that ``value`` is."""
+        if isinstance(value, float) and math.isnan(value):  # it may be unknown
+            return self.numbers.get(name, value)
+        least, most = part.state[name.split(".")[1]]
+        if isinstance(value, int):
+            least, most = max(least, -MOST_COUNT), min(most, MOST_COUNT)
+        return type(value)(self.number(name, value, least, most))
+
     def row(self, name: str) -> np.ndarray:
         """Raises InputError where there is none."""
         if name not in self.rows:
@@ -49,10 +99,6 @@ class Checkpoint:
         if not least <= value <= most:
             raise InputError(f"the checkpoint is damaged: {name} is {value:g}")
         return value
-
-    def count(self, name: str, most: int = 2**53) -> int:
-        """A whole number, 0 if there is none. Raises InputError likewise."""
-        return int(self.number(name, 0, 0, most))
 
     def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
         """Raise InputError for rows not of the shape of those in ``like``, not finite or absurd (collective)."""

@@ -182,6 +182,12 @@ class Environment:
             surface = SurfaceContact(self._contacts, q, time_step)
         return Contact(states, owned, surface) if states or surface else None
 
+    def forget(self) -> None:
+        """Know nothing of the steps before (collective)."""
+        if self.self_contact:
+            self.self_contact.forget()
+            self._contacts = Contacts(self.self_contact)
+
     def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts of the surface with itself at q (collective)."""
         return self._contacts.touch(q) if self._contacts else Touch()

@@ -130,16 +130,9 @@ CHECKPOINT = {  # two slots, of which the one with the greater step holds
     "numbers": Field("f8", (2, "k"), "1", "what else a step depends on; names as an attribute"),
     "q": Field("f8", (2, "n", 3), "m", "node positions"),
     "q_previous": Field("f8", (2, "n", 3), "m", "node positions one step before"),
-    "correction": Field("f8", (2, "n", 3), "m", "correction x - y of the last step"),
-    "correction_before": Field("f8", (2, "n", 3), "m", "correction x - y of the step before that"),
-    "contact_bound": Field("f8", (2, "n"), "N/m", "contact stiffness that the preconditioner knows"),
-    "hierarchy_q": Field("f8", (2, "n", 3), "m", "positions that the multigrid hierarchy was built at"),
-    "hierarchy_contact": Field("f8", (2, "n", 9), "N/m", "contact's Hessian that the hierarchy was built with"),
     "history_q": Field("f8", (2, "n", 3), "m", "positions that BDF2 looks back to"),
     "history_v": Field("f8", (2, "n", 3), "m/s", "velocities that BDF2 looks back to"),
-    "mode": Field("f8", (2, "n", 3), "1", "highest mode, which limits the explicit step"),
     "lowest_mode": Field("f8", (2, "n", 3), "kg^-1/2", "mode of the least curvature"),
-    "pairs_q": Field("f8", (2, "n", 3), "m", "positions that pairs which may meet were looked for at"),
     "sides": Field("f8", (2, "n", "o"), "1", "side of a thin obstacle on which a node is"),
 }
 GROUPS = {

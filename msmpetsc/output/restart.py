@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError, printable
-from msmpetsc.model.checkpoint import AT_REST, Checkpoint
+from msmpetsc.model.checkpoint import AT_REST, ROWS, Checkpoint
 from msmpetsc.model.fields import FRAME_FIELDS
 from msmpetsc.output.compare import rows_agree
 from msmpetsc.output.reader import (
@@ -38,7 +38,7 @@ class Earlier:
     step       : of the last checkpoint, 0 if it has none
     finished   : frames that it has
     planned    : frames that it has room for
-    exact      : whether a checkpoint has all that a run goes on from
+    exact      : whether its checkpoints are laid out as those of today
     at_rest    : whether it ended there (time.until)
     """
 
@@ -59,11 +59,12 @@ class Earlier:
             true_error = result.attributes.get("true_error")
             names = _checked_numbers(path, result.file)
             _refuse_foreign_series(result)
+            is_of_now = names is not None and set(result.file["checkpoint"]) <= {"step", "numbers", *ROWS}
             count, planned = len(result.frames.time), result.frames.time.planned[0]
             at_rest = bool(count) and _is_at_rest(result, names or [])
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, bool(names), at_rest)
+        return cls(path, texts, true_error, step, count, planned, bool(names) and is_of_now, at_rest)
 
 
 def _is_at_rest(result: Result, names: list[str]) -> bool:

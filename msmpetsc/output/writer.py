@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.model.checkpoint import Checkpoint

@@ -17,22 +17,21 @@ In a linear body Verlet's, of substeps dt, swings just as dt^2/8 |M^(-1) (f_ext 
 Wanner, Geometric Numerical Integration, IX): only what was gained with and without that is worth a word.
 """
 
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import describe_inverted, node_of_greatest
 from msmpetsc.model.self_contact.contacts import Touch
-from msmpetsc.solve.integrators.state import State
+from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.state import Ledger, State
 from msmpetsc.solve.nonlinear.step import StepResult
 
 MOST = 3.0  # times all that the body ever had: explicit substeps near their limit let energy swing by nearly two
@@ -64,35 +63,11 @@ class Energies:
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
-@dataclass(frozen=True)
-class Ledger:
-    """Energies that a run keeps account of [J].
-
-    put_in  : the most that the body had by right
-    gained  : from nowhere, and not lost since; negative where a swing may give back
-    steady  : the same without a known swing
-    last    : gained in the last step
-    bounced : what nodes gained that bounced off its end
-    """
-
-    put_in: float = 0.0
-    gained: float = 0.0
-    steady: float = 0.0
-    last: float = 0.0
-    bounced: float = 0.0
-
-    @property
-    def share(self) -> float:
-        """Share of all energy that came from nowhere."""
-        return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
-
-
 class EnergyBalance:
-    """Examiner of a run's steps, who keeps its ledger.
+    """Examiner of a run's steps; states keep the ledger.
 
     swings : whether the integrator's energy does
     checks : whether steps are balanced; if not only numbers that are not finite are found
-    gained : from nowhere [J], since the frame stored before
     """
 
     def __init__(
@@ -106,7 +81,6 @@ class EnergyBalance:
     ):
         self.credit, self.checks = CREDIT if swings else 0.0, checks
         self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
-        self.ledger, self.gained = Ledger(), 0.0
         self._now: Energies | Callable[[], Energies] = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
         self.known: tuple[np.ndarray, float] | None = (
             None  # positions that the last step ended at, their elastic energy [J]
@@ -149,25 +123,30 @@ class EnergyBalance:
             touch=environment.touch(q),
         )
 
-    def examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> None:
-        """Examine a step from ``before`` to ``after`` that ended at ``time``, and take it into the ledger (collective).
+    def step(self, integrator: Integrator, before: State, time: float, time_step: float) -> tuple[StepResult, State]:
+        """Take the step of an integrator that ends at ``time``, and enter it into the ledger (collective).
 
         Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
         """
+        result, after = integrator.advance(before, time)
+        return result, replace(after, ledger=self._examine(before, result, after, time, time_step))
+
+    def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Ledger:
+        """The ledger with a step from ``before`` to ``after``."""
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         if not self.checks:
             self._refuse_infinite(self._sums(result.position.sum())[0], result)
-            return
+            return before.ledger
         solved = ended = self.energies
         self._refuse_infinite(solved.kinetic + solved.inner, result)
         if result.static:  # which owes nothing to the state before
-            return
+            return before.ledger
         bounces = self._bounces(result, after)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
-        ledger = self._entered(solved, ended, sums, bounces)
+        ledger = self._entered(before.ledger, solved, ended, sums, bounces)
         if ledger.gained > MOST * ledger.put_in:
             raise StepFailed(
                 f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
@@ -176,17 +155,16 @@ class EnergyBalance:
                 + ("" if self.environment.exchanges else ', or safety.on_failure = "fallback"'),
                 "energy",
             )
-        self.known, self.ledger = (after.q, ended.elastic), ledger
-        self.gained += ledger.last
+        self.known = after.q, ended.elastic
+        return ledger
 
     def _refuse_infinite(self, total: float, result: StepResult) -> None:
         if not np.isfinite(total):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
 
-    def _entered(self, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
+    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
         """The ledger with a step; sums (5,) of _start."""
         start, pushed, work, struck, swing = sums
-        ledger = self.ledger
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
         by_right = start - max(ledger.bounced, 0.0) - pushed - max(ledger.gained, 0.0)  # an exchange puts nothing in
@@ -194,7 +172,8 @@ class EnergyBalance:
         put_in = max(put_in, solved.inner - max(ledger.gained + gained, 0.0))
         least = -self.credit * put_in
         steady = max(least, ledger.steady + gained - swing)
-        return Ledger(put_in, max(least, ledger.gained + gained), steady, gained, bounced)
+        since_frame = ledger.since_frame + gained
+        return Ledger(put_in, max(least, ledger.gained + gained), steady, since_frame, bounced)
 
     def remedy(self, explicit: bool) -> str:
         """Return what was seen to keep energy from coming from nowhere, in words."""
@@ -203,16 +182,6 @@ class EnergyBalance:
         if explicit or self.credit:
             return "a smaller time.substep" if explicit else "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the ledger."""
-        checkpoint.keep(numbers={**vars(self.ledger), "energy_gained": self.gained})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        most = sys.float_info.max
-        self.ledger = Ledger(**{name: checkpoint.number(name, 0.0, -most, most) for name in vars(Ledger())})
-        self.gained = checkpoint.numbers.get("energy_gained", 0.0)
 
     def _bounces(self, result: StepResult, after: State) -> bool:
         """Whether any node was struck once the step was solved (collective)."""

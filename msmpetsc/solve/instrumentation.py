@@ -1,16 +1,18 @@
 """Measurements of a run beside its frames: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.solve.multigrid.memory import stored_bytes
+from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import GRIDS, HIERARCHY, LOCAL, count, seconds
 
+INDEX, VALUE = PETSc.IntType().itemsize, PETSc.ScalarType().itemsize
 EVENTS = {
     "factor": ["PCSetUp"], "local": [LOCAL.name], "ksp": ["KSPSolve"], "hierarchy": [GRIDS.name, HIERARCHY.name]
 }  # fmt: skip
@@ -43,13 +45,13 @@ class Trace:
 
     def follow(self, stepper: Stepper) -> None:
         """Take the iterates from now on, which is when the step begins."""
-        begin, before = perf_counter(), stepper.all_its()
+        begin, before = perf_counter(), stepper.work_so_far()
 
         def observe(q: np.ndarray) -> None:
             nonlocal begin
             now = perf_counter()
             self.iteration.append(len(self.iteration))
-            self.ksp_its.append(stepper.all_its() - before)
+            self.ksp_its.append((stepper.work_so_far() - before).ksp_its)
             self.seconds.append(now - begin)
             self.positions.append(q)
             begin += perf_counter() - now  # not of the step
@@ -75,5 +77,34 @@ def times(comm: MPI.Comm) -> dict[str, float]:
 def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
     """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective)."""
     multigrid = stepper.jacobian.preconditioner.multigrid if stepper else None
-    own = stored_bytes(multigrid.multigrid) if multigrid else 0
+    own = _stored_bytes(multigrid.multigrid) if multigrid else 0
     return {"builds": count(HIERARCHY.name), "bytes": comm.allreduce(own)}
+
+
+def _stored_bytes(multigrid: Multigrid) -> int:
+    """Return bytes of this rank that a hierarchy keeps beside the lattice, without what factors the coarsest level.
+
+    They are P and matrix of each coarse level, what sums the first, the finest level's blocks.
+    """
+    levels = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
+    total, fine = multigrid.sum, multigrid.fine
+    arrays: list[np.ndarray] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
+    for things in (total.springs, total.nodes, total.cells):
+        arrays += things.arrays
+    return levels + sum(array.nbytes for array in (*arrays, *_blocks(multigrid)))
+
+
+def _blocks(multigrid: Multigrid) -> list[np.ndarray]:
+    """Arrays that the finest level's Hessian has of its own, not of the lattice."""
+    elasticity, hessian = multigrid.fine.elasticity, multigrid.fine.elastic
+    lent = {id(array) for part in elasticity.parts for array in vars(part).values()}
+    parts = [part for part in hessian.parts if isinstance(part, partial)] if hessian else []
+    return [array for part in parts for array in part.args if hasattr(array, "nbytes") and id(array) not in lent]
+
+
+def _of_matrix(matrix: PETSc.Mat) -> int:
+    """Return bytes of a rank's part of an AIJ matrix; 0 where it is not there yet."""
+    if not matrix:
+        return 0
+    rows, nonzeros = matrix.getLocalSize()[0], matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
+    return int(nonzeros) * (INDEX + VALUE) + (rows + 1) * INDEX

@@ -5,14 +5,14 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.comm import log
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, COUNT, Range
 from msmpetsc.model.contact.obstacle import describe_overlap
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.model.locate import worst_inverted
-from msmpetsc.solve.energy_balance import MUCH, Ledger
+from msmpetsc.solve.energy_balance import MUCH
+from msmpetsc.solve.integrators.state import Ledger
 
-COUNTS = ("frames_inverted", "most_inverted", "now_inverted", "frames_far", "frames_gaining")  # in checkpoints
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 
 
@@ -76,17 +76,11 @@ class Monitors:
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what was seen so far."""
-        counts = dict(zip(COUNTS, (self.frames, self.most, self.now, self.far, self.gaining), strict=True))
-        checkpoint.keep(numbers={**counts, "worst_error": self.worst_error, "worst_gain": self.worst_gain})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self.frames, self.most, self.now, self.far, self.gaining = map(checkpoint.count, COUNTS)
-        self.worst_error, self.worst_gain = (
-            checkpoint.numbers.get(name, 0.0) for name in ("worst_error", "worst_gain")
-        )
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        counts = dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT)
+        return {**counts, "worst_error": ANY, "worst_gain": ANY}
 
     def sum_up(self) -> None:
         """Say at the end of a run how often it was."""

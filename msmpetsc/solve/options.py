@@ -1,21 +1,20 @@
 """PETSc options that this program has no use for: an error that says what to give instead, as early as can be known.
 
-PETSc keeps no list of the options it knows, but their names stand in its library.
+PETSc keeps no list of the options that it knows: what no object has looked at is told once the solvers are made.
 """
 
 import ctypes
+import difflib
 import re
 from collections.abc import Collection
-from functools import cache
-from pathlib import Path
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.errors import InputError, nearest
+from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.solve.petsc.errors import petsc_errors
-from msmpetsc.solve.petsc.library import Integer, library_file, open_viewer, petsc_library
-from msmpetsc.solve.presets import Preset, forget_defaults, set_defaults
+from msmpetsc.solve.petsc.library import Integer, open_viewer, petsc_library
+from msmpetsc.solve.presets import PRESETS, Preset, forget_defaults, set_defaults
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
@@ -23,8 +22,10 @@ READ_AT_THE_END = re.compile(
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
 SWITCHES_READ_AT_THE_END = ("options_left", "get_total_flops", "mpidump")
 VIEWERS_READ_AT_THE_END = ("log_view", "options_view", "memory_view")
-LITERAL = re.compile(rb"-([A-Za-z]\w*(?:%l*d\w*)?)\0")  # %d: of a block
 OF_STEPPERS = re.compile(r"^(reference_|fallback_)")
+
+OFTEN_GIVEN = {"ksp_view", "ksp_monitor", "ksp_max_it", "ksp_atol", "snes_view", "snes_monitor", "mat_type", "mat_view"}
+USUAL = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values()))  # what a misspelt option may have meant
 
 NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
@@ -63,7 +64,7 @@ def refuse_early(comm: MPI.Comm, ours: Collection[str]) -> None:
     message = None
     if comm.rank == 0:
         lines = [_no_use(name, value) for name, value in database.items()]
-        lines += [_unknown(name, ours) for name in _left() if not _is_in_library(name)]
+        lines += [f"-{name}: {NO_PART}{_ours(name, ours)}" for name in _left() if _ours(name, ours)]
         message = "\n".join(filter(None, lines))
     message = comm.bcast(message)
     if message:
@@ -109,7 +110,7 @@ def refuse_unused(comm: MPI.Comm, ours: set[str], at_end: bool = False, awaited:
         and (at_end or not READ_WHILE_SOLVING.search(name))
         and not name.startswith(awaited)
     ]
-    lines = (f"-{name}: {NO_PART}" if _is_in_library(name) else _unknown(name, ()) for name in unused)
+    lines = (f"-{name}: {NO_PART}" + (did_you_mean(name, USUAL) if name not in USUAL else "") for name in unused)
     message = "\n".join(lines)
     message = comm.bcast(message)
     if message:
@@ -125,29 +126,11 @@ def _no_use(name: str, value: str | None) -> str | None:
     return next((f"-{name}: {instead}" for names, instead in NO_USE.items() if re.fullmatch(names, bare)), None)
 
 
-def _unknown(name: str, ours: Collection[str]) -> str:
-    valid = {known: known for known in _names_in_library() if "_" in known} | {own.lstrip("-"): own for own in ours}
-    near = nearest(name, valid)
-    return f"-{name}: {NO_PART}" + (f", did you mean {valid[near]!r}?" if near else "")
-
-
-def _is_in_library(name: str) -> bool:
-    """Whether an option may be called so: whole, or after the prefix of an inner solver."""
-    names = _names_in_library()
-    if "ksp_rtol" not in names:  # a library that hides them: what is unused is seen later
-        return True
-    numbered = re.sub(r"\d+", "%d", name)
-    parts = numbered.split("_")
-    return name in names or any("_".join(rest) in names for rest in (parts[i:] for i in range(len(parts) - 1)))
-
-
-@cache
-def _names_in_library() -> frozenset[str]:
-    """Names of the options that stand in PETSc's library and in petsc4py's; a few are words of messages, which does no
-    harm."""
-    files = {library_file(), PETSc.__file__}
-    names = {name for file in files for name in LITERAL.findall(Path(file).read_bytes())}
-    return frozenset(re.sub("%l+d", "%d", name.decode()) for name in names)
+def _ours(name: str, ours: Collection[str]) -> str:
+    """Words on the command's own option that was given with one dash, or with a letter too many; "" if it was not."""
+    valid = {own.lstrip("-").replace("-", "_"): own for own in ours}
+    near = [name] if name.replace("-", "_") in valid else difflib.get_close_matches(name, valid, 1) * ("_" not in name)
+    return f", did you mean {valid[near[0].replace('-', '_')]!r}?" if near else ""
 
 
 def _check_what_is_read_at_the_end(database: dict[str, str]) -> None:

@@ -1,17 +1,18 @@
 """Recovery from a step that fails, so that a hard moment costs time instead of the run."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import COUNT, Range
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.work import Work
 
 DEEPEST = 10  # halvings: 1024 pieces of a step
 ROBUST = "newton-projected"
@@ -19,26 +20,6 @@ PREFIX = "fallback_"  # of the PETSc options of that
 WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
 
 MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # the string: prefix of its PETSc options
-
-
-@dataclass
-class StepCost:
-    """Cost of one step: shorter steps taken in its place, whether the robust method solved it, and what all that
-    took."""
-
-    substeps: int = 0
-    fallbacks: int = 0
-    error: float = 0.0
-    iterations: int = 0
-    ksp_its: int = 0
-    products: int = 0
-
-    def add(self, result: StepResult) -> None:
-        """Count one more solve."""
-        self.error = max(self.error, result.error)
-        self.iterations += result.iterations
-        self.ksp_its += result.ksp_its
-        self.products += result.products
 
 
 class Recovery:
@@ -59,14 +40,14 @@ class Recovery:
     @property
     def is_on(self) -> bool:
         """Whether steps are under its care before they have failed."""
-        return self.level > 0
+        return self.level > 0 and self.on_failure == "substep"  # else it was another scene that asked for it
 
     @property
     def awaited(self) -> tuple[str, ...]:
         """Prefixes of PETSc options that may still be used."""
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
-    def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State, StepCost]:
+    def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
         """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises
         StepFailed."""
         if failure and self.on_failure == "stop":
@@ -77,66 +58,55 @@ class Recovery:
         self.recovered += 1
         for integrator in self.spare.values():
             integrator.forget()  # so that a checkpoint need not remember them
-        cost = StepCost()
         if self.on_failure == "fallback":
-            result, after = self._take(0, state, time, cost)
-            cost.fallbacks = 1
-        else:
-            result, after = self._in_pieces(state, time, max(self.level, 1) if failure else self.level, cost)
-        result = replace(result, error=cost.error, iterations=cost.iterations)
-        result = replace(result, ksp_its=cost.ksp_its, products=cost.products)
-        return result, after, cost
+            result, after = self._take(0, state, time)
+            return replace(result, cost=result.cost + Work(fallbacks=1)), after
+        return self._in_pieces(state, time, max(self.level, 1) if failure else self.level)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on."""
-        checkpoint.keep(numbers={"level": self.level, "rescued": self.recovered})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        if self.on_failure == "substep":
-            self.level = checkpoint.count("level", DEEPEST)
-        if self.on_failure != "stop":  # else it was another scene that asked for it
-            self.recovered = checkpoint.count("rescued")
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"level": (0, DEEPEST), "recovered": COUNT}
 
     def sum_up(self) -> None:
         """Say at the end of a run how many steps were recovered."""
-        if self.recovered:
+        if self.recovered and self.on_failure != "stop":
             were = "s were" if self.recovered > 1 else " was"
             log.warning("%d step%s %s", self.recovered, were, WORDS[self.on_failure])
 
-    def _in_pieces(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:
+    def _in_pieces(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
         """Take a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
         self.deepest = level
-        pieces, start = 2**level, time - self.time_step
+        pieces, start, cost = 2**level, time - self.time_step, Work()
         for piece in range(1, pieces + 1):
-            result, state = self._piece(state, start + piece * self.time_step / pieces, level, cost)
+            result, state = self._piece(state, start + piece * self.time_step / pieces, level)
+            cost += result.cost
         self.level = self.deepest if self.deepest > level else level - 1
         self.destroy()  # a resumed run has not seen what the spare solvers did in this step
-        return result, state
+        return replace(result, cost=replace(cost, steps=1)), state
 
-    def _piece(self, state: State, time: float, level: int, cost: StepCost) -> tuple[StepResult, State]:
+    def _piece(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
         self.deepest = max(self.deepest, level)
         try:
-            result, after = self._take(level, state, time, cost)
-            cost.substeps += 1
-            return result, after
+            result, after = self._take(level, state, time)
+            return replace(result, cost=result.cost + Work(substeps=1)), after
         except StepFailed as failure:
             if level == DEEPEST:
                 raise StepFailed(f"{failure} (and failed in {2**level} pieces)", failure.kind) from None
         half = self.time_step / 2 ** (level + 1)
-        _, state = self._piece(state, time - half, level + 1, cost)
-        return self._piece(state, time, level + 1, cost)
+        first, state = self._piece(state, time - half, level + 1)
+        second, state = self._piece(state, time, level + 1)
+        return replace(second, cost=first.cost + second.cost), state
 
-    def _take(self, level: int, state: State, time: float, cost: StepCost) -> tuple[StepResult, State]:
+    def _take(self, level: int, state: State, time: float) -> tuple[StepResult, State]:
         """Take one step of t / 2^level; states outside are of steps of t."""
         short = self.time_step / 2**level
         if level not in self.spare:
             self.spare[level] = self._new(short)
             self.spare[level].set_up()
+            self.spare[level].forget()  # as those that are kept
         before = state.over(self.time_step, short)
-        result, after = self.spare[level].advance(before, time)
-        self.balance.examine(before, result, after, time, short)
-        cost.add(result)
+        result, after = self.balance.step(self.spare[level], before, time, short)
         previous = State(result.position, result.previous).over(short, self.time_step).q_previous
         return replace(result, previous=previous), after.over(short, self.time_step)
 

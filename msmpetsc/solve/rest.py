@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import AT_REST, Checkpoint
+from msmpetsc.model.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.model.environment import Environment
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.integrators.state import State
@@ -81,15 +81,10 @@ class Rest:
         finally:
             stepper.destroy()
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next look depends on."""
-        numbers = {"farthest": self.farthest, "next_look": self.next, "look_wait": self.wait, AT_REST: self.has_come}
-        checkpoint.keep(numbers=numbers)
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self.farthest = checkpoint.number("farthest", 0.0, 0)
-        self.next, self.wait = checkpoint.count("next_look"), max(checkpoint.count("look_wait", LONGEST_WAIT), 1)
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"farthest": LENGTH, "next": COUNT, "wait": (1, LONGEST_WAIT), "has_come": (0, 1)}
 
 
 def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:

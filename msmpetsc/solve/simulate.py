@@ -1,7 +1,7 @@
 """The run: one step after another, those that are stored yielded as frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 
@@ -12,11 +12,10 @@ from msmpetsc.backend.arrays import on_host, to_host
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model, to_device
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.fields import Frame
-from msmpetsc.model.self_contact.contacts import NearPairs
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -34,8 +33,11 @@ from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
-from msmpetsc.solve.recovery import ROBUST, Recovery, StepCost
+from msmpetsc.solve.recovery import ROBUST, Recovery
 from msmpetsc.solve.rest import Rest
+from msmpetsc.solve.work import NO_WORK, Work
+
+REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
@@ -64,47 +66,21 @@ def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
 
 
 @dataclass
-class FrameCost:
-    """Cost of the steps since the frame stored before: the numbers of Frame of these names."""
+class Effort:
+    """What the steps since the frame stored before took, and how far off those are whose true errors were measured."""
 
-    step_error: float = 0.0
-    iterations: int = 0
-    ksp_its: int = 0
-    products: int = 0
-    wall_time: float = 0.0  # [s]
+    work: Work = NO_WORK
     true_error: float = np.nan
     energy_error: float = np.nan
-    substeps: int = 0
-    fallbacks: int = 0
-    steps: int = 0
-    time_error: float = np.nan
 
     def measure(self, errors: np.ndarray) -> None:
         """Take note of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
-    def add(self, result: StepResult, cost: StepCost | None, wall_time: float) -> None:
-        """Count a step, and what its recovery took if it failed."""
-        self.step_error = max(self.step_error, result.error)
-        self.iterations += result.iterations
-        self.ksp_its += result.ksp_its
-        self.products += result.products
-        self.wall_time += wall_time
-        self.steps, self.time_error = self.steps + result.steps, result.time_error
-        if cost:
-            self.substeps += cost.substeps
-            self.fallbacks += cost.fallbacks
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the cost so far."""
-        checkpoint.keep(numbers=vars(self))
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        for name, value in vars(FrameCost()).items():
-            if name in checkpoint.numbers:
-                number = checkpoint.count(name) if isinstance(value, int) else checkpoint.numbers[name]
-                setattr(self, name, number)
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        return {"work": ANY, "true_error": ANY, "energy_error": ANY}
 
 
 class Simulation:
@@ -140,7 +116,9 @@ class Simulation:
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
-        self.state, self.cost = State(q.copy(), q - self.time_step * velocity, sides=sides), FrameCost()
+        self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
+        self.time_error = np.nan  # estimated, of the trajectory so far
+        self._saved = Checkpoint()
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
@@ -170,29 +148,33 @@ class Simulation:
         if index == self.probes.trace:
             self.integrator.follow()
         self._overlaps(index, time)
-        begin, cost = perf_counter(), None
+        begin = perf_counter()
         try:
             if self.recovery.is_on:
-                result, after, cost = self.recovery.step(self.state, time, None)
+                result, after = self.recovery.step(self.state, time, None)
+            elif self.adaptive:  # which has each of its own steps examined
+                result, after = self.adaptive.advance(self.state, time)
             else:
-                result, after = self.integrator.advance(self.state, time)
-                if not self.adaptive:  # which has each of its own examined
-                    self.balance.examine(self.state, result, after, time, self.time_step)
+                result, after = self.balance.step(self.integrator, self.state, time, self.time_step)
         except StepFailed as failure:
-            result, after, cost = self._recovered(index, time, failure)
+            result, after = self._recovered(index, time, failure)
         before, self.state = self.state, after
-        self.cost.add(result, cost, perf_counter() - begin)
-        if self.probes.asks(index) and cost is None:
+        self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
+        self.time_error = result.time_error
+        if self.probes.asks(index) and not result.cost.is_of_recovery:
             errors, trace = self.integrator.true_errors(index, result)
-            self.cost.measure(errors)
+            self.effort.measure(errors)
             self.trace = trace or self.trace
-        self.monitors.gain(index, time, self.balance.ledger, self.balance.remedy(result.explicit))
+        self.monitors.gain(index, time, after.ledger, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
-        return self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        frame = self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
+            self._saved = self._save()
+        return frame
 
-    def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State, StepCost]:
+    def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
         """A step that failed, taken another way (collective). Raises StepFailed, naming the step."""
         try:
             if self.recovery.is_on:
@@ -205,28 +187,33 @@ class Simulation:
         self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
 
     def saved(self) -> Checkpoint:
-        """All that the next step depends on; to be stored or copied before that is taken."""
+        """The last step that the run may go on from: every ``REMEMBERED``-th, and that of a body at rest."""
+        rows = {name: to_host(rows) for name, rows in self._saved.rows.items()}
+        return replace(self._saved, rows=rows)
+
+    def _save(self) -> Checkpoint:
+        """Store the state, and forget what is no part of it: a resumed run would not have it."""
         checkpoint = Checkpoint(self.step)
         self.state.save(checkpoint, self.model.lattice.owned, self.integrator.looks_back, self.environment.has_sides)
-        self.integrator.save(checkpoint, self.state)
-        for part in self._remembering():
-            part.save(checkpoint)
-        checkpoint.rows = {name: to_host(rows) for name, rows in checkpoint.rows.items()}
+        self.integrator.save(checkpoint)
+        self.environment.forget()
+        for part in self._counting():
+            checkpoint.keep_counts(part)
         return checkpoint
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint (collective)."""
+        """Go on from a checkpoint, before any step is taken (collective)."""
         checkpoint.refuse_rows_unlike(self.comm, self.saved())
         self.step = checkpoint.step
         self.state = State.restored(self.comm, self.model.lattice, checkpoint)
-        self.integrator.restore(checkpoint, self.state, self.step * self.time_step)
-        self.cost = FrameCost()
-        for part in self._remembering():
-            part.restore(checkpoint)
+        for part in self._counting():
+            checkpoint.restore_counts(part)
+        if self.step:
+            self.integrator.restore(checkpoint, self.step * self.time_step)
+        self._saved = self._save()
 
-    def _remembering(self) -> list[EnergyBalance | Recovery | Monitors | FrameCost | Rest | NearPairs]:
-        parts = (self.rest, self.environment.self_contact)
-        return [self.balance, self.recovery, self.monitors, self.cost, *(part for part in parts if part)]
+    def _counting(self) -> list[Counting]:
+        return [self.recovery, self.monitors, self.effort, *([self.rest] if self.rest else [])]
 
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
@@ -234,10 +221,12 @@ class Simulation:
 
     def _frame(self, index: int, q: np.ndarray) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
-        time, energies, cost, gained = index * self.time_step, self.balance.energies, self.cost, self.balance.gained
+        time, energies = index * self.time_step, self.balance.energies
+        effort, gained = self.effort, self.state.ledger.since_frame
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
-            self.cost, self.balance.gained = FrameCost(), 0.0
-        self.monitors.error(index, time, cost.step_error)
+            self.effort = Effort()
+            self.state = replace(self.state, ledger=replace(self.state.ledger, since_frame=0.0))
+        self.monitors.error(index, time, effort.work.step_error)
         position = to_host(q[: self.model.lattice.owned])
         return Frame(
             index=index,
@@ -254,12 +243,16 @@ class Simulation:
             self_contacts=energies.touch.contacts,
             self_distance=energies.touch.distance,
             self_contact=energies.touch.energy,
-            **vars(cost),
+            true_error=effort.true_error,
+            energy_error=effort.energy_error,
+            time_error=self.time_error,
+            **vars(effort.work),
         )
 
     def __enter__(self) -> "Simulation":
         try:
             self.integrator.set_up()
+            self._saved = self._save()
         except InputError:
             self.destroy()
             raise

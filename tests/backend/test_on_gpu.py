@@ -32,6 +32,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.model.build import build_model
 from msmpetsc.model.fields import Frame
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.simulate import Simulation
@@ -191,7 +192,8 @@ def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_ca
 
 
 @pytest.mark.parametrize("case", ["held, led and let go", "pressed, rubbed and stiffening", "bdf2", "verlet"])
-def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case: str):
+def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case: str, monkeypatch):
+    monkeypatch.setattr(simulate, "REMEMBERED", 4)
     scene = load_scene(block_scene(tmp_path, **CASES[case]))
     model = build_model(MPI.COMM_SELF, scene)
     with pretended():

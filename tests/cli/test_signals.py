@@ -10,7 +10,15 @@ from pathlib import Path
 import h5py
 import pytest
 from conftest import ENVIRONMENT
-from stopped_runs import EVERY, STEPS, assert_same, hanging, ranks_of, signal_after
+from stopped_runs import (  # noqa: F401  # a fixture
+    EVERY,
+    STEPS,
+    assert_same,
+    every_step_forgets,
+    hanging,
+    ranks_of,
+    signal_after,
+)  # fmt: skip
 
 from msmpetsc.cli.main import main
 from msmpetsc.output.reader import finished
@@ -120,7 +128,7 @@ def test_a_signal_to_one_rank_stops_all_together(tmp_path):
     step = int(told.partition("after step ")[2].split()[0])
     with h5py.File(path) as file:
         # step may be 0: on busy cores the signal comes before the first
-        assert max(file["checkpoint/step"]) == step and finished(file) == 1 + step
+        assert max(file["checkpoint/step"]) == step // 20 * 20 and finished(file) == 1 + step
 
 
 def test_mpiexec_hands_on_what_it_is_sent(tmp_path):
@@ -130,4 +138,4 @@ def test_mpiexec_hands_on_what_it_is_sent(tmp_path):
         told = process.stderr.read()
     assert "stopped by SIGUSR1" in told and process.returncode == 0
     with h5py.File(path) as file:
-        assert max(file["checkpoint/step"]) == finished(file) - 1
+        assert max(file["checkpoint/step"]) == (finished(file) - 1) // 20 * 20

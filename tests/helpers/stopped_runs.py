@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -11,8 +12,17 @@ import pytest
 from block_scene import block_scene
 
 from msmpetsc.output.reader import finished
+from msmpetsc.solve import simulate
 
 EVERY, STEPS = 3, 40
+
+
+@pytest.fixture(scope="module", autouse=True)
+def every_step_forgets() -> Iterator[None]:
+    """Have, where it is imported, a checkpoint after each step, so that a run goes on from wherever it was stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "REMEMBERED", 1)
+        yield
 
 
 def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:

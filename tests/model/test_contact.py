@@ -405,8 +405,8 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
 
     result, exact = one_step(preset, 1e-3), one_step("newton", 1e-11).position
     norm = lambda v: np.sqrt((v**2).sum(axis=1) @ lattice.mass)  # noqa: E731
-    assert norm(result.position - exact) <= 1.5 * result.error * norm(exact - (2 * q - before))
-    assert result.error <= 1e-3 and contact.energy(result.position) > 0
+    assert norm(result.position - exact) <= 1.5 * result.cost.step_error * norm(exact - (2 * q - before))
+    assert result.cost.step_error <= 1e-3 and contact.energy(result.position) > 0
 
 
 # ---- obstacles that move, and that act for a while

@@ -249,7 +249,7 @@ def squeezed_step(preset: str, height: float, error: float) -> tuple[np.ndarray,
         result = stepper.step(StepProblem(q, q, np.zeros_like(q)))
     finally:
         stepper.destroy()
-    return result.position, result.error, lattice, q
+    return result.position, result.cost.step_error, lattice, q
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -21,6 +21,7 @@ from msmpetsc.model.self_contact.barrier import Barrier
 from msmpetsc.model.self_contact.contacts import NearPairs
 from msmpetsc.model.self_contact.term import SMALL, SurfaceContact
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.linear.explicit import explicit
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -196,7 +197,8 @@ def test_arms_that_close_do_not_cross(tmp_path):
     assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(without[-1].self_distance)
 
 
-def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
+def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate, "REMEMBERED", 8)
     friction = {"friction": 0.3, "distance": 1e-3}
     scene = load_scene(pinch_scene(tmp_path, material=STIFFENING, self_contact=friction), ("time.duration=0.1",))
     model = build_model(COMM, scene)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from stopped_runs import assert_same, hanging
+from stopped_runs import assert_same, every_step_forgets, hanging  # noqa: F401  # a fixture
 
 from msmpetsc.cli.main import main
 from msmpetsc.output.reader import finished

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from stopped_runs import hanging, signal_after
 
 from msmpetsc.cli.main import main
+from msmpetsc.solve import simulate
 
-NAMES = [f"checkpoint/{name}" for name in ("step", "q", "q_previous", "numbers", "correction", "new\nline")]
+NAMES = [f"checkpoint/{name}" for name in ("step", "q", "q_previous", "numbers", "lowest_mode", "new\nline")]
 NAMES += ["frames/time", "frames/position", "frames/kinetic", "lattice/nodes", "lattice/mass"]
 VALUES = st.sampled_from([np.nan, np.inf, -1.0, 0.0, 3.0, 12.0, 1e308])
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 75, 10**12]), max_size=4).map(tuple)
@@ -34,6 +35,7 @@ TEXTS = st.sampled_from(
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stopped")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "REMEMBERED", 4)
         signal_after(patch, 4, signal.SIGUSR1)
         assert main(["run", str(hanging(folder, steps=6)), "-o", str(folder / "x.h5")]) == 0
     return folder / "x.h5"
@@ -124,13 +126,13 @@ def number(value: float):
 
 DAMAGE = [
     (a_group, "frames/iterations"), (dangling, "frames/substeps"), (a_loop, "frames/kinetic"), (text, "frames/ksp_its"),
-    (short, "frames/momentum"), (without, "checkpoint/correction"), (a_group, "checkpoint/correction"),
-    (short, "checkpoint/correction_before"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
+    (short, "frames/momentum"), (without, "checkpoint/lowest_mode"), (a_group, "checkpoint/lowest_mode"),
+    (short, "checkpoint/lowest_mode"), (a_group, "checkpoint/q"), (a_group, "checkpoint/numbers"),
     (dangling, "checkpoint/step"), (without, "surface/triangles"), (a_group, "surface/points"),
     (short, "lattice/springs"), (without, "lattice/cells"), (dangling, "embedding/weights"),
-    (text, "lattice/cell_kind"), (a_group, "frames/surface"), (number(np.nan), "corrections"),
-    (number(5), "corrections"), (number(np.inf), "iterations"), (number(np.nan), "put_in"),
-    (number(-1), "frames_inverted"), (number(np.nan), "ratio"),
+    (text, "lattice/cell_kind"), (a_group, "frames/surface"), (number(5), "LowestCurvature.knows_mode"),
+    (number(np.inf), "Effort.work.iterations"), (number(np.nan), "put_in"),
+    (number(-1), "Monitors.frames"), (number(np.nan), "LowestCurvature.searched.total"),
 ]  # fmt: skip
 
 
@@ -153,6 +155,7 @@ def test_whatever_is_damaged_ends_in_a_line(stopped, tmp_path, monkeypatch, inte
     source = stopped
     if integrator == "verlet":
         with monkeypatch.context() as patch:
+            patch.setattr(simulate, "REMEMBERED", 4)
             signal_after(patch, 4, signal.SIGUSR1)
             scene, source = hanging(tmp_path, steps=6), tmp_path / "source.h5"
             assert main(["run", str(scene), "-o", str(source), "--set", "time.integrator=verlet"]) == 0

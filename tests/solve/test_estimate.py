@@ -62,7 +62,7 @@ def test_the_estimate_is_within_three_of_the_true_error(
         for frame in simulation.frames():
             if frame.index and frame.true_error > 1e-9:
                 ratios.append(frame.step_error / frame.true_error)
-                estimated.append(stepper.control.now.corrected)
+                estimated.append(stepper.outcome.corrected)
     ratios, estimated = np.array(ratios), np.array(estimated)
     assert estimated.sum() >= 5 and (ratios[estimated] < 3).all() and (ratios > 1 / 3).all()
 

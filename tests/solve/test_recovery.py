@@ -361,6 +361,6 @@ def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path
     scene = load_scene(path)
     with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         saved = simulation.saved()
-        saved.numbers |= {"level": 3, "rescued": 2}
+        saved.numbers |= {"Recovery.level": 3, "Recovery.recovered": 2}
         simulation.restore(saved)
         assert len(list(simulation.advance())) == 3

@@ -88,7 +88,7 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
     def one_step(name: str, error: float):
         stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
         try:
-            return stepper.step(StepProblem(q, 2 * q - before, weight(lattice))), stepper.control.now.corrected
+            return stepper.step(StepProblem(q, 2 * q - before, weight(lattice))), stepper.outcome.corrected
         finally:
             stepper.destroy()
 
@@ -96,8 +96,8 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
     exact = one_step("newton", 1e-12)[0].position
     norm = lambda v: np.sqrt((v**2).sum(axis=1) @ lattice.mass)  # noqa: E731
     true = norm(result.position - exact) / norm(exact - (2 * q - before))
-    assert true <= 1.5 * result.error and result.error <= error
-    assert not estimated or result.error <= 3 * true
+    assert true <= 1.5 * result.cost.step_error and result.cost.step_error <= error
+    assert not estimated or result.cost.step_error <= 3 * true
 
 
 def test_too_loose_a_solve_is_told():
@@ -108,12 +108,12 @@ def test_too_loose_a_solve_is_told():
 def test_published_presets_take_ten_iterations_and_say_their_error():
     for result in swing("fast-msm", 3):
         # each iteration is one solve; the rest is CG that estimates the error
-        assert result.iterations == 10 and 10 < result.ksp_its <= 20 and 0 < result.error < 1
+        assert result.cost.iterations == 10 and 10 < result.cost.ksp_its <= 20 and 0 < result.cost.step_error < 1
 
 
 def test_a_budget_is_kept_and_the_error_reported():
     results = swing("anderson", 3, error=1e-12, max_iterations=4)
-    assert all(result.iterations <= 4 for result in results) and results[-1].error > 1e-12
+    assert all(result.cost.iterations <= 4 for result in results) and results[-1].cost.step_error > 1e-12
 
 
 def test_a_budget_may_be_more_than_a_preset_allows_itself(petsc_options):
@@ -147,7 +147,7 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
 )
 def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: dict[str, str]):
     petsc_options(**options)
-    assert all(result.error <= 1e-3 for result in swing(preset, 2, error=1e-3))
+    assert all(result.cost.step_error <= 1e-3 for result in swing(preset, 2, error=1e-3))
 
 
 @pytest.mark.parametrize(

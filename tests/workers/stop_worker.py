@@ -1,4 +1,5 @@
-"""The command line, stopped by SIGUSR1 to the last rank after a step: stop_worker.py STEP ARGUMENTS; -1 for never."""
+"""The command line, stopped by SIGUSR1 to the last rank after a step: stop_worker.py STEP ARGUMENTS; -1 for never.
+Checkpoints are of every second step."""
 
 import os
 import signal
@@ -13,8 +14,10 @@ def stop_after(step: int) -> None:
     import petsc4py
 
     petsc4py.init(["msmpetsc"])
+    from msmpetsc.solve import simulate
     from msmpetsc.solve.simulate import Simulation
 
+    simulate.REMEMBERED = 2
     advance = Simulation.advance
 
     def watched(simulation):

@@ -16,7 +16,6 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.self_contact.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.model.self_contact.creases import NEAREST
 from msmpetsc.model.self_contact.points import SurfacePoints
@@ -147,17 +146,9 @@ class NearPairs:
             ends = most
         return self.points.spread * 0.5 * float(np.linalg.norm(ends[:3] + ends[3:]))
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store where pairs were looked for: in their order contacts are summed."""
-        pairs = self._newest
-        rows = np.zeros((self.owned, 3)) if pairs is None else pairs.q
-        checkpoint.keep({"pairs_q": rows}, {"pairs_reach": pairs.reach if pairs else 0.0})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        self._newest, reach = None, checkpoint.number("pairs_reach", 0.0, 0)
-        if reach > 0:
-            self.look(checkpoint.row("pairs_q"), reach)
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self._newest = None
 
 
 class Contacts:

@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import MOST_COUNT, Checkpoint, Range
 from msmpetsc.model.environment import Environment
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.scene.motion import Time
@@ -30,6 +30,7 @@ from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 from msmpetsc.solve.nonlinear.step import StepResult
+from msmpetsc.solve.work import Work
 
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
@@ -137,6 +138,8 @@ class Adaptive:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
             self.kept[level].set_up()
+            if self.taken.steps:
+                self.kept[level].forget()  # as one that was kept and not used last
         elif level != next(reversed(self.kept)):
             self.kept[level] = self.kept.pop(level)
             self.kept[level].forget()
@@ -151,13 +154,13 @@ class Adaptive:
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """What a frame at ``time`` shows, after as many steps as that takes. Raises StepFailed."""
         frame = round(time / self.time_step)
-        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, 0.0, 0, 0, steps=0)
+        wanted, total = frame * self.ticks.length(0), StepResult(state.q, state.q_previous, Work())
         if self.tick < wanted - self.ticks.length(0):  # Recovery has taken a step meanwhile
             self.tick = wanted - self.ticks.length(0)
         while self.tick < wanted:
             result, state = self._step(state)
-            total = sum_of(total, result)
-        if self.tick > wanted or not total.steps:
+            total = replace(result, cost=total.cost + result.cost)
+        if self.tick > wanted or not total.cost.steps:
             total = self._within(total, state, (self.tick - wanted) / self.ticks.length(self.last), time)
         return replace(total, time_error=self.control.estimate), state
 
@@ -174,24 +177,23 @@ class Adaptive:
     def _step(self, state: State) -> tuple[StepResult, State]:
         """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
-        wasted = StepResult(state.q, state.q_previous, 0.0, 0, 0)
+        cost = Work()
         while True:
             level = self._next_level(state)
             before = self._begun(state, level, restarts)
             try:
                 result, after, measure = self._try(before, level)
                 stands = self.control.accepts(level, measure)
-                if stands:
-                    self.balance.examine(before, result, after, self._end(level), self._length(level))
             except StepFailed:
                 stands = False
                 if not self.control.shorten(level):
                     raise
             else:
-                wasted = sum_of(wasted, result)
+                cost += result.cost
             if stands:
                 self.control.pay(level, measure)
-                return self._taken(wasted, result, before, after, level)
+                result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
+                return self._taken(result, before, after, level)
             self.taken.again += 1
 
     def _next_level(self, state: State) -> int:
@@ -217,7 +219,7 @@ class Adaptive:
 
     def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
         """A step of a level, and what it shows."""
-        result, after = self._integrator(level).advance(before, self._end(level))
+        result, after = self.balance.step(self._integrator(level), before, self._end(level), self._length(level))
         return result, after, self._measure(before, result, after, level)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
@@ -240,19 +242,15 @@ class Adaptive:
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 
-    def _taken(
-        self, wasted: StepResult, result: StepResult, before: State, after: State, level: int
-    ) -> tuple[StepResult, State]:
-        """A step that stands, as the scene's step has it, with the work of those that did not."""
+    def _taken(self, result: StepResult, before: State, after: State, level: int) -> tuple[StepResult, State]:
+        """A step that stands, as the scene's step has it."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
         self.taken.add(level)
         history = after.history or (before.q, before.velocity(t))
         previous = result.position - T / t * (result.position - result.previous)
-        result = replace(
-            result, previous=previous, iterations=wasted.iterations, ksp_its=wasted.ksp_its, products=wasted.products
-        )
+        result = replace(result, previous=previous)
         return result, replace(after, q_previous=after.q - T * after.velocity(t), history=history)
 
     def follow(self) -> None:
@@ -262,26 +260,22 @@ class Adaptive:
         """Unknown (NaN): a frame is no single step."""
         return np.full(2, np.nan), None
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        """Store the account, and what the integrator used last depends on."""
-        self.control.save(checkpoint)
-        counts = {f"taken_{name}": count for name, count in vars(self.taken).items()}
-        checkpoint.keep(numbers={"tick": self.tick, "last_level": self.last} | counts)
-        self._integrator_last().save(checkpoint, state)
-        if self.environment.touches:  # as not every level's has it
-            checkpoint.rows.setdefault("contact_bound", np.zeros(self.lattice.owned))
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"tick": (0, self.ticks.ticks), "last": self.levels, "taken": (-99, MOST_COUNT)}
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        for part in (self, self.control):
+            checkpoint.keep_counts(part)
+        self._integrator_last().save(checkpoint)
 
     def _integrator_last(self) -> Integrator:
         return self.kept[next(reversed(self.kept))]
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        self.control.restore(checkpoint)
-        lowest, highest = self.levels
-        self.tick = int(checkpoint.number("tick", 0, 0, self.ticks.ticks))
-        self.last = int(checkpoint.number("last_level", 0, lowest, highest))
-        counts = {name: checkpoint.number(f"taken_{name}", value, -99, 2**53) for name, value in vars(Taken()).items()}
-        self.taken = Taken(**{name: int(count) for name, count in counts.items()})
-        self._integrator(self.last).restore(checkpoint, state, self._reached(self.tick))
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        for part in (self, self.control):
+            checkpoint.restore_counts(part)
+        self._integrator(self.last).restore(checkpoint, self._reached(self.tick))
 
     def forget(self) -> None:
         for integrator in self.kept.values():
@@ -304,15 +298,3 @@ class Adaptive:
         self.mean.destroy()
         for integrator in self.kept.values():
             integrator.destroy()
-
-
-def sum_of(total: StepResult, result: StepResult) -> StepResult:
-    """A result with the work of another before it."""
-    return replace(
-        result,
-        error=max(total.error, result.error),
-        iterations=total.iterations + result.iterations,
-        ksp_its=total.ksp_its + result.ksp_its,
-        products=total.products + result.products,
-        steps=total.steps + result.steps,
-    )

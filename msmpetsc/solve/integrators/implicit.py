@@ -31,6 +31,7 @@ from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.work import Work
 
 
 class ImplicitEuler:
@@ -118,14 +119,13 @@ class ImplicitEuler:
             fixed=fixed,
             q_before=q_before,
         )
-        iterations = ksp_its = products = 0
+        begun = self.stepper.work_so_far()
         while not faces.is_settled:
             self.problem = faces.problem()
             result = self.stepper.step(self.problem)
-            iterations, ksp_its = iterations + result.iterations, ksp_its + result.ksp_its
-            products += result.products
             faces.compare(result.position)
-        return replace(result, iterations=iterations, ksp_its=ksp_its, products=products), faces.sides
+        cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
+        return replace(result, cost=cost), faces.sides
 
     def follow(self) -> None:
         self.trace = Trace()
@@ -168,15 +168,18 @@ class ImplicitEuler:
             self.stepper, self.reference = self._new_stepper(time), None
             self.set_up()
 
-    def save(self, checkpoint: Checkpoint, _: State) -> None:
-        self.stepper.save(checkpoint)
+    def save(self, checkpoint: Checkpoint) -> None:
+        if checkpoint.step:  # before the first there is nothing to forget
+            self.stepper.forget(modes=False)
+        self.stepper.minimum.curvature.save(checkpoint)
 
-    def restore(self, checkpoint: Checkpoint, _: State, time: float) -> None:
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
         self._let_go(time)
-        self.stepper.restore(checkpoint)
+        self.stepper.forget()
+        self.stepper.minimum.curvature.restore(checkpoint)
 
     def forget(self) -> None:
-        self.stepper.restore(Checkpoint())
+        self.stepper.forget()
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         names = self.stepper.options.names
@@ -210,11 +213,11 @@ class Bdf2(ImplicitEuler):
         the other end of, a ball gained a fifth of its energy.
         """
         self._let_go(time)
-        q, v, its, products = state.q, state.velocity(self.time_step), 0, 0
+        q, v, begun = state.q, state.velocity(self.time_step), Work()
         self.environment.begin_step(q, v, time - self.time_step)
         history = state.history
         if history is None:
-            history, its, products = self._history(state, time)
+            history, begun = self._history(state, time)
         q_0, v_0 = history
         y = (4 * q - q_0 + self._carried(self.tau) * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, time, self.time_step, q_0)
@@ -224,18 +227,18 @@ class Bdf2(ImplicitEuler):
         _, before, work = self.environment.strike(
             result.position, previous, StepTaken(time, self.time_step, sides), self.stepper.lattice.pinned
         )
-        its, products = its + result.ksp_its, products + result.products
-        result = replace(result, previous=previous, ksp_its=its, products=products, work=work)
+        cost = replace(begun + result.cost, step_error=result.cost.step_error, steps=1)
+        result = replace(result, previous=previous, cost=cost, work=work)
         if before is not previous:
             struck = (before != previous).any(axis=1)[:, None]
             v_after = (result.position - before - a) / self.time_step
             q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
-    def _history(self, state: State, time: float) -> tuple[tuple[np.ndarray, np.ndarray], int, int]:
+    def _history(self, state: State, time: float) -> tuple[tuple[np.ndarray, np.ndarray], Work]:
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
-        which is the true one but for a part of first order; the KSP iterations and products that this takes."""
+        which is the true one but for a part of first order; the work that this takes."""
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
         result, _ = self._solve(state, q + self._carried(tau) * v, time - t + tau, tau)
         a = ((result.position - q) / tau - v) / tau
-        return (q - t * v + t**2 / 2 * a, v - t * a), result.ksp_its, result.products
+        return (q - t * v + t**2 / 2 * a, v - t * a), result.cost

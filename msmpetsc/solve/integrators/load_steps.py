@@ -63,7 +63,6 @@ class LoadPath:
 
     problem    : of the share taken last
     sides      : (o, l) contact faces that it has
-    iterations : of the share tried last
     """
 
     def __init__(
@@ -80,7 +79,7 @@ class LoadPath:
         )  # fmt: skip
         self.base, self.target = state.q, environment.prescribed(state.q, time)
         self.known = [(0.0, state.q)]  # shares and their positions (l, 3) [m], the last two
-        self.sides, self.iterations = state.sides, 0
+        self.sides = state.sides
         self.inverted = worst_inverted(comm, stepper.lattice, state.q)[0]
         self.holding: np.ndarray | None = None  # r (owned, 3) [N], once it is asked for
         self.problem: StepProblem | None = None
@@ -89,7 +88,7 @@ class LoadPath:
         """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one with cells turned
         inside out, which smaller steps may avoid."""
         share, q = steps.share, self.known[-1][1]
-        self.iterations, begun = 0, len(self.known) > 1  # obstacles have moved
+        begun = len(self.known) > 1  # obstacles have moved
         faces = ContactFaces(
             self.comm,
             self.environment,
@@ -102,21 +101,12 @@ class LoadPath:
         )
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
-            result = self._solved(problem, share)
+            result = self.stepper.step(problem, self._guess(problem, share))
             faces.compare(result.position)
         if steps.may_be_refused:
             self._refuse_folds(result.position)
         self.known = [self.known[-1], (share, result.position)]
         self.problem, self.sides = problem, faces.sides
-        return result
-
-    def _solved(self, problem: StepProblem, share: float) -> StepResult:
-        try:
-            result = self.stepper.step(problem, self._guess(problem, share))
-        except StepFailed:
-            self.iterations += self.stepper.snes.its
-            raise
-        self.iterations += result.iterations
         return result
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:

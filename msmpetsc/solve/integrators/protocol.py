@@ -33,11 +33,11 @@ class Integrator(Protocol):
     def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
         """Position and energy error (2,) of step ``index``, taken last, and its trace if it was followed."""
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        """Store what the next step depends on beside ``state``, which it starts from."""
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Store what the next step depends on beside its state, and forget all that is not stored."""
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        """Go on after a step that ended at ``time`` [s] in ``state``."""
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        """Go on after a step that ended at ``time`` [s]."""
 
     def forget(self) -> None:
         """Let the steps so far leave no trace in the next."""

@@ -5,11 +5,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import FINITE, Checkpoint
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import with_ghosts
 
 HISTORY, SIDES = ("history_q", "history_v"), "sides"
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Energies that a run keeps account of [J].
+
+    put_in  : the most that the body had by right
+    gained  : from nowhere, and not lost since; negative where a swing may give back
+    steady  : the same without a known swing
+    since_frame : gained since the frame stored before
+    bounced : what nodes gained that bounced off its end
+    """
+
+    put_in: float = 0.0
+    gained: float = 0.0
+    steady: float = 0.0
+    since_frame: float = 0.0
+    bounced: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """Share of all energy that came from nowhere."""
+        return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
+
+
+NO_ENERGY = Ledger()
 
 
 @dataclass(frozen=True)
@@ -18,6 +44,7 @@ class State:
     not what the frame shows, which is the step as it was solved.
 
     history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
+    ledger  : of energy, as the steps so far have filled it
     sides   : (o, l) by which faces of the obstacles nodes are in contact (model.environment); None: the nearest
     """
 
@@ -25,6 +52,7 @@ class State:
     q_previous: np.ndarray
     history: tuple[np.ndarray, np.ndarray] | None = None
     sides: np.ndarray | None = None
+    ledger: Ledger = NO_ENERGY
 
     def velocity(self, time_step: float) -> np.ndarray:
         """(l, 3) [m/s]"""
@@ -46,16 +74,17 @@ class State:
             checkpoint.keep(numbers={"history": self.history is not None})
         if has_sides and self.sides is not None:
             rows[SIDES] = 1.0 * self.sides[:, :owned].T
-        checkpoint.keep(rows)
+        checkpoint.keep(rows, vars(self.ledger))
 
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
         """The state that a checkpoint holds (collective)."""
-        names = ("q", "q_previous", *HISTORY) if checkpoint.count("history", 1) else ("q", "q_previous")
+        names = ("q", "q_previous", *HISTORY) if checkpoint.number("history", 0, 0, 1) else ("q", "q_previous")
         q, q_previous, *last = (with_ghosts(comm, lattice, checkpoint.row(name)) for name in names)
         history = (last[0], last[1]) if last else None
         sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None
-        return State(q, q_previous, history, sides)
+        numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(NO_ENERGY)}
+        return State(q, q_previous, history, sides, Ledger(**numbers))
 
 
 def _sides(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:

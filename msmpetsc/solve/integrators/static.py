@@ -20,7 +20,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
@@ -28,6 +28,7 @@ from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.support import refuse_free_bodies
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
+from msmpetsc.solve.work import Work
 
 SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked for first
 LOWEST = 10.0  # eigenvalue of M^(-1) tau^2 (Hessian of E) at rest
@@ -78,19 +79,19 @@ class Static(ImplicitEuler):
         self._let_go(time)
         before = time - self.time_step
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
-            return StepResult(state.q, state.q, self.error, 0, 0, static=True), state
+            return StepResult(state.q, state.q, Work(self.error, steps=1), static=True), state
         stepper = self.stepper
-        its, products = stepper.all_its(), stepper.all_products()
+        begun = stepper.work_so_far()
         path = LoadPath(self.comm, stepper, self.environment, state, time, self.time_step)
         result = self._follow(path, time)
-        its, products = stepper.all_its() - its, stepper.all_products() - products
-        q, self.problem, self.error = result.position, path.problem, result.error
-        result = replace(result, previous=q, ksp_its=its, products=products, static=True)
+        q, self.problem, self.error = result.position, path.problem, result.cost.step_error
+        cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)
+        result = replace(result, previous=q, cost=cost, static=True)
         return result, State(q, q, sides=path.sides)
 
     def _follow(self, path: LoadPath, time: float) -> StepResult:
         """Bring all of the load on, with as few load steps as may be. Raises StepFailed."""
-        steps, iterations = LoadSteps(), 0
+        steps = LoadSteps()
         while not steps.is_done:
             try:
                 with self._hurried(steps.may_be_refused):
@@ -98,18 +99,21 @@ class Static(ImplicitEuler):
                 steps.take()
             except StepFailed as failure:
                 steps.halve(failure)
-            iterations += path.iterations
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
-        return replace(result, iterations=iterations)
+        return result
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        super().save(checkpoint, state)
-        checkpoint.keep(numbers={"state_error": self.error})
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"error": ANY}
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        super().restore(checkpoint, state, time)
-        self.error = checkpoint.numbers.get("state_error", 0.0)
+    def save(self, checkpoint: Checkpoint) -> None:
+        super().save(checkpoint)
+        checkpoint.keep_counts(self)
+
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        super().restore(checkpoint, time)
+        checkpoint.restore_counts(self)
 
     @contextmanager
     def _hurried(self, soon: bool) -> Iterator[None]:

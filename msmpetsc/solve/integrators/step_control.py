@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import COUNT, LENGTH, Range
 
 SHARE = 1 / 8  # of what was saved, that a step may spend
 FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case
@@ -99,22 +99,11 @@ class StepControl:
         if self.calm >= CALM and self.level < self.highest:
             self.level, self.calm = longer, 0
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the account."""
-        numbers = {"step_level": self.level, "step_calm": self.calm, "steps_paid": self.steps, "time_paid": self.time}
-        checkpoint.keep(
-            numbers=numbers | {"motion": self.motion, "motion_passed": self.passed, "error_spent": self.spent}
-        )
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint."""
-        most = sys.float_info.max
-        self.level = int(checkpoint.number("step_level", min(0, self.highest), self.lowest, self.highest))
-        self.calm = checkpoint.count("step_calm", CALM)
-        self.steps, self.time = checkpoint.count("steps_paid"), checkpoint.number("time_paid", 0.0, 0.0, most)
-        self.motion = checkpoint.number("motion", 0.0, 0.0, most)
-        self.passed = checkpoint.number("motion_passed", 0.0, 0.0, most)
-        self.spent = checkpoint.number("error_spent", 0.0, 0.0, most)
+    @property
+    def state(self) -> dict[str, Range]:
+        """Attributes that a checkpoint holds."""
+        lengths = dict.fromkeys(("time", "motion", "passed", "spent"), LENGTH)
+        return {"level": (self.lowest, self.highest), "calm": (0, CALM), "steps": COUNT, **lengths}
 
 
 class Ticks:

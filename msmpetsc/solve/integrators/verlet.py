@@ -21,12 +21,12 @@ from itertools import pairwise
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.arrays import greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.model.contact.friction import Movers
 from msmpetsc.model.contact.reflection import StepTaken
 from msmpetsc.model.elasticity.energy import Elasticity
@@ -39,6 +39,7 @@ from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step
@@ -112,31 +113,16 @@ class Verlet:
         """Unknown (NaN): an explicit step solves nothing."""
         return np.full(2, np.nan), None
 
-    def save(self, checkpoint: Checkpoint, state: State) -> None:
-        """Store the highest mode; grad E is computed again from q, if it is known of that."""
-        has_begun = self.anchors is not None  # it has taken a step
-        squared, known = (self.highest.squared, state.q is self.known) if has_begun else (-1.0, False)
-        mode = self.highest.mode.values[: self.lattice.owned]
-        numbers = {"squared": squared, "known": known, "substep": self.substep}
-        checkpoint.keep({"mode": mode}, {**numbers, "halvings": self.halvings, "springs_gained": self.gained})
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"substep": (sys.float_info.min, np.inf), "halvings": (0, HALVINGS), "gained": FINITE}
 
-    def restore(self, checkpoint: Checkpoint, state: State, time: float) -> None:
-        squared = checkpoint.number("squared", -1.0, -1.0, sys.float_info.max)
-        if squared < 0:
-            return
-        self._hold(time)
-        self.highest.mode.values[: self.lattice.owned] = like(self.v, checkpoint.row("mode"))
-        self.highest.mode.update()
-        self.highest.squared = squared
-        self.substep = checkpoint.number("substep", self.substep, sys.float_info.min)
-        self.halvings = checkpoint.count("halvings", HALVINGS)
-        self.gained = checkpoint.number("springs_gained", 0.0, -sys.float_info.max, sys.float_info.max)
-        if checkpoint.count("known", 1):
-            self.known = state.q
-            self.position.values[:] = state.q
-            sides = self.environment.no_sides if state.sides is None else state.sides
-            self.sides = sides[:, : self.lattice.owned]
-            self._pull(time)
+    def save(self, checkpoint: Checkpoint) -> None:
+        checkpoint.keep_counts(self)
+        self.known = self.anchors = None
+
+    def restore(self, checkpoint: Checkpoint, time: float) -> None:
+        checkpoint.restore_counts(self)
 
     def forget(self) -> None:
         self.known = self.anchors = None
@@ -231,7 +217,9 @@ class Verlet:
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(self.known, previous, 0.0, count, 0, self.work, explicit=True, swing=swing)
+        result = StepResult(
+            self.known, previous, Work(iterations=count, steps=1), self.work, explicit=True, swing=swing
+        )
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:

@@ -5,7 +5,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -37,16 +36,6 @@ class Preconditioner:
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         return self.contact is not None and self.contact.follow(contact, q)
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on."""
-        if self.contact:
-            self.contact.save(checkpoint)
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
-        if self.contact:
-            self.contact.restore(checkpoint)
 
     def setFromOptions(self, _: PETSc.PC) -> None:
         self.pc.setFromOptions()
@@ -112,17 +101,6 @@ class ContactDiagonal:
         self.added = bound
         self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
         self.matrix.setDiagonal(self.vector)
-
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the bound: where it does not change, the preconditioner of the last step is kept."""
-        bound = np.zeros(self.unknowns.lattice.owned, like=self.added)
-        bound[self.unknowns.free] = self.added[: self.unknowns.size]
-        checkpoint.keep(rows={"contact_bound": bound})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
-        bound = checkpoint.rows.get("contact_bound", np.zeros(self.unknowns.lattice.owned))
-        self._add(self._columns(like(self.added, bound)))
 
     def destroy(self) -> None:
         """Collective."""

@@ -4,14 +4,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.bodies import Translations
 from msmpetsc.solve.multigrid.cycle import Multigrid
-from msmpetsc.solve.multigrid.translations import Translations
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
@@ -23,8 +20,7 @@ class LatticePreconditioner:
 
     touches  : steps may have a ``contact``
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
-    q        : positions (l, 3) [m] of that; None before the first
-    contact  : (owned, 9) [N/m] blocks of each node at that time; (0, 9) where nothing touches
+    is_first : there is none yet
     pace     : iterations a digit of the first solve with it; None before that
     wasted   : iterations since then that were more than that
     is_stale : a new one is due
@@ -44,8 +40,7 @@ class LatticePreconditioner:
             self.multigrid = Multigrid(comm, unknowns, elasticity, time_step, prefix)
         bodies = self.multigrid.bodies
         self.translations = Translations(comm, unknowns, bodies) if bodies.free.any() else None
-        self.q: np.ndarray | None = None
-        self.contact = np.empty((0, 9), like=unknowns.lattice.nodes)
+        self.is_first = True
         self.pace: float | None = None
         self.wasted = 0.0
         self.is_stale, self.is_free = True, False
@@ -91,8 +86,8 @@ class LatticePreconditioner:
     def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact)
-        self.pace, self.wasted = USUAL_PACE if self.q is None else None, 0.0
-        self.q, self.contact, self.is_stale = q, contact, False
+        self.pace, self.wasted = USUAL_PACE if self.is_first else None, 0.0
+        self.is_first = self.is_stale = False
 
     def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
@@ -128,48 +123,9 @@ class LatticePreconditioner:
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.multigrid.pc.view(viewer)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store where the hierarchy was built."""
-        contact = np.zeros((self.unknowns.lattice.owned, 9), like=self.contact)
-        contact[: len(self.contact)] = self.contact
-        q = self.unknowns.lattice.nodes if self.q is None else self.q
-        store(
-            checkpoint, self.unknowns, q, contact if self.touches else None, self.pace, self.wasted, not self.is_stale
-        )
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        self.is_stale, lattice = True, self.unknowns.lattice
-        if not checkpoint.count("hierarchy_serves", 1):
-            return
-        stored = checkpoint.rows.get("hierarchy_contact", np.zeros((lattice.owned, 9)))
-        contact = like(lattice.nodes, stored)
-        touched = self.comm.allreduce(bool(contact.any()), MPI.LOR)
-        self._build(with_ghosts(self.comm, lattice, checkpoint.row("hierarchy_q")), contact if touched else contact[:0])
-        self.pace = checkpoint.number("hierarchy_pace", 0.0, 0) or None
-        self.wasted = checkpoint.number("hierarchy_wasted", 0.0, 0)
+    def forget(self) -> None:
+        """Know nothing of the steps before: a new hierarchy is due."""
+        self.is_stale = self.is_first = True
 
     def destroy(self) -> None:
         self.multigrid.destroy()
-
-
-def store(
-    checkpoint: Checkpoint,
-    unknowns: Unknowns,
-    q: np.ndarray,
-    contact: np.ndarray | None,
-    pace: float | None,
-    wasted: float,
-    serves: bool,
-) -> None:
-    """Store where a hierarchy was built, and whether it serves; a solver that may yet make one stores that it does not,
-    for all checkpoints of a run are of the same parts."""
-    rows = {"hierarchy_q": q[: unknowns.lattice.owned]} | ({} if contact is None else {"hierarchy_contact": contact})
-    checkpoint.keep(rows, {"hierarchy_pace": pace or 0.0, "hierarchy_wasted": wasted, "hierarchy_serves": serves})
-
-
-def store_none(checkpoint: Checkpoint, unknowns: Unknowns, touches: bool) -> None:
-    """Store that no hierarchy was built yet."""
-    nodes = unknowns.lattice.nodes
-    contact = np.zeros((unknowns.lattice.owned, 9), like=nodes) if touches else None
-    store(checkpoint, unknowns, nodes, contact, None, 0.0, False)

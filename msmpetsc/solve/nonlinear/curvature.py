@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest, like, to_host
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.model.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
@@ -101,6 +101,7 @@ class LowestCurvature:
         self.known: tuple[StepProblem | None, np.ndarray, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
         self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.knows_mode = False  # in the last checkpoint
         self.vectors: list[PETSc.Vec] | None = None
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
@@ -280,22 +281,29 @@ class LowestCurvature:
         """Sum over all ranks."""
         return self.comm.allreduce(values)
 
+    @property
+    def state(self) -> dict[str, Range]:
+        return {"searched": ANY, "knows_mode": (0, 1)}
+
     def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step's search depends on."""
-        lattice, searched = self.functional.lattice, self.searched
-        rows = np.zeros((lattice.owned, 3), like=lattice.nodes)
+        """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""
+        rows = np.zeros((self.functional.lattice.owned, 3), like=self.functional.lattice.nodes)
+        self.knows_mode = self.mode is not None
         if self.mode is not None:
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
-        numbers = {"searched_greatest": searched.greatest, "searched_total": searched.total}
-        checkpoint.keep({"lowest_mode": rows}, {**numbers, "knows_mode": self.mode is not None})
+        checkpoint.keep({"lowest_mode": rows})
+        checkpoint.keep_counts(self)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        most, total = (checkpoint.number(name, 0, 0) for name in ("searched_greatest", "searched_total"))
-        self.searched, self.mode = Compression(most, total, False), None
-        if checkpoint.count("knows_mode", 1):
+        """Go on from a checkpoint."""
+        checkpoint.restore_counts(self)
+        if self.knows_mode:
             rows = like(self.functional.mass, checkpoint.row("lowest_mode"))
             self.mode = rows[self.unknowns.free].T.ravel()
+
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self.searched, self.mode = NONE, None
 
     def destroy(self) -> None:
         for vector in self.vectors or ():

@@ -5,11 +5,10 @@ wherever E is convex between x and x*. Where the bound will do already, or no es
 error.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
@@ -26,9 +25,9 @@ SHARE = 0.5  # of the error that would do, left to the linear solve
 CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
 
 
-@dataclass
-class StepError:
-    """Error of the step in progress.
+@dataclass(frozen=True)
+class Outcome:
+    """What a solve has come to, as far as is known at its last iterate.
 
     goal        : relative error to come to; 0 where a budget of iterations ends the step
     error       : of the last iterate, estimated or bounded
@@ -41,7 +40,7 @@ class StepError:
     doubts      : how often the step came to a point that is no minimum, or farther from one than it seemed
     """
 
-    goal: float
+    goal: float = 0.0
     error: float = np.inf
     bound: float = np.inf
     residual: float = np.inf
@@ -50,6 +49,16 @@ class StepError:
     alarm: Alarm = Alarm.NOWHERE
     at_rounding: bool = False
     doubts: int = 0
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the error is below the goal, or nothing but rounding is left."""
+        return self.at_rounding or self.error <= self.goal
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether g falls by less than its rounding near the iterate: any move is then called a fall."""
+        return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
 
 
 class ErrorControl:
@@ -71,88 +80,58 @@ class ErrorControl:
         self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
         self.target, self.tightest = error or 0.0, tightest
         self.ratio = FIRST_RATIO  # of bound to error in the last estimate
-        self.now = StepError(self.target)
 
-    def begin(self) -> None:
-        """Know nothing yet of a new step."""
-        self.now = StepError(self.target)
-
-    def judge(self, iterate: Iterate) -> None:
-        """Know the error of an iterate; only a bound on it while that is far too large."""
-        now, functional = self.now, self.functional
-        now.corrected, now.alarm = False, min(now.alarm, Alarm.ON_THE_WAY)
-        now.residual, distance = functional.dual_norm(iterate.f), functional.distance(iterate.q)
-        now.at_rounding = self.rounding.is_all_of(iterate.f)
-        now.error = self._error(iterate, distance)
-
-    def _error(self, iterate: Iterate, distance: float) -> float:
-        now = self.now
-        if not distance > 0 or not np.isfinite(now.residual):  # the start x = y tells nothing yet
-            return 0.0 if now.at_rounding else np.inf
-        now.bound = now.residual / distance
-        if now.bound > max(self.ratio, LEAST_RATIO) * now.early * now.goal and not now.at_rounding:
-            return now.bound
+    def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
+        """What is known at an iterate: its error, only a bound on it while that is far too large."""
+        residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
+        at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
+        now = replace(before, residual=residual, at_rounding=at_rounding, alarm=alarm, corrected=False)
+        if not distance > 0 or not np.isfinite(residual):  # the start x = y tells nothing yet
+            return replace(now, error=0.0 if at_rounding else np.inf)
+        now = replace(now, bound=residual / distance)
+        if now.bound > max(self.ratio, LEAST_RATIO) * now.early * now.goal and not at_rounding:
+            return replace(now, error=now.bound)
         if now.bound <= now.goal:
             lowest = self.curvature.compression(iterate.q).least_curvature
             if lowest > 0 and now.bound <= now.goal * lowest:
-                return now.bound / lowest
-        return self._estimated(iterate, distance, now.goal)
+                return replace(now, error=now.bound / lowest)
+        return self._estimated(iterate, distance, now, now.goal)
 
-    def _estimated(self, iterate: Iterate, distance: float, goal: float) -> float:
+    def _estimated(self, iterate: Iterate, distance: float, now: Outcome, goal: float) -> Outcome:
         """The error against x less its correction: where x has not come far, |x - y|_M is not yet |x* - y|_M."""
-        now = self.now
         enough = EARLY * goal * distance if goal else np.inf
         length = self.estimate(iterate, now.residual, enough, KNOWN * goal * distance)
         if not np.isfinite(length):
-            now.alarm = Alarm.HERE
-            return now.bound
+            return replace(now, error=now.bound, alarm=Alarm.HERE)
         if self.estimate.missing is None:
             self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
-        now.early, now.corrected = 1.0, True
-        return self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
+        error = self.rounding.relative(length, self.functional.distance(iterate.q, self.estimate.correction))
+        return replace(now, error=error, early=1.0, corrected=True)
 
-    def estimate_last(self, iterate: Iterate) -> None:
+    def estimate_last(self, iterate: Iterate, now: Outcome) -> Outcome:
         """Estimate the error of the iterate that a budget ends at, unless that was done."""
-        if not self.now.corrected:
-            self.now.error = self._estimated(iterate, self.functional.distance(iterate.q), 0.0)
+        return now if now.corrected else self._estimated(iterate, self.functional.distance(iterate.q), now, 0.0)
 
-    @property
-    def is_enough(self) -> bool:
-        """Whether the last iterate's error is below the goal, or nothing but rounding is left."""
-        return self.now.at_rounding or self.now.error <= self.now.goal
-
-    @property
-    def is_flat(self) -> bool:
-        """Whether g falls by less than its rounding near the last iterate: any move is then called a fall."""
-        now = self.now
-        return now.bound < FULL_STEP_ERROR and (now.corrected or not now.doubts)
-
-    def relative_tolerance(self) -> float:
+    def relative_tolerance(self, now: Outcome) -> float:
         """ksp_rtol of the next linear solve: it need not gain more digits than are missing."""
-        missing = self.now.bound / self.ratio
-        return min(max(SHARE * self.now.goal / missing, self.tightest), LOOSEST)
+        missing = now.bound / self.ratio
+        return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST)
 
-    def doubt(self, has_moved: bool) -> bool:
-        """Go on from a point that is no minimum, or farther from one than it seemed; whether there is more to gain.
+    def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
+        """What is known where a step goes on from a point that is no minimum, or farther from one than it seemed; None
+        where there is no more to gain.
 
         has_moved : the point was left; if not the goal becomes closer, until g has no digits left to tell by
         """
-        now = self.now
-        now.doubts += 1
-        now.goal *= 1.0 if has_moved else CLOSER
-        if not has_moved and now.goal < CLOSEST * self.target and np.isfinite(now.error):
-            return False
-        now.bound, now.corrected = np.inf, False
-        return True
+        goal = now.goal if has_moved else CLOSER * now.goal
+        if not has_moved and goal < CLOSEST * self.target and np.isfinite(now.error):
+            return None
+        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
-    def final_error(self, q: np.ndarray) -> float:
+    def final_error(self, error: float, at_rounding: bool, q: np.ndarray) -> float:
         """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
-        return self.rounding.added_to(self.now.error, self.functional.distance(q), self.now.at_rounding)
+        return self.rounding.added_to(error, self.functional.distance(q), at_rounding)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step's judgements depend on."""
-        checkpoint.keep(numbers={"ratio": self.ratio})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        self.ratio = checkpoint.number("ratio", FIRST_RATIO, 0)
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self.ratio = FIRST_RATIO

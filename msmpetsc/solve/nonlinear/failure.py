@@ -6,7 +6,7 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import StepFailed
 from msmpetsc.model.locate import describe_inverted, node_of_greatest
-from msmpetsc.solve.nonlinear.error_control import StepError
+from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
@@ -21,7 +21,7 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 
 
 def not_converged(
-    snes: PETSc.SNES, ksp: PETSc.KSP, now: StepError, iterations: int, worst: str, true_hessian: bool
+    snes: PETSc.SNES, ksp: PETSc.KSP, now: Outcome, iterations: int, worst: str, true_hessian: bool
 ) -> StepFailed:
     """SNES gave up after ``iterations``.
 
@@ -41,7 +41,7 @@ def not_converged(
     )
 
 
-def no_minimum(now: StepError, worst: str) -> StepFailed:
+def no_minimum(now: Outcome, worst: str) -> StepFailed:
     """All that the step came to was no minimum, or farther from one than it seemed."""
     seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
     return StepFailed(

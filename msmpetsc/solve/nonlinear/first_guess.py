@@ -4,12 +4,9 @@ import numpy as np
 
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 SHORTER = (0.5, 0.1, 0.0)  # shares of a guess's way, where anchors move on at once
-STORED = ("correction", "correction_before")
 
 
 class FirstGuess:
@@ -74,20 +71,9 @@ class FirstGuess:
         """The step has come to x (l, 3) [m]."""
         self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store the corrections."""
-        if not self.extrapolate:
-            return
-        lattice = self.functional.lattice
-        missing = [np.zeros((lattice.owned, 3), like=lattice.nodes)] * (2 - len(self.corrections))
-        rows = [rows[: lattice.owned] for rows in (*self.corrections, *missing)]
-        checkpoint.keep(dict(zip(STORED, rows, strict=True)), {"corrections": len(self.corrections)})
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
-        names = STORED[: checkpoint.count("corrections", len(STORED))]
-        comm, lattice = self.functional.comm, self.functional.lattice
-        self.corrections = [with_ghosts(comm, lattice, checkpoint.row(name)) for name in names]
+    def forget(self) -> None:
+        """Know nothing of the steps before."""
+        self.corrections = []
 
     def _held(self, guess: np.ndarray) -> np.ndarray:
         """The guess, but with the held nodes where they will be."""

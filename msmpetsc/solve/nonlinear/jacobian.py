@@ -15,7 +15,7 @@ from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHes
 from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble, diagonal_of
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner, store_none
+from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
 from msmpetsc.solve.nonlinear.preconditioning import MASSLESS, MULTIGRID, Preconditioned, StepPreconditioner
 from msmpetsc.solve.presets import SolverOptions
 
@@ -63,12 +63,9 @@ class Jacobian:
         self.operator = python_matrix(unknowns, context, comm)
         owned.callback(self.operator.destroy)
         of_lattice = partial(LatticePreconditioner, comm, unknowns, elasticity, time_step, options.prefix, touches)
-        reserve = partial(store_none, unknowns=unknowns, touches=touches)
         ratio, is_held = self._stiffness_ratio(), unknowns.total < unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
-        self.preconditioner = StepPreconditioner(
-            self._of_matrix, of_lattice, reserve, kind, chooses, ratio, unknowns.total
-        )
+        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, unknowns.total)
         self.pmat = python_matrix(unknowns, Preconditioned(self.preconditioner), comm)
         owned.callback(self.pmat.destroy)
 

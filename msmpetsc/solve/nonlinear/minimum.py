@@ -27,17 +27,19 @@ FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g f
 
 
 @dataclass(frozen=True)
-class Examination:
+class Verdict:
     """Verdict on a point x.
 
-    error     : relative, of x; infinite where no estimate can be had
-    direction : (n,) of negative curvature; None where there is none
-    curvature : of it, an eigenvalue of M^(-1) H
+    error      : relative, of x; infinite where no estimate can be had
+    direction  : (n,) of negative curvature; None where there is none
+    curvature  : of it, an eigenvalue of M^(-1) H
+    is_minimum : that will do
     """
 
     error: float
     direction: np.ndarray | None = None
     curvature: float = 1.0
+    is_minimum: bool = False
 
 
 class Minimum:
@@ -50,9 +52,7 @@ class Minimum:
         self.unknowns, self.memory = functional.unknowns, functional.memory
         self.nearer, self.f, self.first = (estimate.correction.duplicate() for _ in range(3))
 
-    def examine(
-        self, x: PETSc.Vec, corrected: bool, compression: Compression, alarm: Alarm, enough: float
-    ) -> Examination:
+    def examine(self, x: PETSc.Vec, corrected: bool, compression: Compression, alarm: Alarm, enough: float) -> Verdict:
         """Examine x, or rather the point that is x less its estimated error.
 
         corrected : whether estimate.correction is of x
@@ -75,16 +75,16 @@ class Minimum:
         hint = estimate.correction if alarm else None
         value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
         if value < 0:
-            return Examination(np.inf, direction, value)
+            return Verdict(np.inf, direction, value)
         value = min(value, 1.0)
         first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
-            return Examination(self.rounding.relative(first + rest, functional.distance(nearer.q)))
+            return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))
         if corrected and estimate.missing is not None and value <= CONVEX:
             return self.examine(x, self._estimate_closely(x), compression, alarm, enough)
         if corrected and bent <= SMALL * estimate.length and value > CONVEX:
-            return Examination(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
-        return Examination(self._second_estimate(nearer, first, rest, enough, value))
+            return Verdict(self.rounding.relative(estimate.length, functional.distance(nearer.q)))
+        return Verdict(self._second_estimate(nearer, first, rest, enough, value))
 
     def _estimate_closely(self, x: PETSc.Vec) -> bool:
         """Estimate the error of x without an early end, which says little where g is hardly convex; whether it could be
@@ -121,16 +121,16 @@ class Minimum:
         self.first.axpy(second / max(functional.norm(correction), sys.float_info.min), correction)
         return relative(functional.norm(self.first), functional.distance(nearer.q, correction))
 
-    def go_on(self, x: PETSc.Vec, examination: Examination) -> bool:
+    def go_on(self, x: PETSc.Vec, verdict: Verdict) -> bool:
         """Move x to the point examined if g is lower there, and from there along a direction of negative curvature, the
         way that g falls, as far as doubling the move lets it fall; whether it has moved."""
         functional = self.functional
         falls = functional.change(functional.positions(self.nearer), functional.positions(x))[0] < 0
         if falls:
             self.nearer.copy(x)
-        if examination.direction is None:
+        if verdict.direction is None:
             return falls
-        return self._descend(x, examination.direction, examination.curvature) or falls
+        return self._descend(x, verdict.direction, verdict.curvature) or falls
 
     def _descend(self, x: PETSc.Vec, direction: np.ndarray, curvature: float) -> bool:
         """Move x along a direction (n,) of negative curvature; whether g falls that way."""

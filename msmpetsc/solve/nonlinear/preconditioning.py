@@ -13,7 +13,6 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.comm import log
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.contact.penalty import Contact
 from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
@@ -44,7 +43,6 @@ class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
-    reserve : stores that there is no hierarchy yet
     kind    : -pc_type; multigrid is taken where that is mg
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
     nodes   : free ones, on all ranks
@@ -54,17 +52,17 @@ class StepPreconditioner:
         self,
         make_of_matrix: Callable[[], Preconditioner],
         make_multigrid: Callable[[], LatticePreconditioner],
-        reserve: Callable[[Checkpoint], None],
         kind: str,
         chooses: bool,
         ratio: float,
         nodes: int,
     ):
-        self.make_multigrid, self.reserve, self.chooses = make_multigrid, reserve, chooses
+        self.make_multigrid, self.chooses = make_multigrid, chooses
         self.is_large, self.is_searching = nodes >= LARGE, False
         self.for_searches: LatticePreconditioner | None = None
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
+        self.is_chosen = kind == MULTIGRID  # multigrid, for the steps
         expected = expected_iterations(ratio)
         if kind == MULTIGRID:
             self.multigrid = make_multigrid()
@@ -75,14 +73,14 @@ class StepPreconditioner:
 
     @property
     def in_use(self) -> Preconditioner | LatticePreconditioner:
-        chosen = self.multigrid or self.of_matrix
+        chosen = self.multigrid if self.is_chosen else self.of_matrix
         assert chosen is not None
         return chosen
 
     @property
     def is_uniform(self) -> bool:
         """Whether smooth errors fade as fast as rough ones."""
-        return self.multigrid is not None or self.is_searching
+        return self.is_chosen or self.is_searching
 
     @property
     def products(self) -> int:
@@ -93,7 +91,7 @@ class StepPreconditioner:
     def searching(self, q: np.ndarray, contact: Contact | None) -> Iterator[None]:
         """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
         smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
-        if self.multigrid or not (self.chooses and self.is_large):
+        if self.is_chosen or not (self.chooses and self.is_large):
             yield
             return
         self.for_searches = self.for_searches or self.make_multigrid()
@@ -105,8 +103,10 @@ class StepPreconditioner:
             self.is_searching = False
 
     def _choose(self, reason: str) -> None:
-        log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
-        self.multigrid = self.make_multigrid()
+        self.is_chosen = True
+        if self.multigrid is None:  # else it was chosen before, and forgotten
+            log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
+            self.multigrid = self.make_multigrid()
 
     def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
@@ -115,17 +115,17 @@ class StepPreconditioner:
     def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
         where linear solves would not."""
-        if self.multigrid:
+        if self.multigrid and self.is_chosen:
             self.multigrid.balance(q, contact, f, x)
 
     @property
     def has_to_balance(self) -> bool:
         """Whether ``balance`` does anything."""
-        return self.multigrid is not None and self.multigrid.translations is not None
+        return self.is_chosen and self.multigrid is not None and self.multigrid.translations is not None
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""
-        if self.multigrid:
+        if self.multigrid and self.is_chosen:
             self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / rtol):
             self._choose(f"Jacobi's took {its} iterations")
@@ -143,27 +143,11 @@ class StepPreconditioner:
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.in_use.view(pc, viewer)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on."""
-        checkpoint.keep(numbers={"multigrid": self.multigrid is not None})
+    def forget(self) -> None:
+        """Know nothing of the steps before: what was chosen for its iterations is to be chosen anew."""
+        self.is_chosen = self.of_matrix is None
         if self.multigrid:
-            self.multigrid.save(checkpoint)
-        elif self.chooses:
-            self.reserve(checkpoint)
-        if self.of_matrix:
-            self.of_matrix.save(checkpoint)
-
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken."""
-        chosen = checkpoint.count("multigrid", 1)
-        if chosen and self.chooses and not self.multigrid:
-            self.multigrid = self.make_multigrid()
-        elif self.multigrid and self.of_matrix and not chosen:  # which it was changed for since
-            self.multigrid.destroy()
-            self.multigrid = None
-        for part in (self.of_matrix, self.multigrid):
-            if part:
-                part.restore(checkpoint)
+            self.multigrid.forget()
 
     def destroy(self, _: PETSc.PC) -> None:
         for owned in (self.of_matrix, self.multigrid, self.for_searches):

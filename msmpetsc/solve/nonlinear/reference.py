@@ -5,7 +5,6 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -39,7 +38,7 @@ class Reference:
             return np.full((len(positions), 2), np.nan)
 
     def _errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
-        self.stepper.restore(Checkpoint())  # what is measured does not depend on what was measured before
+        self.stepper.forget()  # what is measured does not depend on what was measured before
         exact = self.stepper.step(problem, positions[-1]).position
         start = self._distances(problem.y, exact)
         distances = np.array([self._distances(x, exact) for x in positions])

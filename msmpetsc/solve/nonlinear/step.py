@@ -2,33 +2,33 @@
 (solve.presets)."""
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Checkpoint
 from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.model.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl
+from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl, Outcome
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.failure import NOT_FINITE, no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
-from msmpetsc.solve.nonlinear.minimum import Minimum
+from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
+from msmpetsc.solve.work import Work
 
 PROJECTED = 5  # iterations with the projected Hessian before the true one, which comes in faster, has another try
 DOUBTS = 100  # about where a step has come to: saddles, and errors larger than they had seemed
@@ -41,29 +41,21 @@ class StepResult:
 
     position   : (l, 3) [m], ghosts included
     previous   : (l, 3) [m], such that the velocity is (position - previous) / t
-    error      : estimated relative error of the step
-    iterations : of SNES
-    ksp_its    : KSP iterations of all of them, and of what examines the result
+    cost       : of the step
     work       : of obstacles that struck this rank's nodes [J]
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
-    products   : with the Hessian, of all of it; those at multigrid's finest level are counted, too
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     static     : a state of equilibrium, not a motion
-    steps      : that it stands for
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
     position: np.ndarray
     previous: np.ndarray
-    error: float
-    iterations: int
-    ksp_its: int
+    cost: Work
     work: float = 0.0
     explicit: bool = False
     swing: float = 0.0
-    products: int = 0
     static: bool = False
-    steps: int = 1
     time_error: float = np.nan
 
 
@@ -98,6 +90,8 @@ class Stepper:
             error = DEFAULT_ERROR
         self.observer: Callable[[np.ndarray], None] | None = None
         self.projected = False  # whether newton's Hessian is, at the moment
+        self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
+        self.iterations = 0  # of all steps so far
         self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
         self.kinks, self.owned = FrictionKinks(), ExitStack()
         self.unknowns = Unknowns(comm, lattice, static)
@@ -179,24 +173,26 @@ class Stepper:
         Raises StepFailed on all ranks, and InputError where PETSc's options do not go together.
         """
         with petsc_errors("PETSc cannot take a step with these options", self._abandon):
-            its_before, products_before = self.all_its(), self.all_products()
-            self.functional.begin(problem)
-            self.control.begin()
-            self.base[:] = problem.fixed
-            self.kinks.begin(problem.contact)
-            self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
-            if start is None and self.jacobian.preconditioner.has_to_balance:
-                self._balance()
-            iterations, is_done = 0, False
-            while not is_done:
-                for _ in self._solves():
-                    self.snes.solve(None, self.x)
-                    iterations += self.snes.its
-                is_done = self._is_minimum()
+            before = self.work_so_far()
+            self._begin(problem, start)
+            outcome = self.solve_once(Outcome(self.control.target))
+            verdict = self.examine(outcome)
+            while not verdict.is_minimum and (doubted := self._leave(verdict, outcome)):
+                outcome = self.solve_once(doubted)
+                verdict = self.examine(outcome)
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
-            its, error = self.all_its() - its_before, self.control.final_error(q)
-            return StepResult(q, problem.q, error, iterations, its, products=self.all_products() - products_before)
+            error = self.control.final_error(verdict.error, outcome.at_rounding, q)
+            return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
+
+    def _begin(self, problem: StepProblem, start: np.ndarray | None) -> None:
+        """Put the first guess into x."""
+        self.functional.begin(problem)
+        self.base[:] = problem.fixed
+        self.kinks.begin(problem.contact)
+        self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
+        if start is None and self.jacobian.preconditioner.has_to_balance:
+            self._balance()
 
     def _balance(self) -> None:
         """Move bodies as wholes to where their forces balance, as far as they do not meet."""
@@ -209,82 +205,82 @@ class Stepper:
         if share < 1.0:
             self.unknowns.from_nodes(iterate.q + share * (balanced - iterate.q), self.x)
 
-    def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on beside its problem."""
-        for part in self._remembering():
-            part.save(checkpoint)
+    def forget(self, modes: bool = True) -> None:
+        """Let the steps so far leave no trace in the next; modes: of the lowest mode neither."""
+        for part in (self.first_guess, self.control, self.jacobian.preconditioner):
+            part.forget()
+        if modes:
+            self.minimum.curvature.forget()
 
-    def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint; from an empty one as if no step had been taken (collective)."""
-        for part in self._remembering():
-            part.restore(checkpoint)
+    def work_so_far(self) -> Work:
+        """Work of all steps so far, of their estimates and searches for negative curvature."""
+        estimate, curvature, jacobian = self.control.estimate, self.minimum.curvature, self.jacobian
+        ksp_its = total_iterations(self.ksp) + total_iterations(estimate.ksp) + curvature.its
+        products = jacobian.hessian.products + jacobian.preconditioner.products
+        return Work(iterations=self.iterations, ksp_its=ksp_its, products=products)
 
-    def _remembering(self) -> list:
-        return [self.first_guess, self.minimum.curvature, self.control, self.jacobian.preconditioner]
+    def solve_once(self, outcome: Outcome) -> Outcome:
+        """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
 
-    def all_its(self) -> int:
-        """KSP iterations of all steps so far, and of their estimates and searches for negative curvature."""
-        estimate, curvature = self.control.estimate, self.minimum.curvature
-        return total_iterations(self.ksp) + total_iterations(estimate.ksp) + curvature.its
+        Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
+        if its very first direction has negative curvature it climbs, and the line search says so: the
+        projected Hessian takes over for some iterations (_linearise).
+        """
+        self.outcome = outcome
+        if self._is_solved():
+            return self.outcome
+        self.projected = self.preset.projected > 0
+        self._forget_pairs()
+        iterations, most = self._run_snes(), self.snes.getTolerances()[3]
+        while self._climbs() and iterations < most:
+            self.projected = True
+            its = self._run_snes()
+            iterations += its
+            if its == 0:  # neither Hessian leads on
+                break
+        self.projected = False
+        if self.snes.reason < 0:
+            worst = where_worst(self.functional, self._evaluate(self.snes.getSolution()))
+            raise not_converged(self.snes, self.ksp, self.outcome, iterations, worst, self.preset.true_hessian)
+        return self.outcome
 
-    def all_products(self) -> int:
-        """Products with the Hessian of all steps so far."""
-        return self.jacobian.hessian.products + self.jacobian.preconditioner.products
+    def _run_snes(self) -> int:
+        self.snes.solve(None, self.x)
+        self.iterations += self.snes.its
+        return self.snes.its
 
-    def _is_minimum(self) -> bool:
-        """Whether x is a minimum and its error what was said; x is moved on if not (collective). Raises StepFailed."""
+    def examine(self, outcome: Outcome) -> Verdict:
+        """Whether x is a minimum, and how far from it (collective)."""
         control, functional, q = self.control, self.functional, self.functional.positions(self.x)
         compression = self.minimum.curvature.compression(q)
         if compression.is_harmless:
-            return True
-        now, enough = control.now, control.target * functional.distance(q) if control.target else np.inf
-        examination = self.minimum.examine(self.x, now.corrected, compression, now.alarm, enough)
-        now.error = examination.error
-        if self.budget or now.error <= control.target or (now.at_rounding and not np.isinf(now.error)):
-            return True
-        if not control.doubt(self.minimum.go_on(self.x, examination)):
-            return True  # g has no digits left to tell the two points apart: the step is as good as it says
-        if now.doubts > DOUBTS:
-            raise no_minimum(now, where_worst(functional, functional.evaluate(self.x, self.work)))
-        return False
+            return Verdict(outcome.error, is_minimum=True)
+        enough = control.target * functional.distance(q) if control.target else np.inf
+        verdict = self.minimum.examine(self.x, outcome.corrected, compression, outcome.alarm, enough)
+        will_do = verdict.error <= control.target or (outcome.at_rounding and not np.isinf(verdict.error))
+        return replace(verdict, is_minimum=bool(self.budget) or will_do)
+
+    def _leave(self, verdict: Verdict, outcome: Outcome) -> Outcome | None:
+        """Move x to where g is lower than where it is no minimum; what is then known, None where g has no digits left
+        to tell the two points apart: the step is as good as the verdict says (collective). Raises StepFailed."""
+        doubted = self.control.doubt(replace(outcome, error=verdict.error), self.minimum.go_on(self.x, verdict))
+        if doubted and doubted.doubts > DOUBTS:
+            worst = where_worst(self.functional, self.functional.evaluate(self.x, self.work))
+            raise no_minimum(doubted, worst)
+        return doubted
 
     def _is_solved(self) -> bool:
         """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
         if not self.has_npc:
             return False
         iterate = self._evaluate(self.x)
-        self.control.judge(iterate)
-        solved = self.control.is_enough
+        self.outcome = self.control.judge(iterate, self.outcome)
+        solved = self.outcome.is_enough
         if not solved:
             self._adapt()
         elif self.observer:
             self.observer(iterate.q)
         return solved
-
-    def _solves(self) -> Iterator[None]:
-        """Yield whenever SNES must solve, until F at x is as small as it must be. Raises StepFailed.
-
-        Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
-        if its very first direction has negative curvature it climbs, and the line search says so: the
-        projected Hessian takes over for some iterations (_linearise).
-        """
-        if self._is_solved():
-            return
-        self.projected = self.preset.projected > 0
-        self._forget_pairs()
-        yield
-        iterations, most = self.snes.its, self.snes.getTolerances()[3]
-        while self._climbs() and iterations < most:
-            self.projected = True
-            yield
-            iterations += self.snes.its
-            if self.snes.its == 0:  # neither Hessian leads on
-                break
-        self.projected = False
-        if self.snes.reason < 0:
-            worst = where_worst(self.functional, self._evaluate(self.snes.getSolution()))
-            now, true_hessian = self.control.now, self.preset.true_hessian
-            raise not_converged(self.snes, self.ksp, now, iterations, worst, true_hessian)
 
     def _forget_pairs(self) -> None:
         """SNESQN alone keeps what it has learnt, its pairs of the last step; a type set anew has none."""
@@ -318,7 +314,7 @@ class Stepper:
             q = self.functional.positions(x)
             self.kinks.see(q, self.base)
             change, distance = self.functional.change(q, self.base)
-        return -1.0 if self.control.is_flat and distance > 0 else change
+        return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
@@ -340,7 +336,7 @@ class Stepper:
                 self.kinks.see(self.functional.positions(x), self.base)  # where no objective was asked for
             self.unknowns.to_nodes(x, self.base)
             self.projected = self.projected and snes.its < (self.preset.projected or PROJECTED)
-            known = self.control.now.corrected and not self.projected  # the estimate has linearised at this very x
+            known = self.outcome.corrected and not self.projected  # the estimate has linearised at this very x
             self.jacobian.linearise(
                 self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
             )
@@ -368,24 +364,24 @@ class Stepper:
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
         """Whether SNES is done (its convergence test): by the error of its iterate, or by the budget."""
-        reasons, control = PETSc.SNES.ConvergedReason, self.control
-        iterate = self._iterate(snes)
+        reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
         if its > 0 or not self.has_npc:  # else known since _is_solved
-            control.judge(iterate)
+            self.outcome = self.control.judge(iterate, self.outcome)
+        outcome = self.outcome
         if self.ksp.reason == INDEFINITE:
-            control.now.alarm = max(control.now.alarm, Alarm.ON_THE_WAY)
+            self.outcome = outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
         if self.observer:
             self.observer(iterate.q)
-        if not np.isfinite(control.now.residual):
+        if not np.isfinite(outcome.residual):
             return NOT_FINITE
-        if control.is_enough:
-            if control.now.at_rounding:
+        if outcome.is_enough:
+            if outcome.at_rounding:
                 return reasons.CONVERGED_FNORM_ABS
-            return reasons.CONVERGED_SNORM_RELATIVE if control.now.corrected else reasons.CONVERGED_FNORM_RELATIVE
+            return reasons.CONVERGED_SNORM_RELATIVE if outcome.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
-            control.estimate_last(iterate)
+            self.outcome = self.control.estimate_last(iterate, outcome)
             return reasons.CONVERGED_ITS
         self._adapt()
         return reasons.ITERATING
@@ -400,7 +396,7 @@ class Stepper:
     def _adapt(self) -> None:
         """Let the next linear solve leave what the step can do with; a tolerance of the user's own is left alone."""
         if self.preset.inexact and self.options.is_default("ksp_rtol"):
-            self.ksp.setTolerances(rtol=self.control.relative_tolerance())
+            self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
 
     def _abandon(self) -> None:
         """After an error within PETSc its objects may be in the middle of something, and crash when they are

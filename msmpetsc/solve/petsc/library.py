@@ -1,7 +1,6 @@
 """PETSc's C functions that petsc4py lacks."""
 
 import ctypes
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -36,13 +35,6 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
     return pointer
 
 
-def library_file() -> str:
-    """Path of PETSc's C library, as the loader has it (dladdr)."""
-    info, address = _DlInfo(), ctypes.cast(petsc_library().PetscInitialize, ctypes.c_void_p)
-    is_known = ctypes.CDLL(None).dladdr(address, ctypes.byref(info))
-    return os.fsdecode(info.file) if is_known and info.file else PETSc.__file__
-
-
 def open_viewer(option: str) -> None:
     """Open and close the viewer that an option of the user's names (PetscOptionsGetViewer) (collective).
 
@@ -56,12 +48,6 @@ def open_viewer(option: str) -> None:
     error = create(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))
     if error:
         raise PETSc.Error(error)
-
-
-class _DlInfo(ctypes.Structure):
-    _fields_ = [
-        ("file", ctypes.c_char_p), ("base", ctypes.c_void_p), ("symbol", ctypes.c_char_p), ("address", ctypes.c_void_p)
-    ]  # fmt: skip
 
 
 def preallocate_coo(matrix: PETSc.Mat, rows: np.ndarray, columns: np.ndarray) -> None:

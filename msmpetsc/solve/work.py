@@ -1,0 +1,44 @@
+"""Work that steps took: what a clock would measure, where clocks do not agree."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Work:
+    """Work of one step, of the steps of a frame, or of any others; the sum of two is the work of both.
+
+    step_error : the greatest estimated relative error of the steps, which does not add up
+    iterations : of SNES; substeps of an explicit integrator
+    ksp_its    : KSP iterations of all of them, and of what examines their results
+    products   : with the Hessian, those at multigrid's finest level included
+    steps      : that stand
+    substeps   : shorter steps taken in place of one that failed
+    fallbacks  : steps solved by the robust method
+    wall_time  : [s]
+    """
+
+    step_error: float = 0.0
+    iterations: int = 0
+    ksp_its: int = 0
+    products: int = 0
+    steps: int = 0
+    substeps: int = 0
+    fallbacks: int = 0
+    wall_time: float = 0.0
+
+    def __add__(self, other: "Work") -> "Work":
+        error = max(self.step_error, other.step_error)
+        return Work(error, *(getattr(self, name) + getattr(other, name) for name in COUNTED))
+
+    def __sub__(self, before: "Work") -> "Work":
+        """What was done since, but for the error, which is of now."""
+        return Work(self.step_error, *(getattr(self, name) - getattr(before, name) for name in COUNTED))
+
+    @property
+    def is_of_recovery(self) -> bool:
+        """Whether a step was taken another way than first tried."""
+        return self.substeps + self.fallbacks > 0
+
+
+NO_WORK = Work()
+COUNTED = [name for name in vars(NO_WORK) if name != "step_error"]  # what adds up

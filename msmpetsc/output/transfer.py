@@ -102,7 +102,7 @@ def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
     return [dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts]
 
 
-def write_bytes(file: int, rows: np.ndarray, start: int, chunk: int, offsets: Sequence[int]) -> None:
+def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:
     """Write rows (n, ...), contiguous, to their bytes in a file. Raises OSError.
 
     start   : number of the first of them in its dataset

@@ -374,7 +374,7 @@ class ResultFile:
         with self._together():
             gather_rows(self._comm, rows, counts, store)
 
-    def _write_directly(self, descriptor: int, rows: np.ndarray, counts: Sequence[int], name: str, index: int) -> None:
+    def _write_directly(self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int) -> None:
         chunk, offsets = 0, []
         with self._together():
             if self._file is not None:

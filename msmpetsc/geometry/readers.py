@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import lzma
 import re
 import struct
 import warnings
@@ -11,7 +12,9 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import BytesIO, StringIO
 from logging import CRITICAL, getLogger
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import trimesh
@@ -25,6 +28,7 @@ from msmpetsc.scene.reading import lies_below
 Arrays = tuple[Array, Array]  # points (v, 3), faces (f, 3 or 4)
 
 MOST_PACKED, LEAST_LIMIT = 100, 2**26  # a compressed mesh may grow so many times, or to so many bytes
+MOST_INSTANCED, LEAST_ROWS = 10, 2**20  # the rows of a glTF: so many times its bytes, or so many
 # of VTK: flat, or of hexahedra
 GRIDS = re.compile(rb"STRUCTURED_POINTS|(?<!UN)STRUCTURED_GRID|RECTILINEAR_GRID", re.IGNORECASE)
 
@@ -132,10 +136,27 @@ def _refuse_claims(kind: str, data: bytes) -> None:
         raise ValueError("it holds a grid of points, not a surface")
     if kind == "vtu" and b"\0" in data[:4]:
         raise ValueError("it is not UTF-8 text")
+    if kind == "vtu" and data.count(b"offset") * len(data) > max(LEAST_LIMIT, MOST_PACKED * len(data)):
+        raise ValueError("too many of its arrays are appended: they may share their bytes")
+    if kind in ("gltf", "glb") and _instanced_rows(kind, data) > max(LEAST_ROWS, MOST_INSTANCED * len(data)):
+        raise ValueError("it repeats its meshes too often")
 
 
 def _gltf(kind: str, data: bytes) -> dict[str, Any]:
     return json.loads(data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+
+
+def _instanced_rows(kind: str, data: bytes) -> int:
+    """Return the rows of the points and corners of all meshes, wherever nodes put them."""
+    tree = _gltf(kind, data)
+    counts = [accessor["count"] for accessor in tree.get("accessors", [])]
+
+    def rows_of(part: dict[str, Any]) -> int:
+        points, corners = part["attributes"]["POSITION"], part.get("indices")
+        return counts[points] + (0 if corners is None else counts[corners])
+
+    rows = [sum(map(rows_of, mesh["primitives"])) for mesh in tree.get("meshes", [])]
+    return sum(rows) + sum(rows[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node)
 
 
 def _claimed_rows(kind: str, data: bytes) -> int:
@@ -202,6 +223,27 @@ class _FolderResolver(FilePathResolver):
         return self._read[name]
 
 
+class _Unpacker:
+    """In place of the modules zlib and lzma, where a reader unpacks blocks by them: all together to ``most`` bytes."""
+
+    def __init__(self, most: int):
+        self.left = most
+
+    def zlib(self, block: bytes) -> bytes:
+        """Unpack a block as zlib.decompress does."""
+        return self._counted(zlib.decompressobj().decompress(block, self.left + 1))
+
+    def lzma(self, block: bytes) -> bytes:
+        """Unpack a block as lzma.decompress does."""
+        return self._counted(lzma.LZMADecompressor(memlimit=LEAST_LIMIT).decompress(block, self.left + 1))
+
+    def _counted(self, content: bytes) -> bytes:
+        self.left -= len(content)
+        if self.left < 0:
+            raise ValueError(f"decompressed it is more than {MOST_PACKED} times as long")
+        return content
+
+
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
     kind = _kind(path)
     scene = trimesh.load_scene(
@@ -222,7 +264,10 @@ def _read_meshio(path: Path, data: bytes) -> Arrays:
     """Read the outer surface of the tetrahedra, or else triangles and quads, without unused points."""
     import meshio
 
-    mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
+    unpacker = _Unpacker(max(LEAST_LIMIT, MOST_PACKED * len(data)))
+    packers = {name: SimpleNamespace(decompress=getattr(unpacker, name)) for name in ("zlib", "lzma")}
+    with mock.patch.multiple(meshio.vtu._vtu, **packers):  # type: ignore[call-overload]  # typeshed takes no names
+        mesh = {"vtu": meshio.vtu, "vtk": meshio.vtk}[_kind(path)].read(path)
     cells = mesh.cells_dict
     if "tetra" in cells:
         triangles = _outer_triangles(mesh.points, cells["tetra"])

@@ -136,7 +136,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     anchors = _anchors(scene, lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
-    reaches = reach_of(comm, scene, lattice, anchors, masks)
+    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
     return Model(

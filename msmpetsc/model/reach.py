@@ -1,4 +1,4 @@
-"""The nodes that pins, anchors and forces of a scene reach, and which of them do nothing or not what they say.
+"""The nodes that pins, anchors, forces and parts of a scene reach, and which of them do nothing or not what they say.
 
 What could not have any effect at all is refused; what is overruled in part is warned of.
 """
@@ -16,9 +16,10 @@ from msmpetsc.backend.arrays import Mask, Positions
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.loads import Anchor
+from msmpetsc.model.loads import SAME, Anchor, within
 from msmpetsc.model.region import Finder
-from msmpetsc.scene.motion import Force
+from msmpetsc.scene.motion import Force, Time
+from msmpetsc.scene.obstacle import ObstacleTable
 from msmpetsc.scene.schema import Scene
 
 NODES = ("pin", "anchor", "force")  # tables whose regions mean nodes
@@ -50,7 +51,7 @@ def regions(scene: Scene, lattice: Lattice, finder: Finder, points: Positions) -
 
 
 def reach_of(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions, finder: Finder
 ) -> tuple[Reach, ...]:
     """Return the reach of pins, anchors and forces in this order; warn of what is overruled (collective).
 
@@ -83,6 +84,8 @@ def reach_of(
                 f"{table.key} moves nothing: of the {_nodes(reaches[-1].nodes)} in its region none is free while it "
                 "acts, pins and anchors hold all"
             )
+    _warn_of_idle_parts(comm, scene, lattice, anchors, finder)
+    _note_what_never_acts(scene)
     return tuple(reaches)
 
 
@@ -109,6 +112,53 @@ def _held_while(force: Force, pinned: Mask, anchors: list[Anchor]) -> Mask:
     until = math.inf if force.stop is None else force.stop
     lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
     return reduce(np.logical_or, lasting, pinned)
+
+
+def _warn_of_idle_parts(comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], finder: Finder) -> None:
+    """Warn of parts all of whose nodes are held for good, and of those that later parts have replaced (collective)."""
+    parts = list(scene.tables("part"))
+    if not parts:
+        return
+    own = lattice.local_cells[: lattice.cells_owned]
+    ijk = finder.cages.grids.nearest_nodes(lattice.nodes[own[:, 0]], lattice.body[own[:, 0]])
+    held = reduce(np.logical_or, (a.where for a in anchors if a.stop is None), lattice.pinned)
+    free = ~held[own].all(axis=1)
+    replaced = {name: np.zeros(len(own), bool) for name in ("density", "young_modulus", "stiffness")}
+    for part in reversed(parts):
+        where = finder.find_cells(part, ijk)
+        given = [name for name in replaced if getattr(part.table, name) is not None]
+        counts = where, where & ~np.all([replaced[name] for name in given], axis=0), where & free
+        cells, kept, moving = comm.allreduce(np.array([mask.sum() for mask in counts]))
+        if kept == 0:
+            log.warning("%s has no effect: later parts give all that it gives, on all its %d cells", part.key, cells)
+        elif moving == 0:
+            log.warning("%s has no effect: pins and anchors hold all nodes of its %d cells", part.key, cells)
+        for name in given:
+            replaced[name] |= where
+
+
+def _note_what_never_acts(scene: Scene) -> None:
+    """Warn of forces and obstacles that are there at the end of no step."""
+    time = scene.time
+    forces = ((force.key, force.table) for force in scene.tables("force"))
+    obstacles = ((f"obstacle.{number}", obstacle) for number, obstacle in enumerate(scene.obstacle))
+    for key, table in chain(forces, obstacles):
+        if _acts_in_a_step(table, time):
+            continue
+        until = "on" if table.stop is None else f"to {table.stop:g} s"
+        text = f"{key} acts in no step: it is there from {table.start:g} s {until}"
+        if table.start > time.duration:  # as --frames has it, too
+            log.info("%s, and the run ends at %g s", text, time.duration)
+        else:
+            log.warning("%s, between the ends of steps of %g s", text, time.step)
+
+
+def _acts_in_a_step(table: Force | ObstacleTable, time: Time) -> bool:
+    """Return whether a table acts at the end of a step; or, where steps have substeps, at any time of the run."""
+    if time.integrator == "verlet":
+        return table.start < time.duration and (table.stop is None or table.stop > 0)
+    first = max(1, math.ceil(table.start / time.step * (1 - SAME)))
+    return first <= time.steps and within(first * time.step, table.start, table.stop)
 
 
 def _nodes(count: int) -> str:

@@ -3,11 +3,13 @@
 import base64
 import gzip
 import json
+import lzma
 import os
 import struct
 import sys
 import tempfile
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import meshio
@@ -232,9 +234,61 @@ def test_a_pipe_is_no_mesh(tmp_path):
     assert "is a pipe or a device" in refusal(lambda: read_surface(tmp_path / "x.ply"))
 
 
+def glb(instances: int, faces: int, parts: int = 1) -> bytes:
+    """One mesh, put in by so many nodes."""
+    points, corners = np.eye(3, dtype="<f4"), np.tile(np.arange(3, dtype="<u4"), faces)
+    binary = points.tobytes() + corners.tobytes()
+    part = {"attributes": {"POSITION": 0}, "indices": 1}
+    tree = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(instances))}],
+        "nodes": [{"mesh": 0}] * instances, "meshes": [{"primitives": [part] * parts}],
+        "buffers": [{"byteLength": len(binary)}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": points.nbytes},
+            {"buffer": 0, "byteOffset": points.nbytes, "byteLength": corners.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3, "min": [0, 0, 0], "max": [1, 1, 1]},
+            {"bufferView": 1, "componentType": 5125, "type": "SCALAR", "count": 3 * faces},
+        ],
+    }  # fmt: skip
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(binary))
+    return (
+        header + struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x4E4942) + binary
+    )
+
+
+def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:
+    """Zeros, packed a thousandfold."""
+    pack = {"ZLib": zlib.compress, "LZMA": lzma.compress}[compressor]
+    block = pack(bytes(12 * points), **({} if compressor == "LZMA" else {"level": 9}))
+    header = np.array([blocks, 12 * points, 12 * points, *[len(block)] * blocks], "<u4").tobytes()
+    numbers = base64.b64encode(header) + base64.b64encode(block * blocks)
+    return (
+        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" compressor="vtk%sDataCompressor">'
+        b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points>'
+        b'<DataArray type="Float32" Name="Points" '
+        b'NumberOfComponents="3" format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
+        % (compressor.encode(), points * blocks, numbers)
+    )
+
+
 def vtk(kind: str) -> bytes:
     header = f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET {kind}\nDIMENSIONS 330 330 330\n"
     return (header + "ORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 1\n").encode()
+
+
+def shared_vtu(arrays: int) -> bytes:
+    """Arrays that are all the same appended bytes."""
+    numbers = base64.b64encode(np.uint32(3 * 10**5).tobytes() + bytes(3 * 10**5))
+    array = b'<DataArray type="Float32" Name="x" format="appended" offset="0"/>'
+    return (
+        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>'
+        b'<Piece NumberOfPoints="0" NumberOfCells="0"><PointData>%s</PointData></Piece></UnstructuredGrid>'
+        b'<AppendedData encoding="base64">_%s</AppendedData></VTKFile>' % (array * arrays, numbers)
+    )
 
 
 CLAIMS = {
@@ -242,6 +296,12 @@ CLAIMS = {
     "in other letters": ("vtk", vtk("structured_points"), "a grid of points"),
     "cells of a grid": ("vtk", vtk("STRUCTURED_GRID"), "a grid of points"),
     "axes of a grid": ("vtk", vtk("RECTILINEAR_GRID"), "a grid of points"),
+    "packed a thousandfold": ("vtu", vtu(10**7), "times as long"),
+    "in many blocks": ("vtu", vtu(10**5, blocks=1000), "times as long"),
+    "packed by lzma": ("vtu", vtu(10**7, compressor="LZMA"), "times as long"),
+    "shared bytes": ("vtu", shared_vtu(3000), "may share"),
+    "20,000 instances": ("glb", glb(20_000, 2000), "repeats its meshes"),
+    "a part again and again": ("glb", glb(1, 2000, 20_000), "repeats its meshes"),
 }
 
 
@@ -258,3 +318,12 @@ def test_memory_that_a_file_claims_is_refused_before_it_is_made(tmp_path, name):
     finally:
         tracemalloc.stop()
     assert words in said and most < 3e8
+
+
+def test_what_is_instanced_or_packed_as_people_do_it_is_read(tmp_path):
+    (tmp_path / "x.glb").write_bytes(glb(100, 20))
+    assert len(read_surface(tmp_path / "x.glb").triangles) == 2000
+    meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(tmp_path / "x.vtu", compression="zlib")
+    assert len(read_surface(tmp_path / "x.vtu").triangles) == 12
+    meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(tmp_path / "y.vtu", compression="lzma")
+    assert len(read_surface(tmp_path / "y.vtu").triangles) == 12

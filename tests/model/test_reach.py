@@ -108,6 +108,44 @@ def test_pins_may_overlap(tmp_path, heard):
     assert heard() == [] and [(r.nodes, r.held) for r in model.reaches] == [(45, 0), (15, 15)]
 
 
+def test_a_part_that_changes_nothing_is_warned_of(tmp_path, heard):
+    part = {"region": LEFT_CELLS, "density": 500.0}
+    build(tmp_path, part=[part], pin=[{"region": LEFT}])
+    assert heard() == []
+    build(tmp_path, part=[part], pin=[{"region": TWO_LAYERS}])
+    assert heard() == [("WARNING", "part.0 has no effect: pins and anchors hold all nodes of its 8 cells")]
+    stiffer = part | {"young_modulus": 1e6}
+    build(tmp_path, part=[part, {"region": LEFT_HALF, "density": 700.0}])
+    assert heard() == [("WARNING", "part.0 has no effect: later parts give all that it gives, on all its 8 cells")]
+    build(tmp_path, part=[stiffer, {"region": LEFT_HALF, "density": 700.0}])
+    assert heard() == []  # its stiffness counts
+    with pytest.raises(InputError, match=r"part.0.region holds the centre of no cell"):
+        build(tmp_path, part=[part | {"region": {"box": [[5, 5, 5], [6, 6, 6]]}}])
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "integrator", "line"),
+    [
+        (0.0, 0.005, "implicit-euler", ("WARNING", "from 0 s to 0.005 s, between the ends of steps of 0.01 s")),
+        (0.012, 0.018, "bdf2", ("WARNING", "from 0.012 s to 0.018 s, between the ends of steps of 0.01 s")),
+        (0.2, None, "implicit-euler", ("INFO", "from 0.2 s on, and the run ends at 0.1 s")),
+        (0.0, 0.005, "verlet", None),
+        (0.1, None, "implicit-euler", None),
+        (0.03, 0.035, "implicit-euler", None),
+    ],
+)
+def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator, line):
+    times = {"start": start} | ({"stop": stop} if stop else {})
+    ground = {"shape": "plane", "point": [0, 0, -1], "normal": [0, 0, 1]}
+    build(tmp_path, force=[force(RIGHT, **times)], obstacle=[ground | times], time=TIME | {"integrator": integrator})
+    wanted = (
+        [(line[0], f"{key} acts in no step: it is there {line[1]}") for key in ("force.0", "obstacle.0")]
+        if line
+        else []
+    )
+    assert heard() == wanted
+
+
 @pytest.mark.parametrize(
     ("side", "mesh", "words"),
     [
@@ -232,6 +270,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     tables = {
         "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
         "it leads none": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "anchor.1": {"region": LEFT, "path": ASIDE}},
+        "part.0 has no effect": {"part.0": {"region": LEFT_CELLS, "density": 500.0}, "pin.0.region": TWO_LAYERS},
     }
     commands = [
         ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]
@@ -240,7 +279,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     ]
     done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands))
     assert done.returncode == 0, done.stderr
-    for words, status, line in zip(tables, (2, 2), done.stdout.splitlines(), strict=True):
+    for words, status, line in zip(tables, (2, 2, 0), done.stdout.splitlines(), strict=True):
         answers = json.loads(line)
         assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
         assert answers[0][1].count(words) == 1

@@ -15,10 +15,10 @@ in their order. `times as fast` and what stands behind it is of the last method.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import lab
 
@@ -38,16 +38,14 @@ LARGE = "beam 1e6"
 SIDES = 1.0, 0.375, 0.375  # of a beam [m]
 
 
-@dataclass(frozen=True)
-class Method:
+class Method(NamedTuple):
     """A way to run a scene: words of `msmpetsc run`, and the number of ranks."""
 
     words: tuple[str, ...]
     ranks: int = 1
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """What one run measured: its numbers frame by frame, frame 0 left out, and what --measure says of it."""
 
     frames: dict[str, np.ndarray]

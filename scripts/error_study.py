@@ -160,8 +160,8 @@ def measured(seed: int, number: int) -> dict:
         if result.exists():  # of a run that failed, the steps before
             frames = run.frames("step_error", "true_error")
             steps = np.transpose([frames["step_error"], frames["true_error"]]).tolist()
-    ended = {"status": run.status, "said": run.failure, "steps": steps}
-    return {"number": number, "preset": solver.preset, "goal": solver.error, **ended}
+    row = {"number": number, "preset": solver.preset, "goal": solver.error, "status": run.status}
+    return row | {"said": run.failure, "steps": steps}
 
 
 def ratios_of(rows: list[dict]) -> np.ndarray:
@@ -186,11 +186,6 @@ def bad(row: dict) -> bool:
     return row["status"] not in ENDS.values() or bool((ratios_of([row]) < LEAST).any())
 
 
-def tell(row: dict) -> None:
-    steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
-    print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
-
-
 def main() -> int:
     options = lab.parser(__doc__)
     options.add_argument("--scenes", type=int, default=500)
@@ -211,7 +206,8 @@ def main() -> int:
     with ThreadPoolExecutor(args.at_once) as pool:
         rows = list(pool.map(partial(measured, args.seed), range(args.scenes)))
     for row in filter(bad, rows):
-        tell(row)
+        steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
+        print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
     if args.json:
         args.json.write_text(json.dumps(rows))
     names = sorted({row["preset"] for row in rows})

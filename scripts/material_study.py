@@ -65,11 +65,6 @@ def box(cells: tuple[int, int, int], cell_size: float) -> Lattice:
     return lattice_of(mesh, cell_size)
 
 
-def beam(across: int) -> Lattice:
-    """A square beam along x, WIDTH wide and BEAM widths long, so many cells across."""
-    return box((BEAM * across, across, across), WIDTH / across)
-
-
 def hessian(lattice: Lattice) -> csc_array:
     """Hessian of E at rest (3n, 3n) [N/m]: a block k d d^T a spring, d its direction."""
     a, b = lattice.springs.T
@@ -198,8 +193,8 @@ class Clamped:
 
 
 def lattice_beam(across: int) -> tuple[float, float]:
-    """Tip deflection [m] under its weight and first bending frequency [Hz] of the lattice, one end face held."""
-    clamped = Clamped(beam(across))
+    """Tip deflection [m] under its weight and first bending frequency [Hz] of the beam of so many cells across."""
+    clamped = Clamped(box((BEAM * across, across, across), WIDTH / across))
     return clamped.sag(BEAM * WIDTH), clamped.frequency()
 
 
@@ -216,7 +211,7 @@ def fem_sag(across: int, order: int = 1) -> float:
     return -u[basis.nodal_dofs[2, np.isclose(basis.mesh.p[0], BEAM * WIDTH)]].mean()
 
 
-# ---- steps of the product
+# ---- steps of the product: a compression wave in a bar, and free flight
 
 
 def steps(
@@ -230,9 +225,6 @@ def steps(
             yield q, before
     finally:
         stepper.destroy()
-
-
-# ---- a compression wave in a bar
 
 
 BAR, STATIONS = 120, (30, 80)  # its length and where it is watched [cells]; two cells wide, WIDTH
@@ -269,9 +261,6 @@ def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
         peak.append(times[at] + (times[1] - times[0]) * (low - high) / (low - 2 * top + high) / 2)
     of_centre, of_peak = np.diff(STATIONS) * CELL / np.diff([centre, peak])[:, 0] / SPEED - 1
     return of_centre, of_peak, v[:, 1].max() / v[:, 0].max()
-
-
-# ---- free flight
 
 
 SHAKE = 0.1  # of the runs whose momentum is shown [m/s]

@@ -3,7 +3,7 @@
 
 OUT (.npz) gets `position` (T, n, 3) [m], frame 0 among the T; `seconds` that the steps of each later frame took;
 `version` and `note`. Reading positions is not timed. Gravity points along -z. A program is a class that takes substeps
-(`advance`), gives `positions` (n, 3) [m], and says in `note` what a reader of its figures must know.
+(`advance`), gives `positions` (n, 3) [m], and may say in `note` what a reader of its figures must know.
 """
 
 import os
@@ -60,8 +60,6 @@ def color_groups(beam: Beam) -> list[np.ndarray]:
 
 class Newton:
     """NVIDIA's Newton on the CPU."""
-
-    note = ""
 
     def __init__(self, beam: Beam, time_step: float, iterations: int | None):
         """With VBD if a number of iterations is given, else semi-implicit."""
@@ -146,8 +144,6 @@ class MuJoCo:
 class PyPBD:
     """Position based dynamics with compliance; its gravity points along -y, so that axes are passed on as y, z, x."""
 
-    note = ""
-
     def __init__(self, beam: Beam, time_step: float, iterations: int):
         import pypbd
 
@@ -193,7 +189,7 @@ def play(peer: Any, substeps: int, frames: int) -> dict:
         peer.advance(substeps)
         seconds.append(perf_counter() - start)
         positions.append(peer.positions())
-    return {"position": positions, "seconds": seconds, "note": peer.note}
+    return {"position": positions, "seconds": seconds, "note": getattr(peer, "note", "")}
 
 
 def main() -> None:

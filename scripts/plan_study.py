@@ -10,9 +10,10 @@ substeps or a quarter of its step. Where no choice meets the error, the best one
 import json
 import subprocess
 import sys
+from argparse import Namespace
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import lab
 
@@ -38,8 +39,7 @@ STUDIES = {  # for each of ERRORS: the first frames, that are tried, and the cel
 }
 
 
-@dataclass(frozen=True)
-class Planned:
+class Planned(NamedTuple):
     """What the plan of a scene chose on its first frames.
 
     method : integrator, time_step [s], preset, step_error (None of verlet)
@@ -68,9 +68,8 @@ class Planned:
         """Yield cells and methods of finer runs that the limit allows; ``seconds``: that the choice took."""
         method = self.method
         if method["integrator"] != "verlet":  # whose substeps are as short as the cells ask
-            error = min(1e-3, method["step_error"])
-            method = {"integrator": "bdf2", "time_step": method["time_step"] / SHORTER, "preset": "newton"}
-            method |= {"step_error": error}
+            shorter = {"integrator": "bdf2", "time_step": method["time_step"] / SHORTER, "preset": "newton"}
+            method = shorter | {"step_error": min(1e-3, method["step_error"])}
         for times in FINER:
             growth = times * SHORTER if method["integrator"] == "bdf2" else times ** (4 / 3)
             if seconds * growth < limit:
@@ -121,13 +120,14 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
     }
 
 
-def rows(scenes: list[str], errors: list[float], cells: int | None, frames: int | None, limit: float) -> lab.Rows:
+def rows(args: Namespace) -> lab.Rows:
     """Yield the rows, as they are run."""
-    for target in errors:
+    for target in args.errors:
         number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
-        for scene in scenes:
+        for scene in args.scenes or STUDIES:
             tried, finest = (of_errors[number] for of_errors in STUDIES[scene])
-            yield row(scene, target, planned(scene, target, frames or tried, cells or finest), limit)
+            plan = planned(scene, target, args.frames or tried, args.cells or finest)
+            yield row(scene, target, plan, args.limit)
 
 
 def main() -> None:
@@ -141,7 +141,7 @@ def main() -> None:
     if unknown := set(args.scenes) - set(STUDIES):
         options.error(f"no such scene: {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
     with lab.page(args):
-        lab.table(rows(args.scenes or list(STUDIES), args.errors, args.cells, args.frames, args.limit))
+        lab.table(rows(args))
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def touching(scene: str, args: argparse.Namespace) -> lab.Row:
     points, triangles = model.collision.points, model.collision.surface.triangles
     with Result(run.path) as result:
         position, last = result.frames.position, len(result.frames.time[:]) - 1
-        counted = [position[int(i)] for i in np.linspace(0, last, COUNTED).round()]
+        counted = [position[index] for index in np.unique(np.linspace(0, last, COUNTED).round().astype(int))]
         met = sum(count_crossings(points(position[index]), triangles) for index in range(last + 1))
         drawn = sum(count_crossings(result.embedding @ q, model.surface.triangles) for q in counted)
         least, most = np.nanmin(result.frames.self_distance[:]), result.frames.self_contacts[:].max()

@@ -8,8 +8,6 @@ substeps or a quarter of its step. Where no choice meets the error, the best one
 """
 
 import json
-import subprocess
-import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +22,7 @@ from msmpetsc.study.distances import surface_error
 ERRORS, LIMIT = (0.1, 0.03, 0.01), 900.0  # [s] a finer run
 FINER = 32, 10  # times the cells
 SHORTER = 4  # times, of implicit steps
+NOT_MET = 3  # exit status of a plan that is there all the same
 STUDIES = {  # for each of ERRORS: the first frames, that are tried, and the cells of the plan's finest trial
     "armadillo_forehead": ((4, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": ((4, 2, 2), (1000, 4000, 8000)),
@@ -65,7 +64,7 @@ class Planned(NamedTuple):
         return lab.run(self.scene, path, ["--quiet"], changes, timeout=limit)
 
     def finer(self, seconds: float, limit: float) -> Iterator[tuple[int, dict]]:
-        """Yield cells and methods of finer runs that the limit allows; ``seconds``: that the choice took."""
+        """Yield cells and methods of finer runs that the limit allows; ``seconds``: of the steps of the choice."""
         method = self.method
         if method["integrator"] != "verlet":  # whose substeps are as short as the cells ask
             shorter = {"integrator": "bdf2", "time_step": method["time_step"] / SHORTER, "preset": "newton"}
@@ -79,12 +78,14 @@ class Planned(NamedTuple):
 def planned(scene: str, target: float, frames: int, cells: int) -> Planned | str:
     """Return what `msmpetsc plan` chooses; or why there is nothing."""
     words = ["--surface-error", target, "--frames", frames, "--cells", cells, "--json"]
-    command = [sys.executable, "-m", "msmpetsc", "plan", lab.SCENES / f"{scene}.toml", *words]
-    done = subprocess.run([*map(str, command)], stdout=subprocess.PIPE, text=True)
-    if not done.stdout:
-        return f"no plan: exit status {done.returncode}"
-    answer = json.loads(done.stdout)
-    return Planned(scene, frames, answer["choice"]["method"], answer["choice"]["cells"], answer)
+    log = lab.OUT / "plan_study" / "plan.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    ended = lab.python(["-m", "msmpetsc", "plan", lab.SCENES / f"{scene}.toml", *words], log)
+    answer = log.read_text().rpartition("\n{\n")[2]  # behind what was tried
+    if ended.status not in (0, NOT_MET):
+        return ended.reason
+    found = json.loads("{" + answer)
+    return Planned(scene, frames, found["choice"]["method"], found["choice"]["cells"], found)
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
@@ -93,7 +94,7 @@ def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
     if choice.failure:
         return None, f"the choice: {choice.failure}"
     why = "a finer run would take too long"
-    for cells, method in plan.finer(choice.seconds, limit):
+    for cells, method in plan.finer(choice.cost["time"]["stepping"], limit):
         finer = plan.run(method, cells, limit)
         if not finer.failure:
             return surface_error(choice.path, finer.path), f"from {cells:,} cells"

@@ -2,17 +2,16 @@
 """How a clamp that lies askew in the grid converges: a round bar tilted about two axes, under its weight.
 
 A half space clamps it, either its last radius, the plane going through cells, or its end face alone. What is compared
-is the work of the weight, to the limit of a bar along the grid, whose clamp is a plane of nodes; prints a table.
+is the work of the weight, to the limit of a bar along the grid, whose clamp is a plane of nodes.
 """
 
 import tempfile
 from pathlib import Path
 
-from clone import parser
+import lab
 
 import numpy as np
 import trimesh
-from material_study import slope, table
 from scipy.spatial.transform import Rotation
 
 import msmpetsc
@@ -20,6 +19,7 @@ import msmpetsc
 RADIUS, FREE = 0.05, 0.3  # of the bar, and its length beyond the clamp [m]
 TILT = Rotation.from_rotvec([0, 0, 0.35]) * Rotation.from_rotvec([0, 0.35, 0])
 SIZES = (4, 8, 16)  # cells a radius
+CLAMPS = {"plane through cells": 1.0, "end face": 0.0}  # held over so many radii
 
 
 def compliance(cells: int, tilt: Rotation, held: float) -> float:
@@ -54,12 +54,16 @@ def errors(sizes: tuple[int, ...], exact: float, held: float) -> np.ndarray:
 
 
 def main() -> None:
-    parser(__doc__).parse_args()
+    args = lab.parser(__doc__).parse_args()
     exact = limit(*SIZES[1:])
-    found = [errors(SIZES, exact, held) for held in (1.0, 0.0)]
-    rows = [(f"R/{cells}", *(f"{100 * e:+.2f}%" for e in row)) for cells, *row in zip(SIZES, *found, strict=True)]
-    orders = (f"{slope([1 / cells for cells in SIZES], np.abs(of_clamp)):.2f}" for of_clamp in found)
-    table(["cells", "plane through cells", "end face"], [*rows, ("order", *orders)])
+    found = {name: errors(SIZES, exact, held) for name, held in CLAMPS.items()}
+    names = [f"R/{cells}" for cells in SIZES]
+    with lab.page(args):
+        lab.table(
+            {"cells": of, **{name: lab.percent(found[name][k], 2) for name in CLAMPS}} for k, of in enumerate(names)
+        )
+        sizes = [1 / cells for cells in SIZES]
+        print("\nOrders:", ", ".join(f"{lab.slope(sizes, of):.2f} {name}" for name, of in found.items()))
 
 
 if __name__ == "__main__":

@@ -2,18 +2,12 @@
 
 import os
 import sys
-from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = ROOT / ".venv" / "bin" / "python"  # scripts/setup makes it
 NEEDED = ("numpy", "numba", "petsc4py", "mpi4py")  # what marks a Python that can run msmpetsc
-
-
-def parser(documentation: str | None) -> ArgumentParser:
-    """Return a parser of the command line that prints a script's documentation for --help."""
-    return ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
 
 
 def _use_own_python() -> None:

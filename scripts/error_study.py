@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Holds the error that steps say they have against their true one, on random hard scenes; prints a Markdown table.
+"""Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT.json] [--at-once 2]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT] [--at-once 2] [-o PAGE]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -16,31 +16,31 @@ fault.
 """
 
 import json
-import os
-import signal
 import sys
 import tempfile
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from types import FrameType
 
-from clone import parser
+import lab
 
 import numpy as np
+import tomli_w
+import trimesh
+
+from msmpetsc.scene.reading import load_scene
 
 LEAST = 1 / 3  # a smaller ratio is bad
 SECONDS = 300  # a scene may take so long
 NOTHING = 1e-9  # true errors below it cannot be told from 0
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
+ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}  # exit status; any other is a fault
+QUANTILES = 0, 0.05, 0.5
 Draw = np.random.Generator
 
 
 def draw_scene(seed: int, number: int, folder: Path) -> Path:
     """Write scene ``number`` of a seed and its mesh; the path of the scene."""
-    import tomli_w
-
     draw = np.random.default_rng([seed, number])
     sides = np.array(SIDES[draw.integers(len(SIDES))])
     scene: dict = {
@@ -72,8 +72,6 @@ def log_uniform(draw: Draw, low: float, high: float) -> float:
 
 
 def mesh_of(draw: Draw, sides: np.ndarray, path: Path) -> str:
-    import trimesh
-
     mesh = trimesh.creation.icosphere(2, 0.3) if sides[0] == 0.6 else trimesh.creation.box(sides)
     if draw.random() < 0.5:  # a body along the grid hides much
         mesh.apply_transform(trimesh.transformations.random_rotation_matrix(draw.random(3)))
@@ -87,7 +85,7 @@ def material_of(draw: Draw) -> dict:
 
 
 def solver_of(draw: Draw) -> dict:
-    from msmpetsc.solve.presets import PRESETS
+    from msmpetsc.solve.presets import PRESETS  # with PETSc, which runs must not find started when they are forked
 
     preset = str(draw.choice(list(PRESETS)))
     if draw.random() < 0.1:
@@ -99,7 +97,8 @@ def add_start(draw: Draw, scene: dict, _: np.ndarray) -> None:
     start = scene["start"] = {}
     kind = draw.integers(5)
     if kind == 0:
-        start["scale"] = squashed(draw, log_uniform(draw, 0.02, 0.9))
+        share, start["scale"] = log_uniform(draw, 0.02, 0.9), [1.0, 1.0, 1.0]
+        start["scale"][draw.integers(3)] = share
     elif kind == 1:
         start["scale"] = [float(s) for s in draw.uniform(0.3, 2.0, 3)]
     elif kind == 2:
@@ -112,12 +111,6 @@ def add_start(draw: Draw, scene: dict, _: np.ndarray) -> None:
         start["spin"] = [float(w) for w in draw.normal(0, 5, 3)]
     if draw.random() < 0.4:
         start["velocity"] = [float(v) for v in draw.normal(0, 3, 3)]
-
-
-def squashed(draw: Draw, share: float) -> list[float]:
-    scale = [1.0, 1.0, 1.0]
-    scale[draw.integers(3)] = share
-    return scale
 
 
 def add_pin(draw: Draw, scene: dict, _: np.ndarray) -> None:
@@ -159,112 +152,42 @@ def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
 
 
 def measured(seed: int, number: int) -> dict:
-    """What became of one scene: ``status``, its words, and a (said, true) pair of each step."""
+    """What became of one scene: ``status``, its words, and what each step said of its error beside the truth."""
     with tempfile.TemporaryDirectory() as folder:
-        return measured_in(draw_scene(seed, number, Path(folder)), number)
-
-
-def measured_in(path: Path, number: int) -> dict:
-    import logging
-
-    from mpi4py import MPI
-
-    from msmpetsc.errors import InputError, StepFailed
-    from msmpetsc.model.build import build_model
-    from msmpetsc.scene.reading import load_scene
-    from msmpetsc.solve.instrumentation import Probes
-    from msmpetsc.solve.simulate import Simulation
-
-    logging.disable(logging.WARNING)
-    scene, steps = load_scene(path), []
-    row = {"number": number, "preset": scene.solver.preset, "goal": scene.solver.error, "status": 0, "said": ""}
-    signal.signal(signal.SIGALRM, too_long)
-    signal.alarm(SECONDS)
-    try:
-        model = build_model(MPI.COMM_SELF, scene)
-        with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
-            for frame in simulation.frames():
-                if frame.index:
-                    steps.append([float(frame.step_error), float(frame.true_error), int(frame.ksp_its)])
-    except StepFailed as failure:
-        row |= {"status": 3, "said": str(failure)}
-    except InputError as error:
-        row |= {"status": 2, "said": str(error)}
-    except TimeoutError as late:
-        row |= {"status": 4, "said": str(late)}
-    except Exception as fault:  # whatever it is, it is a finding
-        row |= {"status": 1, "said": f"{type(fault).__name__}: {fault}"}
-    signal.alarm(0)
-    return row | {"steps": steps}
-
-
-def too_long(_: int, __: FrameType | None) -> None:
-    raise TimeoutError(f"took more than {SECONDS} s")
+        scene, result = draw_scene(seed, number, Path(folder)), Path(folder) / "run.h5"
+        run = lab.run(scene, result, ["--true-error", 1, "--quiet"], timeout=SECONDS, warm=True)
+        solver, steps = load_scene(scene).solver, []
+        if result.exists():  # of a run that failed, the steps before
+            frames = run.frames("step_error", "true_error")
+            steps = np.transpose([frames["step_error"], frames["true_error"]]).tolist()
+    row = {"number": number, "preset": solver.preset, "goal": solver.error, "status": run.status}
+    return row | {"said": run.failure, "steps": steps}
 
 
 def ratios_of(rows: list[dict]) -> np.ndarray:
     """Said over true, of the steps whose truth is known and more than nothing."""
-    pairs = np.array([step[:2] for row in rows for step in row["steps"]]).reshape(-1, 2)
+    pairs = np.array([step for row in rows for step in row["steps"]]).reshape(-1, 2)
     known = pairs[np.isfinite(pairs[:, 1]) & (pairs[:, 1] > NOTHING)]
     return known[:, 0] / known[:, 1]
 
 
-def table_row(name: str, rows: list[dict]) -> list[str]:
-    statuses = [row["status"] for row in rows]
-    counts = [str(statuses.count(status)) for status in (0, 3, 2, 4, 1)]
-    ratios = ratios_of(rows)
-    if not len(ratios):
-        return [name, *counts, "0", "", "", "", ""]
+def row_of(name: str, rows: list[dict]) -> lab.Row:
+    """Return the row of a preset: how its scenes ended, and said over true."""
+    statuses, ratios = [row["status"] for row in rows], ratios_of(rows)
+    found: dict[str, object] = {"preset": name} | {word: statuses.count(status) for word, status in ENDS.items()}
+    found["faults"] = len(rows) - sum(statuses.count(status) for status in ENDS.values())
     within = ratios[np.isfinite(ratios)]
-    shares = [f"{value:.2g}" for value in np.quantile(within, [0, 0.05, 0.5])] if len(within) else [""] * 3
-    return [name, *counts, str(len(ratios)), *shares, str(int((ratios < LEAST).sum()))]
-
-
-COLUMNS = (
-    "preset",
-    "done",
-    "stopped",
-    "refused",
-    "cut off",
-    "faults",
-    "steps",
-    "least ratio",
-    "5%",
-    "median",
-    "below 1/3",
-)
-
-
-def print_table(rows: list[dict]) -> None:
-    names = sorted({row["preset"] for row in rows})
-    lines = [table_row(name, [row for row in rows if row["preset"] == name]) for name in names]
-    for cells in (COLUMNS, ["---"] * len(COLUMNS), *lines, table_row("all", rows)):
-        print("|", " | ".join(cells), "|")
+    lowest = [f"{share:.2g}" for share in np.quantile(within, QUANTILES)] if len(within) else ["", "", ""]
+    found |= {"steps": len(ratios)} | dict(zip(("least ratio", "5%", "median"), lowest, strict=True))
+    return found | {"below 1/3": int((ratios < LEAST).sum())}
 
 
 def bad(row: dict) -> bool:
-    return row["status"] == 1 or bool((ratios_of([row]) < LEAST).any())
-
-
-def run_all(numbers: range, seed: int, at_once: int, each: Callable[[dict], None]) -> list[dict]:
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    with ProcessPoolExecutor(at_once, get_context("spawn")) as pool:
-        rows = []
-        for future in [pool.submit(measured, seed, number) for number in numbers]:
-            rows.append(future.result())
-            each(rows[-1])
-    return rows
-
-
-def tell(row: dict) -> None:
-    if bad(row):
-        steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true, _ in row["steps"])
-        print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
+    return row["status"] not in ENDS.values() or bool((ratios_of([row]) < LEAST).any())
 
 
 def main() -> int:
-    options = parser(__doc__)
+    options = lab.parser(__doc__)
     options.add_argument("--scenes", type=int, default=500)
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", type=int)
@@ -280,10 +203,17 @@ def main() -> int:
         row = measured(args.seed, args.only)
         print(json.dumps(row, indent=1))
         return int(bad(row))
-    rows = run_all(range(args.scenes), args.seed, args.at_once, tell)
+    with ThreadPoolExecutor(args.at_once) as pool:
+        rows = list(pool.map(partial(measured, args.seed), range(args.scenes)))
+    for row in filter(bad, rows):
+        steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
+        print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)
     if args.json:
         args.json.write_text(json.dumps(rows))
-    print_table(rows)
+    names = sorted({row["preset"] for row in rows})
+    of_presets = [row_of(name, [row for row in rows if row["preset"] == name]) for name in names]
+    with lab.page(args):
+        lab.table([*of_presets, row_of("all", rows)])
     return int(any(map(bad, rows)))
 
 

@@ -1,23 +1,31 @@
 #!/usr/bin/env python3
-"""Checks the calibrated lattice against elasticity and prints Markdown tables. Needs scikit-fem.
+"""The calibrated lattice against elasticity. Needs scikit-fem.
 
-Static problems and eigenfrequencies use the Hessian of E at rest, assembled here on its own from the list of
-springs; the wave and the free flight use the product's own steps. All errors are relative.
+    scripts/material_study.py [strain beam wave flight round turned ball] [-o PAGE]
+
+Of boxes that lie along the grid: uniform strain, a clamped beam beside scikit-fem's, a wave, free flight. Of bodies
+that do not, whole boundary cells beside those by their fill: clamped bars, round and turned, and the frequency of a
+ball; of bars the mean over places of the grid, and in brackets how far these are apart. Static problems and
+eigenfrequencies use the Hessian of E at rest, assembled here on its own from the list of springs; the wave and the free
+flight use the product's own steps. All errors are relative.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
-from clone import parser
+import lab
+from lab import percent, slope
 
 import numpy as np
 import skfem
 import trimesh
 from mpi4py import MPI
-from scipy.linalg import eigh, expm
+from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.sparse import coo_array, csc_array, diags
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from scipy.spatial.transform import Rotation
+from scipy.special import spherical_jn
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from msmpetsc.geometry.cages import Body, fill
@@ -29,33 +37,40 @@ from msmpetsc.solve.presets import find_preset
 
 E, NU, DENSITY, GRAVITY = 1e6, 1 / 4, 1000.0, 9.81  # [Pa], [-], [kg/m^3], [m/s^2]
 C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E  # [Pa]
+SHEAR = E / (2 * (1 + NU))  # [Pa]
+KAPPA_SQUARE, KAPPA_ROUND = 10 * (1 + NU) / (12 + 11 * NU), 6 * (1 + NU) / (7 + 6 * NU)  # Cowper (1966)
 WIDTH, BEAM = 0.1, 10  # of the beam [m], and its length in widths
 ACROSS = (2, 4, 6, 8)  # cells across the beam
+LENGTH, RADIUS = 0.5, 0.05  # of bars that do not lie along the grid, and of the ball [m]
+OFFSETS = ((0.0, 0.0), (0.3, 0.7), (0.5, 0.5))  # of the grid across the bar [cells]
+BOUNDARIES = ("whole", "fill")
 COMM = MPI.COMM_SELF
 
 
-# ---- the lattice of a box, its Hessian at rest
+# ---- lattices, and the Hessian at rest
+
+
+def lattice_of(mesh: trimesh.Trimesh, h: float, boundary: str = "fill", offset: Iterable[float] = (0, 0, 0)) -> Lattice:
+    """The calibrated lattice of a mesh in a grid that begins ``offset`` (3,) cells before it."""
+    surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
+    cages = fill([Body(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
+    return build_lattice(cages, DENSITY, young_modulus=E)
 
 
 def box(cells: tuple[int, int, int], cell_size: float) -> Lattice:
-    """The calibrated lattice of a box filled with exactly these cells, its low corner at the origin."""
+    """The lattice of a box filled with exactly these cells, its low corner at the origin."""
     mesh = trimesh.creation.box(np.ones(3))
-    surface = Surface((mesh.vertices + 0.5) * cells * cell_size, np.array(mesh.faces))
-    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return build_lattice(fill([Body(COMM, surface, examine(surface), bounds)], cell_size), DENSITY, young_modulus=E)
+    mesh.vertices = (mesh.vertices + 0.5) * cells * cell_size
+    return lattice_of(mesh, cell_size)
 
 
-def beam(across: int) -> Lattice:
-    """A square beam along x, WIDTH wide and BEAM widths long, so many cells across."""
-    return box((BEAM * across, across, across), WIDTH / across)
-
-
-def hessian(lattice: Lattice, share: np.ndarray | float = 1.0) -> csc_array:
-    """Hessian of E at rest (3n, 3n) [N/m]: a block k d d^T a spring, d its direction; ``share`` (s,) of each."""
+def hessian(lattice: Lattice) -> csc_array:
+    """Hessian of E at rest (3n, 3n) [N/m]: a block k d d^T a spring, d its direction."""
     a, b = lattice.springs.T
     d = (lattice.nodes[a] - lattice.nodes[b]) / lattice.rest_length[:, None]
     along = np.concatenate([d, -d], axis=1)
-    blocks = (share * lattice.stiffness)[:, None, None] * along[:, :, None] * along[:, None, :]
+    blocks = lattice.stiffness[:, None, None] * along[:, :, None] * along[:, None, :]
     rows = np.concatenate([3 * a[:, None] + np.arange(3), 3 * b[:, None] + np.arange(3)], axis=1)
     places = [index.ravel() for index in np.broadcast_arrays(rows[:, :, None], rows[:, None, :])]
     return coo_array((blocks.ravel(), places), shape=2 * (lattice.nodes.size,)).tocsc()
@@ -69,22 +84,10 @@ def factorise(K: csc_array) -> Callable[[np.ndarray], np.ndarray]:
 # ---- uniform strain
 
 
-def inner_nodes(lattice: Lattice) -> np.ndarray:
-    """(n,) bool: nodes within eight cells."""
-    return np.bincount(lattice.springs.ravel()) == 26
-
-
-def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray, inner: bool = False) -> float:
-    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3, 3).
-
-    inner : of the inner nodes alone, each with half of its springs and a cell's volume
-    """
-    share, volume = 1.0, lattice.mass.sum() / DENSITY
-    if inner:
-        nodes = inner_nodes(lattice)
-        share, volume = nodes[lattice.springs].sum(axis=1) / 2, nodes.sum() * lattice.cell_size**3
+def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> float:
+    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3, 3)."""
     u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
-    return u @ (hessian(lattice, share) @ v) / volume
+    return u @ (hessian(lattice) @ v) * DENSITY / lattice.mass.sum()
 
 
 def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
@@ -101,32 +104,43 @@ def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
         yield f"C44 along {name}", np.outer(d, across), np.outer(d, across), C44
 
 
-# ---- a clamped beam: Timoshenko's, the lattice, and scikit-fem's
+# ---- Timoshenko's beams
 
 
-def beam_section(across: float = np.inf) -> tuple[float, float, float, float]:
-    """E I [N m^2], kappa G A [N], rho A [kg/m], rho I [kg m] of the beam; kappa by Cowper (1966).
+class Section(NamedTuple):
+    """E I [N m^2], kappa G A [N], rho A [kg/m], rho I [kg m] of a beam."""
+
+    EI: float
+    kGA: float
+    line_mass: float
+    line_inertia: float
+
+
+def section(area: float, second_moment: float, kappa: float) -> Section:
+    return Section(E * second_moment, kappa * SHEAR * area, DENSITY * area, DENSITY * second_moment)
+
+
+def beam_section(across: float = np.inf) -> Section:
+    """The square beam's section.
 
     across : for the lattice so many cells across. A cell cannot curve between its corners: their displacements
              u_x = c x z, u_y = -nu c y z stretch edges and face diagonals (k1 : k2 = 40 : 16) by energies that add
              up to 103/560 E c^2 h^2 / 2 a volume where bending has 1/12, so E I grows by 1 + 169/140 (h/b)^2.
              And its masses sit at corners: rho I grows by 1 + 2 (h/b)^2.
     """
-    A, second_moment, ratio = WIDTH**2, WIDTH**4 / 12, 1 / across**2
-    kappa, G = 10 * (1 + NU) / (12 + 11 * NU), E / (2 * (1 + NU))
-    return (
-        E * second_moment * (1 + 169 / 140 * ratio),
-        kappa * G * A,
-        DENSITY * A,
-        DENSITY * second_moment * (1 + 2 * ratio),
-    )
+    solid, ratio = section(WIDTH**2, WIDTH**4 / 12, KAPPA_SQUARE), 1 / across**2
+    return solid._replace(EI=solid.EI * (1 + 169 / 140 * ratio), line_inertia=solid.line_inertia * (1 + 2 * ratio))
+
+
+def tip_sag(of: Section, length: float) -> float:
+    """Tip deflection [m] of a beam clamped at one end, under its weight: w L^4 / (8 E I) + w L^2 / (2 kappa G A)."""
+    w = of.line_mass * GRAVITY
+    return w * length**4 / (8 * of.EI) + w * length**2 / (2 * of.kGA)
 
 
 def timoshenko_sag(across: float = np.inf) -> float:
-    """Tip deflection [m] of the beam clamped at one end, under its weight: w L^4 / (8 E I) + w L^2 / (2 kappa G A)."""
-    EI, kGA, line_mass, _ = beam_section(across)
-    w, L = line_mass * GRAVITY, BEAM * WIDTH
-    return w * L**4 / (8 * EI) + w * L**2 / (2 * kGA)
+    """Tip deflection [m] of the beam clamped at one end, under its weight."""
+    return tip_sag(beam_section(across), BEAM * WIDTH)
 
 
 def timoshenko_frequency(across: float = np.inf) -> float:
@@ -135,33 +149,53 @@ def timoshenko_frequency(across: float = np.inf) -> float:
     (w, phi, M, V)' = B (w, phi, M, V) along x; w = phi = 0 at the clamp, and M = V = 0 at the free end: the block
     of exp(B L) that takes M, V there from those at the clamp is singular.
     """
-    EI, kGA, line_mass, line_inertia = beam_section(across)
+    of, length = beam_section(across), BEAM * WIDTH
 
     def end(omega: float) -> float:
         B = np.zeros((4, 4))
-        B[0, 1], B[0, 3], B[1, 2] = 1, 1 / kGA, 1 / EI
-        B[2, 1], B[2, 3], B[3, 0] = -line_inertia * omega**2, -1, -line_mass * omega**2
-        return np.linalg.det(expm(B * BEAM * WIDTH)[2:, 2:])
+        B[0, 1], B[0, 3], B[1, 2] = 1, 1 / of.kGA, 1 / of.EI
+        B[2, 1], B[2, 3], B[3, 0] = -of.line_inertia * omega**2, -1, -of.line_mass * omega**2
+        return np.linalg.det(expm(B * length)[2:, 2:])
 
-    slender = 1.8751**2 * np.sqrt(EI / line_mass) / (BEAM * WIDTH) ** 2  # Euler-Bernoulli's [rad/s], a little higher
+    slender = 1.8751**2 * np.sqrt(of.EI / of.line_mass) / length**2  # Euler-Bernoulli's [rad/s], a little higher
     return brentq(end, 0.5 * slender, 1.1 * slender, xtol=1e-12 * slender) / (2 * np.pi)
 
 
-def lattice_beam(across: int) -> tuple[float, float]:
-    """Tip deflection [m] under its weight and first bending frequency [Hz] of the lattice, one end face held.
+ROUND_SAG = tip_sag(section(np.pi * RADIUS**2, np.pi * RADIUS**4 / 4, KAPPA_ROUND), LENGTH)
+SQUARE_SAG = tip_sag(beam_section(), LENGTH)
 
-    Both linear, as Timoshenko's: how large the deflection is does not matter.
-    """
-    lattice = beam(across)
-    K, mass, x = hessian(lattice), np.repeat(lattice.mass, 3), np.repeat(lattice.nodes[:, 0], 3)
-    vertical, free = np.tile([False, False, True], len(lattice.nodes)), ~np.isclose(x, 0)
-    K, M, u = K[free][:, free], diags(mass[free]), np.zeros(len(free))
-    inverse = factorise(K)
-    u[free] = inverse(-(GRAVITY * mass * vertical)[free])
-    # bending along y and along z are one double eigenvalue; a start that is given keeps the figures the same
-    modes = {"OPinv": LinearOperator(K.shape, inverse), "v0": np.ones(K.shape[0]), "return_eigenvectors": False}
-    squares = eigsh(K, k=2, M=M, sigma=0, **modes)
-    return -u[vertical & np.isclose(x, BEAM * WIDTH)].mean(), np.sqrt(squares.min()) / (2 * np.pi)
+
+# ---- a clamped beam, of the lattice and of scikit-fem
+
+
+class Clamped:
+    """A lattice whose nodes at x = 0 are held: the Hessian (f, f) of the others and its inverse."""
+
+    def __init__(self, lattice: Lattice):
+        self.lattice, self.free = lattice, np.repeat(~np.isclose(lattice.nodes[:, 0], 0), 3)
+        self.K = hessian(lattice)[self.free][:, self.free]
+        self.inverse = factorise(self.K)
+
+    def sag(self, length: float) -> float:
+        """Mean tip deflection [m] under the weight; linear, so that it does not matter how large it is."""
+        weight, u = np.zeros_like(self.lattice.nodes), np.zeros(self.lattice.nodes.size)
+        weight[:, 2] = -GRAVITY * self.lattice.mass
+        u[self.free] = self.inverse(weight.ravel()[self.free])
+        return -u.reshape(-1, 3)[np.isclose(self.lattice.nodes[:, 0], length), 2].mean()
+
+    def frequency(self) -> float:
+        """First bending frequency [Hz]."""
+        # bending along y and along z are one double eigenvalue; a start that is given keeps the figures the same
+        modes = {"OPinv": LinearOperator(self.K.shape, self.inverse), "v0": np.ones(self.K.shape[0])}
+        M = diags(np.repeat(self.lattice.mass, 3)[self.free])
+        squares = eigsh(self.K, k=2, M=M, sigma=0, return_eigenvectors=False, **modes)
+        return np.sqrt(squares.min()) / (2 * np.pi)
+
+
+def lattice_beam(across: int) -> tuple[float, float]:
+    """Tip deflection [m] under its weight and first bending frequency [Hz] of the beam of so many cells across."""
+    clamped = Clamped(box((BEAM * across, across, across), WIDTH / across))
+    return clamped.sag(BEAM * WIDTH), clamped.frequency()
 
 
 def fem_sag(across: int, order: int = 1) -> float:
@@ -177,29 +211,20 @@ def fem_sag(across: int, order: int = 1) -> float:
     return -u[basis.nodal_dofs[2, np.isclose(basis.mesh.p[0], BEAM * WIDTH)]].mean()
 
 
-# ---- steps of the product
+# ---- steps of the product: a compression wave in a bar, and free flight
 
 
 def steps(
-    lattice: Lattice,
-    t: float,
-    q: np.ndarray,
-    before: np.ndarray,
-    loads: Iterable[np.ndarray],
-    error: float,
-    preset: str = "newton",
+    lattice: Lattice, t: float, q: np.ndarray, before: np.ndarray, loads: Iterable[np.ndarray], error: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """q_(n+1) and q_n, one pair for each of the loads (n, 3) [N]; from q_n and q_(n-1)."""
-    stepper = Stepper(COMM, lattice, t, find_preset(preset), error=error)
+    stepper = Stepper(COMM, lattice, t, find_preset("newton"), error=error)
     try:
         for load in loads:
             q, before = stepper.step(StepProblem(q, 2 * q - before, load)).position, q
             yield q, before
     finally:
         stepper.destroy()
-
-
-# ---- a compression wave in a bar
 
 
 BAR, STATIONS = 120, (30, 80)  # its length and where it is watched [cells]; two cells wide, WIDTH
@@ -238,49 +263,10 @@ def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
     return of_centre, of_peak, v[:, 1].max() / v[:, 0].max()
 
 
-def dispersion(across: int = 2, phase: float = 0.05) -> float:
-    """beta [m^2] in omega = c k (1 - beta k^2) of the compression wave of a lattice bar, WIDTH wide.
-
-    From the Hessian's blocks between one section and its neighbours: K(k) = sum_j K_j exp(i j k h); ``phase`` k h.
-    """
-    h = WIDTH / across
-    lattice = box((4, across, across), h)
-    order = np.lexsort(lattice.nodes.T[::-1])  # section by section
-    unknowns = (3 * order[:, None] + np.arange(3)).reshape(5, -1)
-    rows = hessian(lattice)[unknowns[2]]
-    K = sum(rows[:, unknowns[2 + j]].toarray() * np.exp(1j * j * phase) for j in (-1, 0, 1))
-    mass = np.repeat(lattice.mass, 3)[unknowns[2]]
-    squares, modes = eigh(K, np.diag(mass))
-    axial = np.abs((mass.reshape(-1, 3) * [1, 0, 0]).ravel() @ modes).argmax()
-    return (1 - np.sqrt(squares[axial]) * h / (SPEED * phase)) * (h / phase) ** 2
-
-
-def predicted_peak(courant: float) -> tuple[float, float, float]:
-    """What of the peak's error the bar itself, its cells and implicit Euler cause, by linear theory.
-
-    The bar has beta = nu^2 r^2 / 2 by its motion across (Rayleigh), r^2 = b^2 / 6 its polar radius squared; the cells
-    add what the lattice has more. Implicit Euler puts (1 - exp(-i omega t)) / t in the place of i omega. So on its way
-    x the pulse's third cumulant in time grows by (t^2 - 6 beta / c^2) x / c and the second by t x / c; the first, its
-    centre, takes x / c whatever t and beta are. The peak of a Gaussian that has become a little skew leads its
-    centre by half the third over the second.
-    """
-    t = courant * CELL / SPEED
-    bar = NU**2 / 2 * WIDTH**2 / 6
-    thirds = np.array([-6 * bar, -6 * (dispersion() - bar), (SPEED * t) ** 2]) / SPEED**2
-    travel = np.array(STATIONS) * CELL / SPEED
-    first, second = (thirds * x / (2 * (PULSE**2 + t * x)) for x in travel)
-    return tuple((second - first) / np.diff(travel))
-
-
-# ---- free flight
-
-
 SHAKE = 0.1  # of the runs whose momentum is shown [m/s]
 
 
-def free_flight(
-    time_step: float, shake: float = 0.0, preset: str = "newton", error: float = 1e-10
-) -> tuple[float, float, float]:
+def free_flight(time_step: float, shake: float = 0.0, error: float = 1e-10) -> tuple[float, float, float]:
     """Drift of momentum and loss of angular momentum in a second, and the loss of a rigid body (``rigid_loss``).
 
     A block of 4 x 3 x 2 cells of 0.1 m thrown at 1 m/s, spinning at 2 rad/s about its shortest side.
@@ -299,7 +285,7 @@ def free_flight(
         return each.sum(axis=0), np.cross(q - mass @ q / mass.sum(), each)[:, 2].sum()
 
     start, spin_start = momenta(q, before)
-    *_, last = steps(lattice, time_step, q, before, count * [np.zeros_like(q)], error, preset)
+    *_, last = steps(lattice, time_step, q, before, count * [np.zeros_like(q)], error)
     end, spin_end = momenta(*last)
     drift = float(np.linalg.norm(end - start) / np.linalg.norm(start))
     return drift, 1 - spin_end / spin_start, rigid_loss(spin * time_step, count)
@@ -317,78 +303,145 @@ def rigid_loss(angle: float, steps: int) -> float:
     return 1 - np.sin(last) / np.sin(angle)
 
 
+# ---- bodies that do not lie along the grid
+
+
+def mass_error(lattice: Lattice, mesh: trimesh.Trimesh) -> float:
+    return lattice.mass.sum() / (DENSITY * mesh.volume) - 1
+
+
+def round_bar() -> trimesh.Trimesh:
+    """Along x; its circle has 256 sides, which take 0.02% of its stiffness."""
+    return along_x(trimesh.creation.cylinder(RADIUS, LENGTH, sections=256))
+
+
+def turned_bar() -> trimesh.Trimesh:
+    """A square bar along x, turned by 30 degrees about it."""
+    bar = along_x(trimesh.creation.box((WIDTH, WIDTH, LENGTH)))
+    bar.apply_transform(trimesh.transformations.rotation_matrix(np.radians(30), (1, 0, 0)))
+    return bar
+
+
+def along_x(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    mesh.vertices = mesh.vertices[:, [2, 0, 1]] + [LENGTH / 2, 0, 0]
+    return mesh
+
+
+def bar_errors(mesh: trimesh.Trimesh, exact: float, h: float, boundary: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """Cells, and errors of sag and mass in the places of the grid."""
+    lattices = [lattice_of(mesh, h, boundary, (0, *offset)) for offset in OFFSETS]
+    errors = [(Clamped(lattice).sag(LENGTH) / exact - 1, mass_error(lattice, mesh)) for lattice in lattices]
+    return len(lattices[0].cells), *np.transpose(errors)
+
+
+def frequencies(lattice: Lattice, count: int) -> np.ndarray:
+    """The lowest frequencies [rad/s] above the six rigid motions."""
+    mass = np.repeat(lattice.mass, 3)
+    K = hessian(lattice)
+    shift = -1e-4 * E / (DENSITY * LENGTH**2)  # so that it can be factorised
+    inverse = LinearOperator(K.shape, factorise((K - shift * diags(mass)).tocsc()))
+    squares = eigsh(K, k=6 + count, M=diags(mass), sigma=shift, OPinv=inverse, v0=np.ones(len(mass)))[0]
+    return np.sqrt(np.sort(squares)[6:])
+
+
+def ball_error(h: float, boundary: str) -> tuple[int, float, float]:
+    """Cells, and errors of the lowest frequency and of the mass of a ball.
+
+    Lamb (1882): the lowest five are torsional of degree 2, where j_2(x) = x j_3(x), x = omega R / c_s.
+    """
+    ball = trimesh.creation.icosphere(5, RADIUS)
+    root = brentq(lambda x: spherical_jn(2, x) - x * spherical_jn(3, x), 2, 3)
+    lattice = lattice_of(ball, h, boundary, (0.3, 0.7, 0.5))
+    exact = root * np.sqrt(SHEAR / DENSITY) / RADIUS
+    return len(lattice.cells), frequencies(lattice, 5).mean() / exact - 1, mass_error(lattice, ball)
+
+
 # ---- the tables
 
 
-def table(columns: list[str], rows: Iterable[Iterable]) -> None:
-    print("\n|", " | ".join(columns), "|")
-    print("|---" * len(columns) + "|")
-    for row in rows:
-        print("|", " | ".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in row), "|")
-
-
-def percent(share: float, digits: int = 2) -> str:
-    return f"{100 * share:+.{digits}f}%"
-
-
-def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
-    """Return the slope of a line fitted to log |error| over log size."""
-    return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
-
-
-def strain_table() -> None:
+def strain_rows() -> lab.Rows:
     lattice = box((5, 6, 7), 0.1)
-    rows = [
-        (name, *(f"{elastic_constant(lattice, G, other, inner) / exact - 1:.0e}" for inner in (True, False)))
-        for name, G, other, exact in uniform_strains()
-    ]
-    table(["uniform strain", "inner nodes", "whole block"], rows)
+    for name, G, other, exact in uniform_strains():
+        yield {"uniform strain": name, "error": f"{elastic_constant(lattice, G, other) / exact - 1:.0e}"}
 
 
-def beam_table() -> None:
-    sag, frequency = timoshenko_sag(), timoshenko_frequency()
-    rows, errors = [], []
+def beam_rows() -> lab.Rows:
+    exact_sag, exact_frequency, errors = timoshenko_sag(), timoshenko_frequency(), []
+    columns = ("deflection", "expected", "scikit-fem, trilinear", "frequency", "expected frequency")
     for across in ACROSS:
-        lattice_sag, lattice_frequency = lattice_beam(across)
-        found = np.array([lattice_sag / sag, fem_sag(across) / sag, lattice_frequency / frequency])
-        expected = np.array([timoshenko_sag(across) / sag, timoshenko_frequency(across) / frequency])
-        errors.append(found - 1)
-        rows.append((across, *map(percent, (found[0] - 1, expected[0] - 1, *(found[1:] - 1), expected[1] - 1))))
-    slopes = [f"{slope(1 / np.array(ACROSS), error):.2f}" for error in np.transpose(errors)]
-    rows.append(("slope", slopes[0], "", slopes[1], slopes[2], ""))
-    columns = ["cells across", "deflection", "expected", "scikit-fem, trilinear", "frequency", "expected"]
-    table(columns, rows)
-    solid = fem_sag(3, order=2) / sag - 1
-    print(f"\nDeflection of the solid, by scikit-fem's quadratic hexahedra, three across: {percent(solid)}.")
+        sag, frequency = lattice_beam(across)
+        expected_frequency = timoshenko_frequency(across) / exact_frequency
+        ratios = (sag, timoshenko_sag(across), fem_sag(across))
+        errors.append(np.array([*(x / exact_sag for x in ratios), frequency / exact_frequency, expected_frequency]) - 1)
+        yield {"cells across": across} | {name: percent(x, 2) for name, x in zip(columns, errors[-1], strict=True)}
+    slopes = (f"{slope(1 / np.array(ACROSS), error):.2f}" for error in np.transpose(errors))
+    yield {"cells across": "slope"} | dict(zip(columns, slopes, strict=True))
+    solid = percent(fem_sag(3, order=2) / exact_sag - 1, 2)
+    yield {"cells across": "solid: quadratic hexahedra, three across", "deflection": solid}
 
 
-def wave_table() -> None:
-    rows = []
+def wave_rows() -> lab.Rows:
     for courant in (1 / 4, 1 / 8, 1 / 16):
         centre, peak, height = wave_speeds(*struck_bar(courant))
-        parts = predicted_peak(courant)
-        rows.append((courant, percent(centre, 4), *map(percent, (peak, sum(parts), *parts)), f"{height:.2f}"))
-    table(["c t / h", "centre", "peak", "expected", "bar", "cells", "implicit Euler", "height left"], rows)
+        speeds = {"centre": percent(centre, 4), "peak": percent(peak, 2)}
+        yield {"c t / h": courant} | speeds | {"height left": f"{height:.2f}"}
 
 
-def flight_table() -> None:
-    sizes = np.array([1 / 50, 1 / 100, 1 / 200, 1 / 400])
-    found = np.array([free_flight(t) for t in sizes])
-    solvers = {"newton": 1e-10, "anderson": 1e-3}
-    drifts = [[free_flight(t, SHAKE, *solver)[0] for solver in solvers.items()] for t in sizes]
-    rows = [
-        (f"1/{1 / t:.0f}", *(f"{drift:.0e}" for drift in pair), percent(-loss, 3), percent(-rigid, 3))
-        for t, pair, (_, loss, rigid) in zip(sizes, drifts, found, strict=True)
-    ]
-    rows.append(("slope", "", "", f"{slope(sizes, found[:, 1]):.2f}", f"{slope(sizes, found[:, 2]):.2f}"))
-    momenta = [f"momentum, `{preset}` to {error:.0e}" for preset, error in solvers.items()]
-    table(["t [s]", *momenta, "angular momentum in 1 s", "rigid body under implicit Euler"], rows)
+def flight_rows() -> lab.Rows:
+    sizes, losses = [1 / 50, 1 / 100, 1 / 200, 1 / 400], []
+    columns = ("angular momentum in 1 s", "rigid body under implicit Euler")
+    for t in sizes:
+        losses.append(free_flight(t)[1:])
+        row = {"t [s]": f"1/{1 / t:.0f}", "momentum": f"{free_flight(t, SHAKE)[0]:.0e}"}
+        yield row | {name: percent(-loss, 3) for name, loss in zip(columns, losses[-1], strict=True)}
+    slopes = (f"{slope(sizes, of_size):.2f}" for of_size in np.transpose(losses))
+    yield {"t [s]": "slope"} | dict(zip(columns, slopes, strict=True))
+
+
+def bar_rows(mesh: trimesh.Trimesh, exact: float, sizes: tuple[float, ...]) -> lab.Rows:
+    means = []
+    for size in sizes:
+        found = {boundary: bar_errors(mesh, exact, size * RADIUS, boundary) for boundary in BOUNDARIES}
+        means.append([found[boundary][1].mean() for boundary in BOUNDARIES])
+        row: dict[str, object] = {"h / R": f"{size:.3f}", "cells": found["fill"][0]}
+        for boundary, (_, *errors) in found.items():
+            texts = (f"{percent(error.mean())} ({100 * np.ptp(error):.1f})" for error in errors)
+            row |= dict(zip((f"{boundary}: sag", f"{boundary}: mass"), texts, strict=True))
+        yield row
+    slopes = (f"{slope(sizes, errors):.2f}" for errors in np.transpose(means))
+    yield {"h / R": "slope"} | dict(zip(("whole: sag", "fill: sag"), slopes, strict=True))
+
+
+def ball_rows() -> lab.Rows:
+    for size in (0.4, 1 / 4, 1 / 6, 1 / 8):
+        found = {boundary: ball_error(size * RADIUS, boundary) for boundary in BOUNDARIES}
+        row: dict[str, object] = {"h / R": f"{size:.3f}", "cells": found["fill"][0]}
+        for boundary, (_, frequency, mass) in found.items():
+            row |= {f"{boundary}: frequency": percent(frequency), f"{boundary}: mass": percent(mass)}
+        yield row
+
+
+TABLES: dict[str, Callable[[], lab.Rows]] = {
+    "strain": strain_rows,
+    "beam": beam_rows,
+    "wave": wave_rows,
+    "flight": flight_rows,
+    "round": lambda: bar_rows(round_bar(), ROUND_SAG, (2 / 3, 0.4, 1 / 3, 1 / 4, 1 / 6)),
+    "turned": lambda: bar_rows(turned_bar(), SQUARE_SAG, (0.5, 1 / 3, 1 / 4, 1 / 6)),
+    "ball": ball_rows,
+}
 
 
 def main() -> None:
-    parser(__doc__).parse_args()
-    for show in (strain_table, beam_table, wave_table, flight_table):
-        show()
+    options = lab.parser(__doc__)
+    options.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(TABLES)}; all if none is named")
+    args = options.parse_args()
+    if unknown := set(args.tables) - set(TABLES):
+        options.error(f"no table {', '.join(sorted(unknown))}: {', '.join(TABLES)}")
+    with lab.page(args):
+        for name in args.tables or TABLES:
+            print(f"\n## {name}")
+            lab.table(TABLES[name]())
 
 
 if __name__ == "__main__":

@@ -2,18 +2,19 @@
 """Steps the lattice of a result by a program that is not ours, in a process of its own: bench_peers.py starts it.
 
 OUT (.npz) gets `position` (T, n, 3) [m], frame 0 among the T; `seconds` that the steps of each later frame took;
-`last` (3, n, 3) [m], the last frame and one and two substeps after it; `version` and `note`. Reading positions is not
-timed. Gravity points along -z.
+`version` and `note`. Reading positions is not timed. Gravity points along -z. A program is a class that takes substeps
+(`advance`), gives `positions` (n, 3) [m], and may say in `note` what a reader of its figures must know.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-from clone import parser
+import lab
 
 import numpy as np
 
@@ -35,20 +36,6 @@ class Beam(NamedTuple):
     stiffness: np.ndarray
     pinned: np.ndarray
     corner: np.ndarray
-
-
-class Peer(Protocol):
-    """A program with the beam in it."""
-
-    @property
-    def note(self) -> str:
-        """Return what a reader of its figures must know; nothing if there is nothing."""
-
-    def advance(self, substeps: int) -> None:
-        """Take so many substeps."""
-
-    def positions(self) -> np.ndarray:
-        """Return the positions (n, 3) [m]."""
 
 
 def read_beam(path: Path) -> Beam:
@@ -73,8 +60,6 @@ def color_groups(beam: Beam) -> list[np.ndarray]:
 
 class Newton:
     """NVIDIA's Newton on the CPU."""
-
-    note = ""
 
     def __init__(self, beam: Beam, time_step: float, iterations: int | None):
         """With VBD if a number of iterations is given, else semi-implicit."""
@@ -159,8 +144,6 @@ class MuJoCo:
 class PyPBD:
     """Position based dynamics with compliance; its gravity points along -y, so that axes are passed on as y, z, x."""
 
-    note = ""
-
     def __init__(self, beam: Beam, time_step: float, iterations: int):
         import pypbd
 
@@ -189,7 +172,7 @@ class PyPBD:
 
 # ---- by name: the package, and how to start from a beam, a substep [s] and a number of iterations
 
-PEERS: dict[str, tuple[str, Callable[[Beam, float, int], Peer]]] = {
+PEERS: dict[str, tuple[str, Callable[[Beam, float, int], Any]]] = {
     "semi-implicit": ("newton", lambda beam, time_step, _: Newton(beam, time_step, None)),
     "vbd": ("newton", Newton),
     "euler": ("mujoco", lambda beam, time_step, _: MuJoCo(beam, time_step, "EULER")),
@@ -198,7 +181,7 @@ PEERS: dict[str, tuple[str, Callable[[Beam, float, int], Peer]]] = {
 }
 
 
-def play(peer: Peer, substeps: int, frames: int) -> dict:
+def play(peer: Any, substeps: int, frames: int) -> dict:
     """Return what OUT gets, but for the version."""
     positions, seconds = [peer.positions()], []
     for _ in range(frames):
@@ -206,15 +189,11 @@ def play(peer: Peer, substeps: int, frames: int) -> dict:
         peer.advance(substeps)
         seconds.append(perf_counter() - start)
         positions.append(peer.positions())
-    last = [positions[-1]]
-    for _ in range(2):
-        peer.advance(1)
-        last.append(peer.positions())
-    return {"position": positions, "seconds": seconds, "last": last, "note": peer.note}
+    return {"position": positions, "seconds": seconds, "note": getattr(peer, "note", "")}
 
 
 def main() -> None:
-    options = parser(__doc__)
+    options = lab.parser(__doc__)
     options.add_argument("peer", choices=PEERS)
     options.add_argument("result", type=Path, help="a result file, whose lattice is taken")
     options.add_argument("out", type=Path, help="the .npz file to write")
@@ -223,6 +202,7 @@ def main() -> None:
     options.add_argument("--frames", type=int, default=30, metavar="N")
     args = options.parse_args()
     package, start = PEERS[args.peer]
+    os.chdir(args.out.parent)  # where MuJoCo leaves its log
     try:
         peer = start(read_beam(args.result), FRAME / args.substeps, args.iterations)
     except ModuleNotFoundError as error:

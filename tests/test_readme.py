@@ -29,7 +29,7 @@ from msmpetsc.study.schema import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}
 READMES = sorted(path for path in ROOT.rglob("README.md") if not OUTSIDE & set(path.relative_to(ROOT).parts))
-ELSEWHERE = {"pip", "python", "module", "export", "./configure", "eval"}
+ELSEWHERE = {"asv", "pip", "python", "module", "export", "./configure", "eval"}
 SMALLER = {  # a command's words -> those of the test
     "cages.count=3000": "cages.count=400 --frames 4",
     "run scenes/bunny_fall.toml --overwrite": "run scenes/bunny_fall.toml --overwrite --set cages.count=400 --frames 2",

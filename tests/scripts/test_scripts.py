@@ -8,7 +8,7 @@ import house
 import pytest
 from conftest import AS_ROOT, ROOT
 
-SCRIPTS = sorted(path for path in (ROOT / "scripts").glob("*.py") if path.stem != "clone")
+SCRIPTS = sorted(path for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab"))
 HOME = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent", **AS_ROOT}  # nothing is activated
 SYSTEM_PYTHON = sys._base_executable  # what the clone's .venv was made with
 needs_venv = pytest.mark.skipif(not (ROOT / ".venv").exists(), reason="the clone has no .venv")
@@ -24,9 +24,9 @@ def test_each_script_finds_its_python(script: Path):
 def test_a_clone_that_is_not_set_up_says_so(tmp_path: Path):
     scripts = tmp_path / "scripts"
     scripts.mkdir()
-    for name in ("clone.py", "table1.py"):
+    for name in ("clone.py", "lab.py"):
         (scripts / name).write_text((ROOT / "scripts" / name).read_text())
-    code = "import sys; sys.path.insert(0, sys.argv[1]); import clone"
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import lab"
     command = [SYSTEM_PYTHON, "-S", "-c", code, scripts]  # -S: without site-packages
     done = subprocess.run(command, env=HOME, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "run scripts/setup first" in done.stderr, done.stderr
@@ -44,20 +44,22 @@ def planted(folder: Path, **files: str) -> Path:
 
 
 def test_planted_faults_are_measured(tmp_path: Path):
-    step = "class Stepper:\n    late: int\n    def __init__(self):\n        self.a = self.b = 1\n"
-    step += "    def step(self):\n        self.c = 2\n        self.a = 3\n"
-    long = 'def f():\n    """Text.\n\n    More.\n    """\n' + "    x = 1\n" * 35
+    long = 'def f():\n    """Text.\n\n    More.\n    """\n' + "    x = 1\n" * 36
     folder = planted(
         tmp_path,
         model__a=f"from msmpetsc.model import b\n{long}",
         model__b="from msmpetsc.solve.step import Stepper\n\n\ndef f():\n    from msmpetsc.model.a import f\n",
-        solve__step=step,
-        solve__other="class Stepper:\n    pass\n",
+        solve__step="class Stepper:\n    pass\nHALF, PAIR = 0.5, 2\nNAME = 'x'\n",
+        solve__b="class Stepper:\n    pass\ndef f(a, b, c, d, e, f, scene: Scene): return a if b else c\n",
     )
     rows = house.measures(folder, quick=True)
-    assert rows["attributes of Stepper (born late)"] == "Stepper 4 (1)"
-    assert rows["classes whose name stands twice"] == "1 Stepper"
-    assert rows["import circles"] == "1 model.a - model.b"
+    assert rows["class names that stand twice"] == "1 Stepper" and rows["file names that stand twice"] == "1 b.py"
+    assert rows["a circle of imports"] in ("model.a - model.b - model.a", "model.b - model.a - model.b")
     assert rows["upward imports"] == "1 model.b > solve.step"
-    assert rows["functions over 35 lines"] == "1 model.a.f 36"
-    assert rows["README.md: lines, words"] == "3, 6"
+    assert rows["functions over 35 lines"] == "1 model.a.f" and rows["functions over 6 arguments"] == 1
+    assert rows["functions, modules on the walk of scene"] == "1, 1" and rows["imports inside functions"] == 1
+    assert rows["files with one user"] == 3 and rows["tuned module constants"] == 1
+    assert rows["lines/files by room"] == "model 47/2, solve 7/2"
+    assert rows["conditional expressions: all, in 1,000 lines"].startswith("1, ")
+    assert rows["tuple assignments: all, in 1,000 lines"].startswith("1, ")
+    assert rows["README files: lines, words"] == "3, 6"

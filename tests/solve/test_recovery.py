@@ -1,6 +1,5 @@
 """Small cases that are hard on a solver (scenes/studies/stability.toml): what comes of each, good or bad, and why."""
 
-import runpy
 import tomllib
 from dataclasses import dataclass
 from functools import cache
@@ -21,11 +20,11 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.nonlinear.failure import REASON
 from msmpetsc.solve.simulate import Simulation
+from msmpetsc.study.distances import distance_of_shapes
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
 CASES = {case["name"]: case for of in MAPS for case in of.get("case", ()) if case["file"].startswith("hard/")}
-shape_error = runpy.run_path(str(ROOT / "scripts" / "press_study.py"))["shape_error"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Played:
         return int((least_volumes(frame.position, self.lattice.cells) <= 0).sum())
 
     def shape_error(self, mirror: tuple = (1, 1, 1)) -> float:
-        return shape_error(self.lattice.nodes * mirror, self.last.position, self.lattice.mass) / self.size
+        return distance_of_shapes(self.last.position, self.lattice.nodes * mirror, self.lattice.mass)
 
     def energy(self, frame: Frame) -> float:
         """All but what the obstacles hold [J]."""

@@ -1,0 +1,55 @@
+"""What small runs cost, for `asv run`: counts, which no machine changes, peak memory, and a few times."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import lab
+
+import numpy as np
+import trimesh
+from mpi4py import MPI
+
+from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.surface import Surface, examine
+
+CELLS = "cages={count=2000}"
+FRAMES = {"armadillo_leg": 6, "heart_pull": 10, "lung_press": 20, "studies/beam_soft": 10}
+MEANS = "products", "iterations", "ksp_its", "wall_time"  # a frame, the first left out; times in seconds
+TOTALS = "memory [byte]", "setup [s]"
+
+
+class Scenes:
+    """A scene's first frames on a small lattice."""
+
+    params = (tuple(FRAMES), (*MEANS, *TOTALS))
+    param_names = ("scene", "figure")
+    timeout = 600
+
+    def setup_cache(self) -> dict[str, dict[str, float]]:
+        """Run each scene once; its figures by their names."""
+        found = {}
+        for scene, frames in FRAMES.items():
+            run = lab.run(scene, Path("run.h5"), ["--frames", frames], [CELLS, "output.surface=false"])
+            found[scene] = {name: float(values[1:].mean()) for name, values in run.frames(*MEANS).items()}
+            totals = run.cost["memory"], run.cost["time"]["setup"]
+            found[scene] |= dict(zip(TOTALS, totals, strict=True))
+        return found
+
+    def track_figure(self, found: dict[str, dict[str, float]], scene: str, figure: str) -> float:
+        """Return a figure of a scene."""
+        return found[scene][figure]
+
+
+class Cages:
+    """A ball of 20,000 triangles, filled with about 4,000 cells."""
+
+    def setup(self) -> None:
+        """Make the ball."""
+        ball = trimesh.creation.icosphere(5)
+        surface = Surface(np.array(ball.vertices), np.array(ball.faces))
+        self.body = Body(MPI.COMM_SELF, surface, examine(surface), np.array(ball.bounds))
+
+    def time_fill(self) -> None:
+        """Fill it."""
+        fill([self.body], 0.1)

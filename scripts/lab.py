@@ -1,0 +1,178 @@
+"""What the studies of this folder share: runs of scenes in processes of their own, repeats, and tables in Markdown."""
+
+import datetime
+import io
+import json
+import shlex
+import sys
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from statistics import median
+from typing import Any, TextIO, TypeVar
+
+from clone import ROOT
+
+import numpy as np
+
+from msmpetsc import __version__
+from msmpetsc.backend.machine import machine
+from msmpetsc.output.reader import Result
+from msmpetsc.study.process import Ended, Processes
+
+SCENES, OUT = ROOT / "scenes", ROOT / "out"
+DAY = 86_400.0  # [s]
+T = TypeVar("T")
+Row = Mapping[str, object]  # of a table: cells by column
+Rows = Iterator[Row]
+
+
+# ---- runs
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that ended.
+
+    failure : why it did not come to its end; empty if it did
+    status  : its exit status; None where time ran out
+    seconds : that the process took
+    """
+
+    path: Path
+    failure: str = ""
+    status: int | None = 0
+    seconds: float = 0.0
+
+    @cached_property
+    def cost(self) -> dict[str, Any]:
+        """What `run --measure` says of it."""
+        return json.loads(self.path.with_suffix(".json").read_text())
+
+    def frames(self, *names: str, start: int = 1) -> dict[str, np.ndarray]:
+        """Return values of the frames from ``start`` on, (frames, ...) each."""
+        with Result(self.path) as result:
+            return {name: result.frames[name][start:] for name in names}
+
+
+def run(
+    scene: str | Path,
+    path: Path,
+    words: Iterable[object] = (),
+    changes: Iterable[str] = (),
+    ranks: int = 1,
+    timeout: float = DAY,
+    warm: bool = False,
+) -> Run:
+    """Run a scene, named or a file, in a process of its own, and say so; its log and its cost lie beside ``path``.
+
+    words : options of `msmpetsc run`, and of PETSc; changes : those of --set
+    warm  : spare it the start of the program, where no time is asked
+    """
+    file = scene if isinstance(scene, Path) else SCENES / f"{scene}.toml"
+    command: list[object] = ["-m", "msmpetsc", "run", file, "-o", path, "--overwrite", *words]
+    command += ["--measure", path.with_suffix(".json"), *(word for change in changes for word in ("--set", change))]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    print(file.stem, *words, *changes, f"({ranks} ranks)", file=sys.stderr, flush=True)
+    ended = python(command, path.with_suffix(".log"), ranks, timeout, warm)
+    if ended.reason:
+        print("  failed:", ended.reason, file=sys.stderr)
+    return Run(path, ended.reason, ended.status, ended.seconds)
+
+
+def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
+    """Run Python with these words to its end, what it says into ``log``."""
+    launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+    return Processes().run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
+
+
+# ---- repeats
+
+
+def alternated(kinds: Mapping[str, Callable[[], T | None]], repeats: int) -> dict[str, list[T]]:
+    """Do each kind so often, no one twice in a row while there are others; one that gives None is not done again."""
+    found: dict[str, list[T]] = {name: [] for name in kinds}
+    failed = set()
+    for name in [*kinds] * repeats:
+        value = None if name in failed else kinds[name]()
+        if value is None:
+            failed.add(name)
+        else:
+            found[name].append(value)
+    return {name: [] if name in failed else values for name, values in found.items()}
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return the median, and the least and the greatest where there are several."""
+    ends = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
+    return shown(median(values)) + ends
+
+
+def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
+    """Return the slope of a line fitted to log |error| over log size."""
+    return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
+
+
+# ---- what is printed
+
+
+def shown(value: object) -> str:
+    """Return a cell of a table: three digits of a float, commas in an int, nothing of None."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def percent(share: float, digits: int = 1) -> str:
+    """Return a signed share in percent."""
+    return f"{100 * share:+.{digits}f}%"
+
+
+def table(rows: Iterable[Row]) -> None:
+    """Print rows as they come, under the columns of the first; one that has more columns begins a table of its own."""
+    columns: list[str] = []
+    for row in rows:
+        if not set(row) <= set(columns):
+            columns = list(row)
+            print(f"\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+        print("|", " | ".join(shown(row.get(column)) for column in columns), "|", flush=True)
+
+
+def parser(documentation: str | None) -> ArgumentParser:
+    """Return a parser that prints a script's documentation for --help, and has -o for a page of its results."""
+    options = ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
+    options.add_argument("-o", "--output", type=Path, metavar="PAGE", help="a Markdown file of what is printed")
+    return options
+
+
+@contextmanager
+def page(args: Namespace) -> Iterator[None]:
+    """Leave what is printed in the file of -o, too, if there is one, below the command, the day and the machine."""
+    if args.output is None:
+        yield
+        return
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    name, *words = sys.argv
+    with open(args.output, "w") as file, redirect_stdout(Both(sys.stdout, file)):
+        file.write(f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n\n")
+        host = machine()
+        file.write(f"{datetime.date.today()}, msmpetsc {__version__}, {host['cpu']}, {host['cores']} cores.\n")
+        yield
+
+
+class Both(io.TextIOBase):
+    """A stream that writes into two, each time to the end, so that what was measured outlives a kill."""
+
+    def __init__(self, *streams: TextIO):
+        self.streams = streams
+
+    def write(self, text: str) -> int:
+        for stream in self.streams:
+            stream.write(text)
+            stream.flush()
+        return len(text)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from block_scene import G, block_scene
+from block_scene import CELL, G, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
@@ -24,6 +24,8 @@ from msmpetsc.solve.integrators.implicit import ImplicitEuler
 TIME = {"step": 0.01, "duration": 0.1}
 LEFT, LEFT_HALF = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}, {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]}  # 15, 45 of 75 nodes
 RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}  # 15
+LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}  # 8 cells, whose nodes are in two layers
+TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}  # 30 nodes: all of those cells
 UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0, 0]}]
 
 

@@ -90,7 +90,10 @@ def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, 
         },
     }  # fmt: skip
     command = print_command(args, choice.method, more) if plan.met else None
-    record = {"choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "command": command}
+    tried = [each._asdict() for each in plan.tried]
+    record = {
+        "choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "tried": tried, "command": command,
+    }  # fmt: skip
     return plan.met, json.loads(json.dumps(record, default=str))  # of paths the names
 
 

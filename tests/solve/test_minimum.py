@@ -180,7 +180,7 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
     result = stepper.step(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.destroy()
     np.testing.assert_allclose(result.position, q, atol=1e-12)
-    assert result.error < 1e-3
+    assert result.cost.step_error < 1e-3
 
 
 def test_a_body_that_is_not_compressed_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from msmpetsc.app.simulation import Simulation, frames
     from msmpetsc.app.start import run
     from msmpetsc.extensions import register_force, register_obstacle, register_preset
-    from msmpetsc.model.fields import Frame
-    from msmpetsc.output.reader import Result
+    from msmpetsc.fields import Frame
+    from msmpetsc.results.reader import Result
     from msmpetsc.scene.schema import Scene
 
 __version__ = "0.1.0"
@@ -27,8 +27,8 @@ __all__ = [
     "run",
 ]
 FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
-    "Frame": "msmpetsc.model.fields",
-    "Result": "msmpetsc.output.reader",
+    "Frame": "msmpetsc.fields",
+    "Result": "msmpetsc.results.reader",
     "Scene": "msmpetsc.scene.schema",
     "Simulation": "msmpetsc.app.simulation",
     "frames": "msmpetsc.app.simulation",
@@ -81,6 +81,6 @@ def open(path: str | Path) -> "Result":
 
     Raises InputError, one line, if the file is no result, or damaged.
     """
-    from msmpetsc.output.reader import Result  # late: the package itself stays quick to import
+    from msmpetsc.results.reader import Result  # late: the package itself stays quick to import
 
     return Result(path)

@@ -20,7 +20,7 @@ import numpy as np
 
 from msmpetsc import __version__
 from msmpetsc.backend.machine import machine
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 from msmpetsc.study.process import Ended, Processes
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out"

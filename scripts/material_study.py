@@ -30,7 +30,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.surface import Surface, examine
-from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset

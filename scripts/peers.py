@@ -19,7 +19,7 @@ import lab
 import numpy as np
 
 from msmpetsc.errors import missing_package
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 
 FRAME = 1 / 60  # [s]
 G = 9.81  # [m/s^2]

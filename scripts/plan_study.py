@@ -28,7 +28,8 @@ MORE = 1.25  # times the cells of the plan's finest trial, at least
 LONG = 5.0  # [s] a choice that takes as long for the whole scene is run so
 SHORTER = 4  # times, of implicit steps
 NOT_MET = 3  # exit status of a plan that is there all the same
-STUDIES = {  # for each of ERRORS: the first frames, that are tried, and the cells of the plan's finest trial
+Setting = tuple[tuple[int | None, ...], tuple[int, ...]]
+STUDIES: dict[str, Setting] = {  # for each of ERRORS: the first frames, that are tried, and the cells of the plan's finest trial
     "armadillo_forehead": ((2, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": ((4, 2, 2), (1000, 4000, 8000)),
     "armadillo_palm": ((4, 2, 2), (1000, 4000, 8000)),
@@ -41,7 +42,7 @@ STUDIES = {  # for each of ERRORS: the first frames, that are tried, and the cel
     "studies/beam_stiff": ((10, 10, 10), (2000, 2000, 8000)),
     "studies/atlas/press": ((6, 6, 6), (512, 2000, 4000)),
 }
-ANOTHER = (None, None, None), (1000, 2000, 4000)  # of a scene file
+ANOTHER: Setting = ((None, None, None), (1000, 2000, 4000))  # of a scene file
 
 
 class Planned(NamedTuple):
@@ -160,8 +161,8 @@ def rows(args: Namespace) -> lab.Rows:
     for target in args.errors:
         number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
         for scene in args.scenes or STUDIES:
-            tried, finest = (of_errors[number] for of_errors in STUDIES.get(scene, ANOTHER))
-            plan = planned(scene, target, args.frames or tried, args.cells or finest)
+            tried, finest = STUDIES.get(scene, ANOTHER)
+            plan = planned(scene, target, args.frames or tried[number], args.cells or finest[number])
             yield row(scene, target, plan, args.limit)
 
 

@@ -17,9 +17,9 @@ from clone import ROOT
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
-from msmpetsc.model.self_contact.contacts import CollisionSurface
-from msmpetsc.output.reader import Result
+from msmpetsc.build import build_model
+from msmpetsc.contact.surface.pairs import CollisionSurface
+from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))

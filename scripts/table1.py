@@ -14,7 +14,7 @@ import lab
 
 import numpy as np
 
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 
 # vertices, facets, valid cells, springs, frames a second on the CPU and on the GPU
 PAPER = {

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from conftest import run
 
+from msmpetsc.constraints.loads import Motion
+from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.inside import inside
 from msmpetsc.geometry.registry import find
-from msmpetsc.model.elasticity.inversion import least_volumes
-from msmpetsc.model.loads import Motion
 from msmpetsc.scene.schema import SceneFile
 
 SCENES = Path(__file__).parents[1] / "scenes"

@@ -17,9 +17,9 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.fields import Frame
-from msmpetsc.output.progress import Progress
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.fields import Frame
+from msmpetsc.results.progress import Progress
+from msmpetsc.results.writer import ResultFile
 
 if TYPE_CHECKING:  # PETSc must first be given its options
     from msmpetsc.solve.simulate import Simulation

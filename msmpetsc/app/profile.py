@@ -16,8 +16,8 @@ from msmpetsc.backend.arrays import on_host
 from msmpetsc.backend.machine import machine
 from msmpetsc.comm import on_root
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.fields import Frame
-from msmpetsc.output.disk import plain_errors, refuse_no_file, write_whole
+from msmpetsc.fields import Frame
+from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import Simulation

@@ -27,7 +27,7 @@ from msmpetsc.scene.toml import overrides_of, toml_of
 from msmpetsc.solve.petsc.words import words_of
 
 if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
-    from msmpetsc.model.fields import Frame
+    from msmpetsc.fields import Frame
     from msmpetsc.scene.schema import Scene
 
 P = ParamSpec("P")

@@ -15,16 +15,16 @@ from msmpetsc.app.request import RunRequest
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, printable
 from msmpetsc.geometry.registry import MODELS
-from msmpetsc.output.reader import refuse_deadly
-from msmpetsc.output.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
-from msmpetsc.output.writer import Begin, ResultFile
+from msmpetsc.results.reader import refuse_deadly
+from msmpetsc.results.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
+from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
 from msmpetsc.scene.reading import load_scene, scene_of
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
-    from msmpetsc.model.build import Model
+    from msmpetsc.build import Model
     from msmpetsc.solve.simulate import Simulation
 
 OF_NO_EFFECT = re.compile(  # on results

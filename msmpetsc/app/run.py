@@ -24,13 +24,13 @@ from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
 from msmpetsc.backend.compiling import compilation_logged
+from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.output.model import write_model
-from msmpetsc.output.restart import Earlier
-from msmpetsc.output.writer import Begin, ResultFile
-from msmpetsc.output.xdmf import write_xdmf
+from msmpetsc.results.constant_parts import write_model
+from msmpetsc.results.restart import Earlier
+from msmpetsc.results.writer import Begin, ResultFile
+from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import load_scene, scene_in
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.instrumentation import Probes, begin_timing
@@ -251,7 +251,7 @@ def write_companions(request: RunRequest, whole: bool) -> None:
     path = request.path
     write_xdmf(path)
     if whole and request.picture:
-        from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
+        from msmpetsc.view.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
 
         contact_sheet(path, path.with_suffix(".png"))
 

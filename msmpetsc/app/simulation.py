@@ -13,9 +13,9 @@ from mpi4py import MPI
 from msmpetsc.app.failure import ending_together
 from msmpetsc.app.log import logged_on_root
 from msmpetsc.app.request import FLAGS
+from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
-from msmpetsc.model.build import Geometry, Model, build_model
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.petsc.words import lent_options, start_for_runs, words_of
 

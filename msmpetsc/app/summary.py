@@ -10,11 +10,11 @@ from mpi4py import MPI
 from tqdm import tqdm
 
 from msmpetsc.app.observers import STATUS
+from msmpetsc.build import Model
 from msmpetsc.comm import log
-from msmpetsc.model.build import Model
-from msmpetsc.model.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.model.reach import Reach
-from msmpetsc.output.progress import duration
+from msmpetsc.constraints.coverage import Reach
+from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
+from msmpetsc.results.progress import duration
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.simulate import Simulation
 

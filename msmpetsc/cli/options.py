@@ -7,7 +7,7 @@ from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.app.request import OPTIONS, Option, RunRequest, flag_of
-from msmpetsc.output.frame_choice import frames_in
+from msmpetsc.results.frame_choice import frames_in
 
 Commands = argparse._SubParsersAction  # argparse has no public name for what add_subparsers returns
 SHELLS = ("bash", "zsh", "fish")

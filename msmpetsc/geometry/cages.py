@@ -15,11 +15,11 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.boundary import sampled_cells, touched_cells
+from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_shares
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
-from msmpetsc.geometry.share import LEAK, OUTSIDE, Columns, sampled_shares
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
+from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 LEAST_SHARE = 1e-3  # of a corner that the inside is far from
@@ -49,7 +49,8 @@ class Cages:
 
     table : keys of the cells (geometry.grid)
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
-    share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.share) [-]; None where all are whole
+    share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.fill_fractions) [-]; None where all
+            are whole
     fills : of each body, whether its boundary cells count by their fill
     """
 

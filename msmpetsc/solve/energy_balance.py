@@ -24,12 +24,12 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.contact.surface.pairs import Touch
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
+from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.locate import describe_inverted, node_of_greatest
-from msmpetsc.model.self_contact.contacts import Touch
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import Ledger, State
 from msmpetsc.solve.nonlinear.step import StepResult

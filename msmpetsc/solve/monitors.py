@@ -4,12 +4,12 @@ from nowhere, and nodes inside an obstacle that comes to be there."""
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.checkpoint import ANY, COUNT, Range
 from msmpetsc.comm import log
-from msmpetsc.model.checkpoint import ANY, COUNT, Range
-from msmpetsc.model.contact.obstacle import describe_overlap
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.lattice import Lattice
-from msmpetsc.model.locate import worst_inverted
+from msmpetsc.contact.obstacles.obstacle import describe_overlap
+from msmpetsc.elasticity.locate import worst_inverted
+from msmpetsc.environment import Environment
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.energy_balance import MUCH
 from msmpetsc.solve.integrators.state import Ledger
 

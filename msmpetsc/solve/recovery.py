@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+from msmpetsc.checkpoint import COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import COUNT, Range
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance

@@ -13,10 +13,10 @@ that nothing holds the way |v| T. They are estimated as errors of steps are, onc
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.build import Model
+from msmpetsc.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.comm import log
-from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import COUNT, LENGTH, Range
-from msmpetsc.model.environment import Environment
+from msmpetsc.environment import Environment
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR

@@ -9,13 +9,13 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import on_host, to_host
+from msmpetsc.build import Model, to_device
+from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import on_root
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model, to_device
-from msmpetsc.model.checkpoint import ANY, Checkpoint, Counting, Range
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import common_times, refuse_different_lattices
-from msmpetsc.output.reader import Result
-from msmpetsc.output.surfaces import surface_distance
+from msmpetsc.results.compare import common_times, refuse_different_lattices
+from msmpetsc.results.reader import Result
+from msmpetsc.results.surfaces import surface_distance
 
 
 def shape_error(run: Result, frame: int) -> float | None:

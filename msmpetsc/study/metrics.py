@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 from msmpetsc.study.distances import shape_error
 from msmpetsc.study.table import Row
 

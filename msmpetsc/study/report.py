@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.cells import growth_charts
 from msmpetsc.study.charts.convergence import convergence_charts

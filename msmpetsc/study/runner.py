@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import Lock
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.distances import surface_error, trajectory_error
 from msmpetsc.study.metrics import of_frames, outcome, rates, read_costs, read_failure, read_trace, together

@@ -7,7 +7,7 @@ from typing import Any
 
 import tomlkit
 
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import inline, scene_tables

@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 
 from msmpetsc.errors import EXTRAS, InputError, missing_package
-from msmpetsc.model.fields import FRAME_FIELDS
-from msmpetsc.output.disk import write_whole
+from msmpetsc.fields import FRAME_FIELDS
+from msmpetsc.results.disk import write_whole
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -15,7 +15,7 @@ import msmpetsc
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.cli.main import main, parsed
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.output.reader import finished
+from msmpetsc.results.reader import finished
 from msmpetsc.solve.petsc.words import options_of
 
 FALL = {"gravity": {"acceleration": [0, 0, -9.81]}, "time": {"step": 0.01, "duration": 0.05}}

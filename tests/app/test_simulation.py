@@ -11,8 +11,8 @@ from conftest import run
 from mpi4py import MPI
 
 import msmpetsc as msm
+from msmpetsc import build
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model import build
 
 FALL = {"gravity": {"acceleration": [0, 0, -G]}, "time": {"step": 0.01, "duration": 0.03}}
 HELD = {"pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}]}

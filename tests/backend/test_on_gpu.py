@@ -28,9 +28,9 @@ from petsc4py import PETSc
 from pretend_gpu import pretended
 
 import msmpetsc
+from msmpetsc.build import build_model
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.build import build_model
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes

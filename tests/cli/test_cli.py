@@ -14,7 +14,7 @@ from conftest import ENVIRONMENT, run
 from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.cli.arguments import split_petsc_options
-from msmpetsc.output.reader import finished
+from msmpetsc.results.reader import finished
 
 SCENE = """
 [mesh]
@@ -323,7 +323,7 @@ BUG_ON_RANK_1 = """
 import sys
 from mpi4py import MPI
 from msmpetsc.cli.main import main
-from msmpetsc.model import build
+from msmpetsc import build
 def broken(body, scene):
     raise ValueError("planted")
 if MPI.COMM_WORLD.rank == 1:

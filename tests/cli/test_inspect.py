@@ -12,12 +12,12 @@ import pytest
 from conftest import ENVIRONMENT, ROOT, WORKERS
 from mpi4py import MPI
 
+from msmpetsc.build import build_model, fill_cages, read_bodies
 from msmpetsc.cli.commands.inspect import largest
 from msmpetsc.cli.main import main
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.model.build import build_model, fill_cages, read_bodies
-from msmpetsc.model.partition import Partition, count_partition
+from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.linear.system import assemble

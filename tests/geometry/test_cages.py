@@ -21,12 +21,12 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.boundary import sampled_cells, touched_cells
 from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
 from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, compact, examine
+from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
 
 WORKER = WORKERS / "cages_worker.py"
 MESHES = Path(os.environ.get("MSMPETSC_MESH_DIR", ""))

@@ -21,11 +21,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
+from msmpetsc.build import read_bodies
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.prepare import repair
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
-from msmpetsc.model.build import read_bodies
 from msmpetsc.scene.reading import load_scene
 
 BOX = trimesh.creation.box(extents=[1, 2, 3])

@@ -7,8 +7,8 @@ import trimesh
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.model.fields import Frame
-from msmpetsc.output.writer import Begin, ResultFile
+from msmpetsc.fields import Frame
+from msmpetsc.results.writer import Begin, ResultFile
 
 BARE = """
 mesh.source = "ball"

@@ -7,15 +7,15 @@ import tomli_w
 import trimesh
 from mpi4py import MPI
 
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.fields import Frame
+from msmpetsc.build import Model, build_model
+from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 
 CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long
 SIDES = np.array([0.5, 0.5, 0.25])
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
-STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (model.material)
+STIFFEST = 4 / 7 * YOUNG * CELL  # an edge inside the block (lattice.material)
 
 
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:

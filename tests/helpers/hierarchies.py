@@ -12,11 +12,11 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from msmpetsc.comm import SortedKeys
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.model.material import CellMaterial
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid import cycle

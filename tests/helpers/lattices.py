@@ -8,7 +8,7 @@ from mpi4py import MPI
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset

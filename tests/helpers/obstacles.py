@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from msmpetsc.model.contact.obstacle import Obstacle
-from msmpetsc.model.contact.solids import BallSolid, Faces
-from msmpetsc.model.loads import Motion
+from msmpetsc.constraints.loads import Motion
+from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.solids import BallSolid, Faces
 
 STILL = Motion.through(())
 

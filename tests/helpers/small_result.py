@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.fields import Frame
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.fields import Frame
+from msmpetsc.results.writer import ResultFile
 
 H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from block_scene import block_scene
 
-from msmpetsc.output.reader import finished
+from msmpetsc.results.reader import finished
 from msmpetsc.solve import simulate
 
 EVERY, STEPS = 3, 40

@@ -18,8 +18,8 @@ from time import sleep
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.fields import Frame
-from msmpetsc.output.writer import Begin, ResultFile
+from msmpetsc.fields import Frame
+from msmpetsc.results.writer import Begin, ResultFile
 
 NODES = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 MASS = np.arange(1.0, 9.0)

@@ -13,7 +13,7 @@ import pytest
 from conftest import ENVIRONMENT, WORKERS, run
 from stopped_runs import assert_same, hanging, ranks_of
 
-from msmpetsc.output.reader import finished
+from msmpetsc.results.reader import finished
 
 ALONE, ON_TWO = 40, 10  # kills
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]

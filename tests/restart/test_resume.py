@@ -19,11 +19,11 @@ from mpi4py import MPI
 from stopped_runs import STEPS, assert_same, every_step_forgets, hanging, signal_after  # noqa: F401  # a fixture
 
 from msmpetsc.app.resume import Resumed
+from msmpetsc.build import build_model
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import build_model
-from msmpetsc.output.reader import finished
-from msmpetsc.output.restart import Earlier
+from msmpetsc.results.reader import finished
+from msmpetsc.results.restart import Earlier
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
@@ -405,7 +405,7 @@ def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, capsys, tmp_
 
 
 def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
-    from msmpetsc.output.disk import Lock
+    from msmpetsc.results.disk import Lock
 
     held, done = multiprocessing.Event(), multiprocessing.Event()
 
@@ -428,7 +428,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
 
 def take_and_free(path: Path, times: int, twice) -> None:
     """A lock again and again; a file that the holder alone should make tells of a second one."""
-    from msmpetsc.output.disk import Lock
+    from msmpetsc.results.disk import Lock
 
     for _ in range(times):
         try:

@@ -9,7 +9,7 @@ import pytest
 from block_scene import CELL, block_scene, play
 
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.solve import recovery
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper

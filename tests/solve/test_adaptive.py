@@ -10,10 +10,10 @@ from block_scene import CELL, block_scene, play
 from conftest import run
 from mpi4py import MPI
 
+from msmpetsc.build import build_model
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import build_model
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.adaptive import between

@@ -8,8 +8,8 @@ import pytest
 from block_scene import block_scene
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
-from msmpetsc.model.lattice import BYTES_OF_CELL, BYTES_OF_NODE, BYTES_OF_SPRING, Lattice, lattice_bytes
+from msmpetsc.build import build_model
+from msmpetsc.lattice.lattice import BYTES_OF_CELL, BYTES_OF_NODE, BYTES_OF_SPRING, Lattice, lattice_bytes
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear import unknowns as unknowns_module
 from msmpetsc.solve.linear.system import assemble, assembly_bytes

@@ -8,7 +8,7 @@ from block_scene import G, block_scene, play
 from mpi4py import MPI
 
 from msmpetsc.cli.main import main
-from msmpetsc.model.elasticity.energy import Elasticity
+from msmpetsc.elasticity.energy import Elasticity
 
 ALPHA, STEP = 3.0, 1 / 64  # [1/s], [s]
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}

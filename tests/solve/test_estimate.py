@@ -12,7 +12,7 @@ from block_scene import block_scene
 from lattices import COMM, T, beam, one_spring, swing, weight
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
+from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear import error_control, minimum

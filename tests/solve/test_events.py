@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import StepFailed
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc import events

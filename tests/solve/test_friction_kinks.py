@@ -7,8 +7,8 @@ import pytest
 from block_scene import CELL, block_scene
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
-from msmpetsc.model.contact.penalty import Contact, Secants
+from msmpetsc.build import build_model
+from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.simulate import Simulation

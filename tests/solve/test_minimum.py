@@ -20,9 +20,9 @@ from conftest import ROOT
 from lattices import T, chain
 from mpi4py import MPI
 
+from msmpetsc.build import build_model
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import build_model
-from msmpetsc.model.fields import Frame
+from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear import preconditioning

@@ -11,11 +11,11 @@ from block_scene import block_scene
 from conftest import ROOT
 from mpi4py import MPI
 
+from msmpetsc.build import Model, build_model
+from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.elasticity.inversion import least_volumes
-from msmpetsc.model.fields import Frame
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.fields import Frame
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.nonlinear.failure import REASON

@@ -8,7 +8,7 @@ from block_scene import block_scene, play
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.presets import PRESETS
 

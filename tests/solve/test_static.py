@@ -9,7 +9,7 @@ from lattices import COMM, one_spring
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.output.reader import Result
+from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.nonlinear.functional import StepProblem

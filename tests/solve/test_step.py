@@ -7,9 +7,9 @@ import pytest
 from lattices import COMM, GRAVITY, T, beam, block, cages_of, one_spring, swing, weight
 from mpi4py import MPI
 
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.errors import petsc_errors

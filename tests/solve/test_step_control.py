@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
 
 STEP, STEPS, LEVELS = 0.01, 400, (-10, 6)

@@ -8,7 +8,7 @@ from conftest import ROOT
 from crossings import count_crossings
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
+from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import Simulation
 

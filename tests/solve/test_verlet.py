@@ -9,14 +9,14 @@ from block_scene import CELL, G, block_scene, play
 from lattices import block, cages_of, one_spring
 from mpi4py import MPI
 
+from msmpetsc.build import Model, build_model
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model, build_model
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.fields import Frame
-from msmpetsc.model.initial_state import at_rest
-from msmpetsc.model.lattice import Lattice, build_lattice
-from msmpetsc.output.reader import Result
+from msmpetsc.fields import Frame
+from msmpetsc.lattice.initial_state import at_rest
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.results.reader import Result
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.results.writer import ResultFile
 from msmpetsc.study.distances import common_times, trajectory_error
 from msmpetsc.study.metrics import of_frames, together
 

@@ -28,7 +28,7 @@ from study_stand_in import blank_frame
 from msmpetsc.cli.commands.study import log_failures
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.results.writer import ResultFile
 from msmpetsc.study.cases import shown_command, study_cases
 from msmpetsc.study.charts.order import closed_form, order
 from msmpetsc.study.charts.stability import COLORS, LIMIT, SYMBOLS, Scale, stability_charts, worded

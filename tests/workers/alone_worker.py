@@ -20,7 +20,7 @@ def fail_at(where: str, what: str, fails: bool) -> None:
     import petsc4py
 
     petsc4py.init(["msmpetsc"])
-    from msmpetsc.model import build
+    from msmpetsc import build
     from msmpetsc.solve.integrators.implicit import ImplicitEuler
 
     owner, name = {"model": (build, "build_lattice"), "step": (ImplicitEuler, "advance")}[where]

@@ -7,11 +7,11 @@ import numpy as np
 from mpi4py import MPI
 from scipy import ndimage
 
+from msmpetsc.constraints.loads import spread_by_mass
 from msmpetsc.geometry.cages import Body, fill
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, examine
-from msmpetsc.model.lattice import build_lattice
-from msmpetsc.model.loads import spread_by_mass
+from msmpetsc.lattice.lattice import build_lattice
 
 comm = MPI.COMM_WORLD
 FILLED = [("closed", 0.11, "exact"), ("open", 0.11, "exact"), ("sampled", 0.11, "sample"), ("one cell", 2.5, "exact")]

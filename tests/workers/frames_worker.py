@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.errors import InputError
-from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.fields import Frame
-from msmpetsc.output import layout, transfer
-from msmpetsc.output.writer import ResultFile
+from msmpetsc.fields import Frame
+from msmpetsc.results import layout, transfer
+from msmpetsc.results.writer import ResultFile
 
 NODES, POINTS, STEPS = 23, 17, 9
 

@@ -21,10 +21,10 @@ petsc4py.init(["msmpetsc"])
 
 from mpi4py import MPI  # noqa: E402, F401
 
+from msmpetsc.build import build_model  # noqa: E402, F401
 from msmpetsc.cli.main import main  # noqa: E402
-from msmpetsc.model.build import build_model  # noqa: E402, F401
-from msmpetsc.output.reader import finished  # noqa: E402
-from msmpetsc.output.writer import ResultFile  # noqa: E402
+from msmpetsc.results.reader import finished  # noqa: E402
+from msmpetsc.results.writer import ResultFile  # noqa: E402
 from msmpetsc.scene.reading import load_scene  # noqa: E402
 from msmpetsc.solve.simulate import Simulation  # noqa: E402, F401
 

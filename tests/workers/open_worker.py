@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 
 import msmpetsc
-import msmpetsc.output.reader  # before the children, or each would import it
+import msmpetsc.results.reader  # before the children, or each would import it
 from msmpetsc.errors import InputError
 
 

@@ -17,7 +17,7 @@ import petsc4py
 petsc4py.init(["msmpetsc"])
 
 from msmpetsc.cli.main import main  # noqa: E402
-from msmpetsc.output.xdmf import write_xdmf  # noqa: E402, F401
+from msmpetsc.results.xdmf import write_xdmf  # noqa: E402, F401
 from msmpetsc.solve.simulate import Simulation  # noqa: E402, F401
 
 KINDS = ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.build import build_model
+from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 
 comm = MPI.COMM_WORLD

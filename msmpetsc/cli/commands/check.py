@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_below_one, refuse_other_format
 from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.baselines import baseline
 from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, row

@@ -9,9 +9,9 @@ import numpy as np
 
 from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.output.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
-from msmpetsc.output.reader import Result, refuse_deadly
-from msmpetsc.output.surfaces import MEAN, compare_surfaces
+from msmpetsc.results.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
+from msmpetsc.results.reader import Result, refuse_deadly
+from msmpetsc.results.surfaces import MEAN, compare_surfaces
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"

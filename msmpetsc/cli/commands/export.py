@@ -4,8 +4,8 @@ import argparse
 
 from msmpetsc.app.checks import refuse_below_one
 from msmpetsc.cli.ranks import refuse_ranks
-from msmpetsc.output.export.formats import export
-from msmpetsc.output.reader import refuse_deadly
+from msmpetsc.export.formats import export
+from msmpetsc.results.reader import refuse_deadly
 
 
 def run(args: argparse.Namespace) -> int:

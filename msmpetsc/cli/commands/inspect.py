@@ -23,7 +23,7 @@ from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:
     from msmpetsc.geometry.surface import Surface
-    from msmpetsc.model.partition import Partition
+    from msmpetsc.lattice.partition import Partition
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])
-    from msmpetsc.model.build import read_bodies
-    from msmpetsc.model.partition import partition_of
+    from msmpetsc.build import read_bodies
+    from msmpetsc.lattice.partition import partition_of
     from msmpetsc.solve.presets import preset_names
 
     scene = load_scene(args.scene, args.set, preset_names())
@@ -125,7 +125,7 @@ def memory_of(partition: "Partition", surfaces: Sequence["Surface"], mesh: float
     surfaces : that are stored
     mesh     : bytes that reading and preparing them took, on rank 0
     """
-    from msmpetsc.model.lattice import lattice_bytes
+    from msmpetsc.lattice.lattice import lattice_bytes
     from msmpetsc.solve.linear.system import assembly_bytes
     from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
 

@@ -10,7 +10,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
-from msmpetsc.output.disk import whole_file, write_whole
+from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.shipped import shipped_text, shipped_titles

@@ -20,14 +20,14 @@ from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.output.drawing.colours import opened_reference
-from msmpetsc.output.drawing.mesh import SHOWN
-from msmpetsc.output.drawing.page import write_page
-from msmpetsc.output.drawing.playback import Style
-from msmpetsc.output.drawing.subject import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
-from msmpetsc.output.frame_choice import Frames, frames_of
-from msmpetsc.output.reader import Result, plain_damage, refuse_deadly
+from msmpetsc.results.frame_choice import Frames, frames_of
+from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.view.colours import opened_reference
+from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
+from msmpetsc.view.mesh import SHOWN
+from msmpetsc.view.page import write_page
+from msmpetsc.view.playback import Style
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
 STILL = (760, 900)  # [px]: a panel of a scene or a mesh
@@ -79,7 +79,7 @@ def style_of(args: argparse.Namespace) -> Style:
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
-        from msmpetsc.output.drawing.sheet import contact_sheet  # loads VTK, which a page does not need
+        from msmpetsc.view.sheet import contact_sheet  # loads VTK, which a page does not need
 
         contact_sheet(args.subject, path, args.frames, args.count, None, style, args.reference)
         return
@@ -101,7 +101,7 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     if path.suffix.lower() not in PICTURE_NAMES:
         _draw_motion(args, subject, path, [0], style, None)
         return
-    from msmpetsc.output.drawing.sheet import Moment, draw_moments
+    from msmpetsc.view.sheet import Moment, draw_moments
 
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
     if len(subject.rest.cells) and not style.shown:
@@ -116,8 +116,8 @@ def _draw_motion(
     if path.suffix.lower() in PAGE_NAMES:
         write_page(subject, path, frames, style, reference)
         return
-    from msmpetsc.output.drawing.film import TURN, write_film
-    from msmpetsc.output.drawing.playback import Playback, playback_of
+    from msmpetsc.view.film import TURN, write_film
+    from msmpetsc.view.playback import Playback, playback_of
 
     if args.turntable and len(frames) == 1:
         if args.speed is not None:
@@ -138,7 +138,7 @@ def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[st
         return drawable_of_surface(path, surface), (f"{_sides(surface.points)} m, {_counted(surface)}", "")
     from mpi4py import MPI
 
-    from msmpetsc.model.build import build_model  # compiled kernels, which drawing a result needs not
+    from msmpetsc.build import build_model  # compiled kernels, which drawing a result needs not
 
     scene = load_scene(path, changes)
     model = build_model(MPI.COMM_SELF, scene)

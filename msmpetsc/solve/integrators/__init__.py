@@ -2,8 +2,8 @@
 
 from mpi4py import MPI
 
-from msmpetsc.model.build import Model
-from msmpetsc.model.environment import Environment
+from msmpetsc.build import Model
+from msmpetsc.environment import Environment
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes

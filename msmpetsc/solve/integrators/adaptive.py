@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.checkpoint import MOST_COUNT, Checkpoint, Range
 from msmpetsc.comm import log
+from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.checkpoint import MOST_COUNT, Checkpoint, Range
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance

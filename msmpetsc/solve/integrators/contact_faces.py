@@ -3,8 +3,8 @@
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.environment import Environment
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.petsc.events import CONTACT
 
@@ -19,7 +19,7 @@ class ContactFaces:
 
     q, y       : (l, 3) [m], as a StepProblem has them
     time       : of the step's end [s]
-    before     : (o, l) faces when it began (model.environment); None: the nearest
+    before     : (o, l) faces when it began (environment); None: the nearest
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back
     fixed      : (l,) bool, nodes that are no unknowns
     sides      : (o, l) faces of the problem to solve; once settled, those of the step

@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import Checkpoint
-from msmpetsc.model.contact.reflection import StepTaken
-from msmpetsc.model.environment import Environment
+from msmpetsc.build import Model
+from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.contact.obstacles.reflection import StepTaken
+from msmpetsc.environment import Environment
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes, Trace

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.elasticity.locate import worst_inverted
+from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.environment import Environment
-from msmpetsc.model.locate import worst_inverted
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.functional import StepProblem

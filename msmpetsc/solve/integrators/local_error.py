@@ -14,7 +14,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import like, to_host
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import Ghosted
 
 SWEEPS = 4

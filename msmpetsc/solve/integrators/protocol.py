@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from msmpetsc.model.checkpoint import Checkpoint
+from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
 

@@ -4,8 +4,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import Ghosted
 
 SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.model.checkpoint import FINITE, Checkpoint
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.checkpoint import FINITE, Checkpoint
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import with_ghosts
 
 HISTORY, SIDES = ("history_q", "history_v"), "sides"
@@ -45,7 +45,7 @@ class State:
 
     history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
     ledger  : of energy, as the steps so far have filled it
-    sides   : (o, l) by which faces of the obstacles nodes are in contact (model.environment); None: the nearest
+    sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest
     """
 
     q: np.ndarray

@@ -18,10 +18,10 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.integrators.state import State

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from msmpetsc.model.checkpoint import COUNT, LENGTH, Range
+from msmpetsc.checkpoint import COUNT, LENGTH, Range
 
 SHARE = 1 / 8  # of what was saved, that a step may spend
 FAIR = 0.25  # of an equal share of all credit among all steps: a step may spend that in any case

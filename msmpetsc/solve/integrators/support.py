@@ -4,8 +4,8 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import to_host
+from msmpetsc.elasticity.locate import of_body
 from msmpetsc.errors import InputError
-from msmpetsc.model.locate import of_body
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import Bodies, bodies_of
 

@@ -23,14 +23,14 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import greatest
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.build import Model
+from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
+from msmpetsc.contact.obstacles.friction import Movers
+from msmpetsc.contact.obstacles.reflection import StepTaken
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.model.build import Model
-from msmpetsc.model.checkpoint import FINITE, Checkpoint, Range
-from msmpetsc.model.contact.friction import Movers
-from msmpetsc.model.contact.reflection import StepTaken
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.environment import Environment
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes

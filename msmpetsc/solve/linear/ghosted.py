@@ -5,7 +5,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of

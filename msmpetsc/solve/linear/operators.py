@@ -7,9 +7,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, to_host
-from msmpetsc.model.contact.penalty import Contact, Secants
-from msmpetsc.model.elasticity.energy import Elasticity, Hessian
-from msmpetsc.model.self_contact.term import SurfaceHessian
+from msmpetsc.contact.obstacles.penalty import Contact, Secants
+from msmpetsc.contact.surface.term import SurfaceHessian
+from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
@@ -117,7 +117,7 @@ class TrueHessian(Viewable):
         self, q: np.ndarray, contact: Contact | None, projected: bool = False, secants: Secants | None = None
     ) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
-        ``secants`` the true curvature of some friction (model.contact.penalty)."""
+        ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             count_flops(self.elasticity.flops.hessian)

@@ -5,7 +5,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like
-from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.memory import HOST, Memory

@@ -6,7 +6,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.geometry.embedding import Embedding
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 
 
 @numba.njit(cache=True)

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of

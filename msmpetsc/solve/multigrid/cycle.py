@@ -15,10 +15,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import to_host
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.initial_state import uniform
+from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import bodies_of

@@ -5,7 +5,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.model.elasticity.energy import Elasticity, Hessian
+from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.operators import Viewable
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import FINE, count_flops

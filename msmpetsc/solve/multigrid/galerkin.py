@@ -15,11 +15,11 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.elasticity.inversion import FRAMES, cofactors, corner_curvature, edges, vector_of
-from msmpetsc.model.elasticity.springs import SYMMETRIC, spring_block
-from msmpetsc.model.lattice import CORNERS
+from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo

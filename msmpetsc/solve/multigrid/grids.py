@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import decode_morton, encode_morton
-from msmpetsc.model.lattice import CORNERS
+from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 

@@ -4,8 +4,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.model.contact.penalty import Contact
-from msmpetsc.model.elasticity.energy import Elasticity
+from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.bodies import Translations
 from msmpetsc.solve.multigrid.cycle import Multigrid

@@ -18,8 +18,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest, like, to_host
-from msmpetsc.model.checkpoint import ANY, Checkpoint, Range
-from msmpetsc.model.initial_state import uniform
+from msmpetsc.checkpoint import ANY, Checkpoint, Range
+from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner

@@ -4,8 +4,8 @@ try."""
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.locate import describe_inverted, node_of_greatest
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 

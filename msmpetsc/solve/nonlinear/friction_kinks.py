@@ -2,14 +2,15 @@
 
 Beyond a small slip the Hessian of friction has nothing along the slip. So Newton's full step takes a node that is about
 to stick past the kink and round, the next one back, and the line search cuts each of them: of a lung that a plate
-pressed, all of 79 nodes turned in most of 28 iterations. The parabola of the secant (model.contact.penalty) never goes
+pressed, all of 79 nodes turned in most of 28 iterations. The parabola of the secant (contact.obstacles.friction)
+never goes
 too far, but comes in slowly where nodes slip on. So a step begins with secants; then only those nodes have them that
 the last full step took over a kink.
 """
 
 import numpy as np
 
-from msmpetsc.model.contact.penalty import Contact, Secants
+from msmpetsc.contact.obstacles.penalty import Contact, Secants
 
 
 class FrictionKinks:

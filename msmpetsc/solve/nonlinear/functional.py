@@ -11,8 +11,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
-from msmpetsc.model.contact.penalty import Contact
-from msmpetsc.model.elasticity.energy import Elasticity
+from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
 

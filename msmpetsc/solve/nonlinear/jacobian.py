@@ -8,9 +8,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import greatest
+from msmpetsc.contact.obstacles.penalty import Contact, Secants
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
-from msmpetsc.model.contact.penalty import Contact, Secants
-from msmpetsc.model.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
 from msmpetsc.solve.linear.system import assemble, diagonal_of

@@ -13,7 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.comm import log
-from msmpetsc.model.contact.penalty import Contact
+from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
 

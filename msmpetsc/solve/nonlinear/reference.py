@@ -5,7 +5,7 @@ from mpi4py import MPI
 
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import REFERENCE, begun

@@ -10,9 +10,9 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.lattice import Lattice
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl, Outcome

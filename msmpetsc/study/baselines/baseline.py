@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import msmpetsc
 from msmpetsc.errors import InputError, printable
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.study.process import environment, last_error
 
 ERROR = 1e-9  # of each step, relative

@@ -15,7 +15,7 @@ import numpy as np
 import vl_convert
 from numpy.typing import ArrayLike
 
-from msmpetsc.output.disk import write_whole
+from msmpetsc.results.disk import write_whole
 from msmpetsc.study.table import Row, records, spread
 
 if TYPE_CHECKING:

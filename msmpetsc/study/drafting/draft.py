@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.model.material import STEPS_A_PERIOD, bending_period
+from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.scene.keys import SCHEMA_FILE
 from msmpetsc.study.drafting.measures import MeshMeasures
 

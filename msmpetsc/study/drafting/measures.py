@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from msmpetsc.build import USUAL
 from msmpetsc.geometry.prepare import part_labels
 from msmpetsc.geometry.surface import Surface, SurfaceReport, examine
-from msmpetsc.model.build import USUAL
 
 MILLIMETRE = 1e-3  # [m]
 SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground

@@ -10,7 +10,7 @@ from conftest import WORKERS
 from mpi4py import MPI
 from stopped_runs import assert_same
 
-from msmpetsc.model.build import build_model
+from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.multigrid import cycle

@@ -4,8 +4,8 @@ import pytest
 from hierarchies import COMM, SHAPES, block
 from lattices import cages_of
 
-from msmpetsc.model.elasticity.energy import Elasticity
-from msmpetsc.model.lattice import build_lattice
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.lattice.lattice import build_lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.preconditioner import USUAL_PACE, WORTH, LatticePreconditioner
 

@@ -1,0 +1,330 @@
+"""From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.comm import log, on_root
+from msmpetsc.constraints.clamp import clamped
+from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
+from msmpetsc.constraints.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
+from msmpetsc.contact.obstacles.friction import STICK
+from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
+from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
+from msmpetsc.contact.obstacles.penalty import Penalty
+from msmpetsc.contact.obstacles.reflection import Exchange
+from msmpetsc.contact.surface.collision_surface import collision_surface
+from msmpetsc.contact.surface.pairs import CollisionSurface
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import FORCES
+from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.embedding import Embedding, embed
+from msmpetsc.geometry.prepare import prepare
+from msmpetsc.geometry.registry import load
+from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
+from msmpetsc.lattice.initial_state import InitialState, initial_state
+from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
+from msmpetsc.lattice.region import Finder, cell_materials
+from msmpetsc.scene.motion import ForceTable
+from msmpetsc.scene.schema import Scene
+
+SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
+PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle
+FARTHEST = 1e9  # longest sides from the origin: leaves seven digits of the shape
+USUAL = 1e-3, 20.0  # [m]: a body beyond these may well be given in another unit
+
+
+@dataclass(frozen=True)
+class Model:
+    """A scene made ready to step. Arrays hold this rank's share; the surfaces are on rank 0 only.
+
+    embedding : None where the scene stores no surface
+    loads     : gravity first, where there is any
+    own_forces : forces that are functions of the state that starts a step
+    start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
+    surface   : of all bodies, one after the other
+    damping   : of velocities, by the mass [1/s]
+    collision : the surface that meets itself, where it does
+    obstacles : in the scene's order
+    bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
+    """
+
+    surface: Surface | None
+    lattice: Lattice
+    embedding: Embedding | None
+    loads: list[Load]
+    anchors: list[Anchor]
+    exchanges: list[Exchange]
+    penalties: list[Penalty]
+    start: InitialState
+    collision: CollisionSurface | None = None
+    bodies: tuple[Body, ...] = ()
+    reaches: tuple[Reach, ...] = ()
+    damping: float = 0.0
+    own_forces: tuple[OwnForce, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+
+    @property
+    def body_of_point(self) -> Indices:
+        """Number (v,) of the body of each surface point, on rank 0."""
+        points = [0 if body.surface is None else len(body.surface.points) for body in self.bodies]
+        return np.repeat(np.arange(len(points)), points)
+
+    @cached_property
+    def solids(self) -> dict[int, Surface]:
+        """Surfaces of obstacles that are meshes or functions, by their numbers, on rank 0 (collective at first)."""
+        return surfaces_of(self.lattice.table.comm, self.obstacles, np.array([body.bounds for body in self.bodies]))
+
+
+class Geometry:
+    """What meshes and cages alone decide, which runs of other materials, loads and times may share.
+
+    bodies, cages, topology : surfaces, valid cells, and the nodes and springs that these make
+    """
+
+    def __init__(self, comm: MPI.Comm, scene: Scene):
+        """Read the meshes and fill them (collective). Raises InputError on all ranks."""
+        self.source = scene.folder, scene.meshes, scene.cages
+        self.bodies = read_bodies(comm, scene)
+        self.cages = fill_cages(self.bodies, scene)
+        self.topology = topology_of(self.cages)
+        self._nearest: Positions | None = None
+
+    def fits(self, scene: Scene) -> bool:
+        """Return whether a scene has these meshes and these cages."""
+        return self.source == (scene.folder, scene.meshes, scene.cages)
+
+    @cached_property
+    def embedding(self) -> Embedding:
+        """How the surfaces follow the nodes (collective)."""
+        points = [np.empty((0, 3)) if body.surface is None else body.surface.points for body in self.bodies]
+        _, _, cages = self.source
+        return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
+
+    def nearest(self, lattice: Lattice) -> Positions:
+        """Return the points (l, 3) [m] of the bodies that nodes are nearest to (collective).
+
+        lattice : of this shape, of any material
+        """
+        if self._nearest is None:
+            self._nearest = nearest_of_body(self.bodies, self.cages, lattice)
+        return self._nearest
+
+    def outside(self, lattice: Lattice) -> Floats | None:
+        """Return how far nodes (l,) stick out of the surfaces [m]; None where cells count whole (collective)."""
+        return None if self.cages.share is None else distance_outside(lattice, self.nearest(lattice))
+
+
+def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> Model:
+    """Build everything of a scene but its solver (collective). Raises InputError on all ranks.
+
+    shape : of the scene's meshes and cages, where it is known already
+    """
+    shape = shape or Geometry(comm, scene)
+    bodies, cages = shape.bodies, shape.cages
+    finder = Finder(bodies, cages, scene.folder)
+    lattice = _lattice(scene, shape, finder)
+    has_regions = any(any(scene.tables(kind)) for kind in NODES)
+    points = shape.nearest(lattice) if has_regions else lattice.nodes
+    masks = regions(scene, lattice, finder, points)
+    lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
+    anchors = _anchors(scene, lattice, masks)
+    fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
+    _check_that_something_moves(comm, lattice, fixed, anchors)
+    reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
+    outside = shape.outside(lattice) if scene.obstacle else None
+    obstacles = build_obstacles(comm, scene, lattice, outside)
+    return Model(
+        surface=joined([body.surface for body in bodies if body.surface is not None]),
+        lattice=clamped(scene, lattice, masks, finder, points),
+        embedding=shape.embedding if scene.output.surface else None,
+        loads=_loads(comm, scene, lattice, masks),
+        own_forces=_own_forces(scene, lattice, masks),
+        anchors=anchors,
+        exchanges=_exchanges(scene, obstacles),
+        penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
+        start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
+        bodies=bodies,
+        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
+        if scene.self_contact
+        else None,
+        reaches=reaches,
+        damping=scene.material.damping,
+        obstacles=tuple(obstacles),
+    )
+
+
+def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
+    """Return the model with the arrays that each step works with sent where ``send`` takes them.
+
+    What only prepares steps stays in the memory of the CPU.
+    """
+
+    lattice, (positions, velocities) = model.lattice, model.start
+    return replace(
+        model,
+        lattice=replace(
+            lattice,
+            nodes=send(lattice.nodes),
+            mass=send(lattice.mass),
+            pinned=send(lattice.pinned),
+            local_cells=send(lattice.local_cells),
+        ),
+        loads=[replace(load, force=send(load.force)) for load in model.loads],
+        anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
+        exchanges=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges],
+        penalties=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties],
+        start=(send(positions), send(velocities)),
+    )
+
+
+def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[Body, ...]:
+    """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
+
+    def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
+        surfaces, reports = zip(*_prepared(scene), strict=True)
+        return list(surfaces), list(zip(reports, map(bounds_of, surfaces), strict=True))
+
+    surfaces, facts = on_root(comm, read) or (None, None)
+    of_bodies: Sequence[Surface | None] = surfaces or [None] * len(scene.meshes)
+    return tuple(Body(comm, surface, *known) for surface, known in zip(of_bodies, comm.bcast(facts), strict=True))
+
+
+def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
+    """Yield the surface of each body with its report, checked; bodies of one shape are prepared once."""
+    shapes: dict[str, Surface] = {}
+    for path, mesh in scene.meshes.items():
+        whose = "" if path == ("mesh",) else f"{'.'.join(map(str, path))}: "
+        shape = repr(mesh.model_copy(update={"base": None}))
+        try:
+            if shape not in shapes:
+                shapes[shape] = prepare(load(mesh.source, scene.folder), mesh.prepare, mesh.size)
+            surface = prepare(shapes[shape], (), base=mesh.base)
+            _check_in_range(surface)
+            report = examine(surface)
+            warnings = *check_encloses(surface, report), *_doubtful_unit(surface, mesh.size)
+        except InputError as error:
+            raise InputError(f"{whose}{error}") from error
+        for warning in warnings:
+            log.warning("%s%s: %s", whose, mesh.source, warning)
+        yield compact(surface.points, surface.triangles), report  # a point of no triangle may lie in no cell
+
+
+def _check_in_range(surface: Surface) -> None:
+    """Raise InputError for a body whose volume or shape a double cannot hold."""
+    points = surface.points[np.unique(surface.triangles)]
+    side, reach = np.ptp(points, axis=0).max(), np.abs(points).max()
+    if side > 0 and not (SIDES[0] <= side <= SIDES[1] and reach <= FARTHEST * side):
+        raise InputError(
+            f"the mesh is {side:.3g} m long and reaches {reach:.3g} m from the origin: "
+            "too large, too small or too far away to compute with"
+        )
+
+
+def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
+    """Return a warning of a body whose longest side is unusual, unless the scene says what it is."""
+    side = np.ptp(surface.points[np.unique(surface.triangles)], axis=0).max()
+    if size is not None or USUAL[0] <= side <= USUAL[1]:
+        return []
+    unit = "millimetres" if side > USUAL[1] else "another unit than metres"
+    return [f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"]
+
+
+def fill_cages(bodies: Sequence[Body], scene: Scene) -> Cages:
+    """Return the scene's valid cells (collective)."""
+    cages = scene.cages
+    cell_size = cages.cell_size
+    if cages.count is not None:
+        cell_size = choose_cell_size(bodies, cages.count, cages.method, cages.max_cells, cages.boundary)
+    assert cell_size is not None  # the schema has one of the two
+    return fill(bodies, cell_size, cages.method, cages.max_cells, cages.boundary)
+
+
+def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
+    material = scene.material
+    return build_lattice(
+        shape.cages,
+        material.density,
+        young_modulus=material.young_modulus,
+        stiffness=material.stiffness,
+        stiffening=material.law_stiffening,
+        of_cells=cell_materials(scene, finder),
+        topology=shape.topology,
+    )
+
+
+def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
+    """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
+    anchors, taken = [], lattice.pinned
+    for anchor in scene.tables("anchor"):
+        where = masks[anchor.key] & ~taken
+        anchors.append(Anchor(where, Motion.through(anchor.table.path), anchor.table.stop))
+        taken = taken | where
+    return anchors
+
+
+def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, anchors: list[Anchor]) -> None:
+    if comm.allreduce(int((~fixed[: lattice.owned]).sum())) == 0:
+        what = "pin or anchor" if anchors else "pin"
+        raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
+
+
+def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> list[Load]:
+    loads = []
+    if scene.gravity is not None:
+        loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
+    for table in scene.tables("force"):
+        if table.table.total is None:
+            continue
+        where, force = masks[table.key][: lattice.owned], table.table
+        if isinstance(force.total, ForceTable):
+            share = spread_by_mass(comm, (1.0,), where, lattice.mass)
+            loads.append(Load(share, force.start, force.stop, LoadTable.of_scene(force.total)))
+        else:
+            loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
+    return loads
+
+
+def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
+    """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
+    forces = []
+    for table in scene.tables("force"):
+        force = table.table
+        if force.function is not None:
+            rows = np.flatnonzero(masks[table.key][: lattice.owned])
+            function = FORCES.find(force.function)
+            forces.append(OwnForce(table.key, function, rows, lattice.mass[rows], force.start, force.stop))
+    return tuple(forces)
+
+
+def _exchanges(scene: Scene, obstacles: list[Obstacle]) -> list[Exchange]:
+    pairs = zip(obstacles, scene.obstacle, strict=True)
+    return [
+        Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
+        for obstacle, table in pairs
+        if table.response == "exchange"
+    ]
+
+
+def _penalties(
+    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: Rows, obstacles: list[Obstacle]
+) -> list[Penalty]:
+    pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response != "exchange"]
+    if not pressing:
+        return []
+    usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
+    return [
+        Penalty(
+            obstacle,
+            o.stiffness or usual,
+            o.friction or 0.0,
+            stick,
+            None if o.restitution == 1 else o.restitution,
+        )
+        for obstacle, o in pressing
+    ]

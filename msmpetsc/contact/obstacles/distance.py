@@ -1,0 +1,114 @@
+"""Solids known by the distance to their surface, which may be a function of the user's own."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
+from msmpetsc.contact.obstacles.solids import TINY, Send, one_face
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import DistanceFunction
+from msmpetsc.geometry.surface import Surface
+
+POINTS = 65  # of the grid that shows a function's surface, along each axis
+BEYOND = 1.0  # around the bodies, of their longest side: so far it is shown
+NEAR = 1e-4  # of the depth: over a shorter way a depth's slope gives more digits of its change than two depths
+
+
+class DistanceSolid(ABC):
+    """A solid that is asked on the CPU, where a step often asks for the same positions again."""
+
+    has_sides = False
+
+    def __init__(self) -> None:
+        self._last: tuple[Positions, Floats, Indices] | None = None
+
+    def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
+        """Return how deep positions lie (n,) [m] and their faces (n,), known of the positions asked for last."""
+        on_host = to_host(q)
+        if self._last is None or not np.array_equal(self._last[0], on_host):
+            self._last = (on_host.copy(), *self._find(on_host))
+        _, depths, face = self._last
+        return like(q, depths.copy()), like(q, face.copy())
+
+    def normals(self, q: Positions, face: Indices) -> Rows:
+        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
+        return like(q, self._behind(to_host(q), to_host(face))[1])
+
+    def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
+        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m].
+
+        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface bends by
+        1 / r.
+        """
+        face, way = to_host(face), to_host(moved)
+        (depth, normal), (depth_before, normal_before) = (self._behind(to_host(x), face) for x in (q, q - moved))
+        near = np.linalg.norm(way, axis=1) < NEAR * np.maximum(depth, depth_before)
+        near &= (normal * normal_before).sum(axis=1) > 0
+        slope = -0.5 * (way * (normal + normal_before)).sum(axis=1)
+        return like(q, np.where(near, slope, depth - depth_before))
+
+    def sent(self, send: Send) -> "DistanceSolid":
+        """Return the solid itself: what is asked on the CPU stays there."""
+        return self
+
+    @abstractmethod
+    def surface(self, low: Positions, high: Positions) -> Surface:
+        """Return its surface, for pictures, around bodies that are between two corners (3,) [m]."""
+
+    @abstractmethod
+    def _find(self, q: Positions) -> tuple[Floats, Indices]:
+        """Return depths and faces (n,) of positions (n, 3)."""
+
+    @abstractmethod
+    def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
+        """Return how far positions (n, 3) within lie behind faces (n,), (n,) [m], and the unit normals (n, 3)."""
+
+
+class FunctionSolid(DistanceSolid):
+    """Where the signed distance that a function of the user's returns is below 0.
+
+    key : of its table in the scene, for messages
+    """
+
+    def __init__(self, function: DistanceFunction, key: str):
+        super().__init__()
+        self.function, self.key = function, key
+
+    def distances(self, q: Positions) -> tuple[Floats, Rows]:
+        """Return the signed distances (n,) [m] of positions (n, 3) [m], and their gradients (n, 3).
+
+        Raises InputError where the function returns anything else.
+        """
+        with np.errstate(all="warn"):  # it is the user's own
+            answer = self.function(q.copy())
+        try:
+            distance, gradient = (np.asarray(part, float) for part in answer)
+            distance, gradient = np.broadcast_to(distance, len(q)), np.broadcast_to(gradient, q.shape)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"{self.key}.function: returned no distances of shape {(len(q),)} and gradients of shape {q.shape}"
+            ) from None
+        if not (np.isfinite(distance).all() and np.isfinite(gradient).all()):
+            raise InputError(f"{self.key}.function: returned numbers that are not finite")
+        return distance, gradient
+
+    def surface(self, low: Positions, high: Positions) -> Surface:
+        """Return its surface by marching cubes, open where it goes on beyond what is shown."""
+        import igl
+
+        margin = BEYOND * (high - low).max()
+        axes = [np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)  # x runs first
+        distance = np.ascontiguousarray(self.distances(grid)[0])
+        points, triangles, _ = igl.marching_cubes(distance, grid, POINTS, POINTS, POINTS)
+        return Surface(points.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
+
+    def _find(self, q: Positions) -> tuple[Floats, Indices]:
+        return (-self.distances(q)[0], one_face(q)) if len(q) else (np.zeros(0), one_face(q))
+
+    def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
+        if not len(q):
+            return np.zeros(0), np.zeros((0, 3))
+        distance, gradient = self.distances(q)
+        return -distance, gradient / np.maximum(np.linalg.norm(gradient, axis=1), TINY)[:, None]

@@ -1,0 +1,98 @@
+"""From a scene's tables to obstacles."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.comm import log, on_root, together
+from msmpetsc.constraints.loads import Motion
+from msmpetsc.contact.obstacles.distance import DistanceSolid, FunctionSolid
+from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Solid
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import OBSTACLES
+from msmpetsc.geometry.prepare import prepare
+from msmpetsc.geometry.registry import load
+from msmpetsc.geometry.surface import Surface, check_encloses, examine
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.body import MeshTable
+from msmpetsc.scene.obstacle import ObstacleTable
+from msmpetsc.scene.schema import Scene
+
+MOST_OFF = 0.01  # by which the gradient of a distance may differ from a unit vector in length
+
+
+def build_obstacles(comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None) -> list[Obstacle]:
+    """Return the obstacles of a scene, for nodes (l,) that stick ``outside`` [m] so far (collective).
+
+    Raises InputError on all ranks for a mesh that is not closed, and for a function that is no signed distance.
+    """
+    obstacles = []
+    for number, table in enumerate(scene.obstacle):
+        key = f"obstacle.{number}"
+        path, solid = Motion.through(table.path), _solid(comm, table, key, scene.folder)
+        if isinstance(solid, FunctionSolid):
+            with together(comm):
+                _check_is_distance(solid, lattice.nodes[: lattice.owned])
+        obstacles.append(Obstacle(solid, path, table.start, table.stop, key, outside))
+    return obstacles
+
+
+def surfaces_of(comm: MPI.Comm, obstacles: Sequence[Obstacle], bounds: Rows) -> dict[int, Surface]:
+    """Return on rank 0 the surfaces of obstacles that are meshes or functions, by their numbers (collective).
+
+    bounds : (b, 2, 3) corners of the box around each body at rest [m]
+    """
+    numbered = enumerate(obstacle.solid for obstacle in obstacles)
+    solids = {number: solid for number, solid in numbered if isinstance(solid, DistanceSolid)}
+    if not solids:
+        return {}
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return on_root(comm, lambda: {number: solid.surface(low, high) for number, solid in solids.items()}) or {}
+
+
+def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
+    """Return the surface of an obstacle that is a mesh. Raises InputError if it is not closed."""
+    try:
+        surface = prepare(load(mesh.source, folder), mesh.prepare, mesh.size, mesh.base)
+        report = examine(surface)
+        warnings = check_encloses(surface, report)
+    except InputError as error:
+        raise InputError(f"{key}.mesh: {error}") from error
+    if not report.closed:
+        raise InputError(f"{key}.mesh: must be closed: {warnings[0]}")
+    for warning in warnings:
+        log.warning("%s.mesh: %s: %s", key, mesh.source, warning)
+    return surface
+
+
+def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path) -> Solid:
+    if table.mesh is not None:
+        from msmpetsc.contact.obstacles.mesh_solid import MeshSolid  # and igl and trimesh: other scenes need neither
+
+        mesh = table.mesh
+        surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))
+        return MeshSolid(surface)
+    if table.function is not None:
+        with together(comm):
+            return FunctionSolid(OBSTACLES.find(table.function), key)
+    if table.box is not None:
+        return Faces.of_box(*np.array(table.box))
+    if table.center is not None:
+        return BallSolid(np.array(table.center), table.radius or 0.0)
+    return Faces(np.array([table.point]), np.array([table.normal]))
+
+
+def _check_is_distance(solid: FunctionSolid, points: Positions) -> None:
+    """Raise InputError unless the gradients at most of the points (n, 3) [m] are of length 1, as a distance's are."""
+    if not len(points):
+        return
+    _, gradient = solid.distances(points)
+    length = float(np.median(np.linalg.norm(gradient, axis=1)))
+    if abs(length - 1) > MOST_OFF:
+        raise InputError(
+            f"{solid.key}.function: no signed distance: its gradient is {length:.3g} long at most nodes, not 1"
+        )

@@ -1,0 +1,102 @@
+"""Solids that nodes stay out of, where they are at a time, and how far nodes are in them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
+from msmpetsc.constraints.loads import Motion, within
+from msmpetsc.contact.obstacles.solids import Faces, Send, Solid, no_sides
+from msmpetsc.elasticity.locate import node_of_greatest
+from msmpetsc.lattice.lattice import Lattice
+
+TOUCHING = 1e-6  # cells: no depth, but what was rounded
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A solid that may move, and may be there for a while only.
+
+    solid       : at its place at time 0
+    path        : how it moves
+    start, stop : it is there while start <= time < stop [s]; None: to the end
+    key         : of its table in the scene, for messages
+    outside     : (l,) how far nodes stick out of the surface at rest [m] (contact.outside): they go so much deeper
+        before the surface meets the obstacle. None: they are the surface
+    """
+
+    solid: Solid
+    path: Motion
+    start: float = 0.0
+    stop: float | None = None
+    key: str = "obstacle"
+    outside: Floats | None = None
+
+    def acts_at(self, time: float) -> bool:
+        """Return whether the obstacle is there at a time [s]."""
+        return within(time, self.start, self.stop)
+
+    def seen_from(self, q: Positions, time: float) -> Positions:
+        """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""
+        return q - like(q, self.path.displacement_at(time)) if self.path.leads_away else q
+
+    def depths(self, q: Positions, time: float, sides: Indices | None = None) -> tuple[Floats, Indices]:
+        """Return how deep the surface at nodes (n, 3) lies in the obstacle at a time [s], (n,) [m], and faces (n,).
+
+        sides : (n or more,) by which face each node came in; None: the nearest counts
+        """
+        depths, face = self.solid.depths(self.seen_from(q, time), sides)
+        return depths if self.outside is None else depths - self.outside[: len(q)], face
+
+    def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
+        """Return the unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
+        return self.solid.normals(self.seen_from(q, time), face)
+
+    @property
+    def has_sides(self) -> bool:
+        """Whether it matters by which of its faces a node came in."""
+        return self.solid.has_sides
+
+    def sides(
+        self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None = None
+    ) -> Indices:
+        """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3) [m] in a step ending at ``time``.
+
+        before : (n,) the sides when it began. A node that the obstacle appears around gets the face nearest to it.
+        """
+        if not (self.acts_at(time) and isinstance(self.solid, Faces)):
+            return no_sides(q)
+        begin = max(time - time_step, 0.0)
+        if not self.acts_at(begin):
+            q, begin = end, time
+        before = no_sides(q) if before is None else before
+        return self.solid.sides_of(self.seen_from(q, begin), self.seen_from(end, time), before)
+
+    def sent(self, send: Send) -> "Obstacle":
+        """Return it with the arrays that each step works with sent where ``send`` takes them."""
+        outside = None if self.outside is None else send(self.outside)
+        return replace(self, solid=self.solid.sent(send), outside=outside)
+
+
+def describe_overlap(
+    comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, held: Mask, time: float
+) -> str | None:
+    """Describe the free nodes that lie inside an obstacle as it stands at a time [s]; None if none does (collective).
+
+    A scene seldom means that, and what reflects leaves them inside.
+
+    q, held : (l, 3) [m]; (l,) bool, the nodes that are not free
+    """
+    owned = slice(lattice.owned)
+    inside, _ = obstacle.depths(q[owned], time)
+    rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~held[owned])
+    count = comm.allreduce(len(rows))
+    if not count:
+        return None
+    deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
+    nodes = f"{count} node{'s' if count > 1 else ''}"
+    worst = node_of_greatest(comm, lattice, rows, inside[rows])
+    return (
+        f"{nodes} inside {obstacle.key}, up to {deepest:.3g} m ({deepest / lattice.cell_size:.2g} cells) deep: {worst}"
+    )

@@ -1,0 +1,193 @@
+"""Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
+and Coulomb friction (contact.friction) on those that were.
+
+A node at depth d > 0 has the energy 1/2 k d^2. It is convex for one face, and so is what a step minimises.
+
+With the push of the start friction is of first order in the step's length. A step of BDF2 takes what the two last
+states lead to, N_(n+1) = 2 N_n - N_(n-1), and u = tau v_(n+1), the velocity that it ends with: of second order.
+
+A node that came into a box by one of its faces has that for its ``side``, and its depth is the way back through it,
+also beyond the far face: a plate that a node passes within a step pushes it back. Without a side the nearest counts.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
+from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
+from msmpetsc.contact.obstacles.obstacle import Obstacle
+
+if TYPE_CHECKING:
+    from msmpetsc.contact.surface.term import SurfaceContact
+
+Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """stiffness [N/m] on each node; friction mu; below the slip speed ``stick`` [m/s] friction fades to nothing.
+
+    restitution : of nodes that strike, normal speed after over before; None for 1: what the push makes of it
+    """
+
+    obstacle: Obstacle
+    stiffness: float
+    friction: float
+    stick: float
+    restitution: float | None = None
+
+    def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
+        """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
+        return ContactState(self.obstacle, time, self.stiffness, None, sides)
+
+    def during(
+        self,
+        q: Positions,
+        time: float,
+        time_step: float,
+        sides: Indices | None = None,
+        before: Positions | None = None,
+    ) -> "ContactState":
+        """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
+
+        before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
+            that it ends with, under the push that is to be expected then
+        """
+        state = self.state_at(time, sides)
+        if self.friction == 0:
+            return state
+        start, path = time - time_step, self.obstacle.path
+        nodes, depth, normal = self.state_at(start, sides).pressed(q)
+        way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
+        carried = q[nodes] + way
+        if before is not None:
+            carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
+            stick *= 2 / 3
+            depth = self._depth_to_come(2 * q - before, time, sides, nodes, depth)
+        return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
+
+    def _depth_to_come(self, q: Positions, time: float, sides: Indices | None, nodes: Indices, depth: Floats) -> Floats:
+        """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
+
+        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just come in the way there
+        says nothing of how far it goes.
+        """
+        coming, _ = self.obstacle.depths(q, time, sides)
+        return np.clip(coming[nodes], 0, 2 * depth)
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """An obstacle as it stands at a time [s], where a step ends.
+
+    stiffness : [N/m] on each node
+    friction  : of the step, if any
+    sides     : (owned or more,) by which face each node came in (faces.side_of); None: the nearest
+    """
+
+    obstacle: Obstacle
+    time: float
+    stiffness: float
+    friction: Friction | None
+    sides: Indices | None = None
+
+    def depths(self, q: Positions) -> tuple[Floats, Indices]:
+        """Return the depths (n,) [m] of positions (n, 3), and the faces (n,) that push."""
+        return self.obstacle.depths(q, self.time, self.sides)
+
+    def pressed(self, q: Positions) -> Pressed:
+        """Return which of the positions (n, 3) are pressed, rows (a,), how deep (a,) [m] and the normals (a, 3)."""
+        depths, face = self.depths(q)
+        rows = np.flatnonzero(depths > 0)
+        return rows, depths[rows], self.obstacle.normals_at(q[rows], self.time, face[rows])
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return the energy of the push at q less that at base (n, 3) [J]."""
+        (depths, face), (base_depths, base_face) = self.depths(q), self.depths(base)
+        within = np.flatnonzero((depths > 0) & (base_depths > 0) & (face == base_face))
+        depths, base_depths = np.maximum(depths, 0), np.maximum(base_depths, 0)
+        deeper = depths - base_depths
+        if len(within):
+            seen, moved = self.obstacle.seen_from(q[within], self.time), (q - base)[within]
+            deeper[within] = self.obstacle.solid.deeper(seen, moved, face[within])
+        return 0.5 * self.stiffness * float(deeper @ (depths + base_depths))
+
+
+class Contact:
+    """What all obstacles, and the surface that meets itself, add to E in one step. Positions q are (owned or more, 3)
+    [m].
+
+    Gradient and Hessian of obstacles act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
+
+    surface : self-contact, if the scene has it; all that asks it is collective
+    """
+
+    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
+        self.states, self.owned, self.surface = states, owned, surface
+
+    def energy(self, q: Positions) -> float:
+        """Return the energy [J] of the push of obstacles alone: friction stores none."""
+        energy = 0.0
+        for state in self.states:
+            inside = np.maximum(state.depths(q[: self.owned])[0], 0)
+            energy += 0.5 * state.stiffness * float(inside @ inside)
+        return energy
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return the energy at q less that at base, friction included [J]."""
+        return self.change_at_nodes(q, base) + (self.surface.change(q, base) if self.surface else 0.0)
+
+    def change_at_nodes(self, q: Positions, base: Positions) -> float:
+        """Return the energy of obstacles alone at q less that at base, friction included [J]."""
+        total = 0.0
+        for state in self.states:
+            total += state.change(q[: self.owned], base[: self.owned])
+            if state.friction:
+                total += float(state.friction.change(q, base))
+        return total
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        for state in self.states:
+            rows, depth, normal = state.pressed(q[: self.owned])
+            gradient[rows] -= (state.stiffness * depth)[:, None] * normal
+            if state.friction:
+                state.friction.add_gradient(q, gradient)
+        if self.surface:
+            self.surface.add_gradient(q, gradient)
+
+    def all_secant(self) -> Secants:
+        """Return what ``hessian`` takes for all friction to have its secant."""
+        return [state.friction.all_secant() if state.friction else None for state in self.states]
+
+    def passes_kinks(self, q: Positions, base: Positions) -> Secants:
+        """Return what ``hessian`` takes for friction to have its secant where it has a kink between base and q."""
+        return [state.friction.passes_kink(q, base) if state.friction else None for state in self.states]
+
+    def hessian(self, q: Positions, true: bool, secants: Secants | None = None) -> Iterator[tuple[Indices, Rows]]:
+        """Yield of each push and friction of obstacles the nodes (a,), each once, and their blocks (a, 3, 3) [N/m].
+
+        The Hessian is the sum of all; each block is positive semidefinite. Across the
+        normal a solid that is round with radius r at a node has -k d / r, too, which is left out.
+
+        true : or else no less than that, as A is no less than the Hessian of the springs: with A, friction's true
+            Hessian, nothing along a slip, would let nodes run to and fro
+        secants : where friction has that of its secant all the same
+        """
+        for state, secant in zip(self.states, secants or [None] * len(self.states), strict=True):
+            rows, _, normal = state.pressed(q[: self.owned])
+            yield rows, state.stiffness * squares(normal)
+            if state.friction:
+                yield state.friction.nodes, state.friction.blocks(q, true, secant)
+
+    def bound(self, q: Positions) -> Floats:
+        """Return (owned,) [N/m] no less than each node's block, and constant while the same nodes meet obstacles."""
+        bound = np.zeros(self.owned, like=q)
+        for state in self.states:
+            bound += state.stiffness * (state.depths(q[: self.owned])[0] > 0)
+            if state.friction:
+                bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
+        return bound + self.surface.bound(q) if self.surface else bound

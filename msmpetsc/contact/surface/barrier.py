@@ -1,0 +1,220 @@
+"""Barrier between the triangles of one surface, and its friction, by ipctk (Li et al. 2020, Incremental Potential
+Contact): all that is computed of points on one rank.
+
+A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
+distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0. All such
+pairs count, so that the energy is continuous: with fewer (Chen et al. 2025, Offset Geometric Contact) it jumps where
+one comes to count or ceases to, and line searches end there.
+
+Pairs that are near at rest for being neighbours push each other from smaller distances, each set of them from its own
+(self_contact.creases); so contacts are one set for each distance.
+
+ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Indices, Positions, Rows
+from msmpetsc.contact.surface.creases import creases, neighbours, together
+from msmpetsc.geometry.surface import Surface
+
+if TYPE_CHECKING:
+    import ipctk
+    from scipy.sparse import csc_matrix
+
+ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"  # one for each distance that pairs push from
+
+KEPT = 0.9  # of the way to where surfaces meet
+PIECE = 2.0  # edges that points move in one piece of a way
+PIECES = 200  # of a way; what is longer is shortened
+
+
+@dataclass(frozen=True)
+class BarrierLaw:
+    """Parameters of the barrier.
+
+    distance  : dhat [m]
+    stiffness : kappa [J/m^2]
+    friction  : Coulomb's mu
+    stick     : slip speed [m/s] below which friction fades to nothing
+    """
+
+    distance: float
+    stiffness: float
+    friction: float
+    stick: float
+
+
+@dataclass(frozen=True)
+class SweptPairs:
+    """Pairs that come near on the first of so many pieces, all as long, of a straight way of the points."""
+
+    whole: int
+    pieces: "list[ipctk.Candidates]"
+
+    def pairs_at(self, share: float) -> "ipctk.Candidates | None":
+        """Return those at a share of the way; None beyond the pieces."""
+        piece = max(int(np.ceil(share * self.whole)) - 1, 0)
+        return self.pieces[piece] if piece < len(self.pieces) else None
+
+
+class Barrier:
+    """Barrier of a surface (p, 3), by the positions S (p, 3) [m] of its points.
+
+    edge : mean length of the surface's edges at rest [m]
+    """
+
+    def __init__(self, surface: Surface, law: BarrierLaw):
+        import ipctk  # of the extra "contact"
+
+        ipctk.set_num_threads(1)
+        ipctk.set_logger_level(ipctk.LoggerLevel.off)
+        self.ipctk, self.law = ipctk, law
+        triangles = np.asfortranarray(surface.triangles, np.int32)
+        edges = np.asfortranarray(ipctk.edges(triangles), np.int32)
+        self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)
+        ends = surface.points[edges]
+        self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+        self.ccd = ipctk.AdditiveCCD()
+        self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
+        self.creases: list[ipctk.Candidates] = []  # pairs of each distance after the first
+        self.folded: ipctk.Candidates = ipctk.Candidates()  # all of them
+
+    def _potential(self, distance: float) -> "ipctk.BarrierPotential":
+        """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
+        stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
+        return self.ipctk.BarrierPotential(self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness)
+
+    def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
+        """Let pairs that are near at rest for being neighbours on the surface push from smaller distances only, points
+        (p, 3) [m] at rest; how many these are, and how many do not push at all."""
+        pairs = neighbours(self.candidates(points, 0.0), self.mesh, points, self.law.distance)
+        if pairs:
+            self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
+        sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
+        self.creases, self.folded = list(sets.values()), together(list(sets.values()))
+        self.distances += sets
+        self.potentials += [self._potential(distance) for distance in sets]
+        return len(self.folded), dropped
+
+    def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
+        """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m], but
+        for those in creases."""
+        candidates = self.ipctk.Candidates()
+        candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
+        return candidates
+
+    def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
+        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
+        from, and until any pair of the surface does; 0 where one is."""
+        clear = [reach]
+        for pairs, distance in zip((candidates, *self.creases), self.distances, strict=True):
+            near = self._pairs(pairs, points, distance + 2 * reach)
+            clear.append(reach if near.empty() else max(0.5 * (self._least(near, points) - distance), 0.0))
+        return clear[1], min(clear)
+
+    def contacts(self, candidates: "ipctk.Candidates | None", points: Positions) -> ContactSets:
+        """Return the pairs nearer than they push from, one set for each distance; of creases only without
+        ``candidates``."""
+        kinds = zip((candidates or self.ipctk.Candidates(), *self.creases), self.distances, strict=True)
+        return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
+
+    def _pairs(self, candidates: Any, points: Positions, distance: float) -> "ipctk.NormalCollisions":
+        pairs = self.ipctk.NormalCollisions()
+        pairs.use_area_weighting = True
+        pairs.build(candidates, self.mesh, np.asfortranarray(points), distance)
+        return pairs
+
+    def pushing(self, contacts: ContactSets) -> list[tuple["ipctk.BarrierPotential", "ipctk.NormalCollisions"]]:
+        """Return the sets that are not empty, each with its barrier."""
+        return [(p, pairs) for p, pairs in zip(self.potentials, contacts, strict=True) if not pairs.empty()]
+
+    def energy(self, contacts: ContactSets, points: Positions) -> float:
+        """Return the barriers' energy [J]."""
+        points = np.asfortranarray(points)
+        return sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts))
+
+    def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
+        """Return its gradient (p, 3) [N]."""
+        gradient, points = np.zeros(points.size), np.asfortranarray(points)
+        for potential, pairs in self.pushing(contacts):
+            gradient += potential.gradient(pairs, self.mesh, points)
+        return gradient.reshape(-1, 3)
+
+    def hessian(self, contacts: ContactSets, points: Positions, projected: bool) -> "list[csc_matrix]":
+        """Return the terms (3p, 3p) [N/m] of its Hessian; ``projected`` leaves out the negative part of each pair."""
+        kinds, points = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
+        kind = kinds.CLAMP if projected else kinds.NONE
+        return [potential.hessian(pairs, self.mesh, points, kind) for potential, pairs in self.pushing(contacts)]
+
+    def least(self, contacts: ContactSets, points: Positions) -> float:
+        """Return the least distance [m]; infinite where there are no contacts."""
+        return min((self._least(pairs, points) for _, pairs in self.pushing(contacts)), default=np.inf)
+
+    def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
+        return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
+
+    def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates") -> float:
+        """Return the share, up to 1, of a straight way that points go from start (p, 3) by ``moved`` (p, 3) [m]
+        without any meeting.
+
+        candidates : pairs that may meet on it, besides those in creases
+        """
+        end = start + moved - moved.mean(axis=0)
+        return _kept(self._share(start, end, candidates, self.folded))
+
+    def sweep(self, start: Positions, moved: Rows, aside: float) -> tuple[float, "SweptPairs"]:
+        """Return the free share of any way, as ``free_share`` does, and the pairs near it, up to where points meet.
+
+        aside : [m], as far as points may be from the way and have no other pairs
+        """
+        moved = moved - moved.mean(axis=0)
+        farthest = float(np.sqrt((moved**2).sum(axis=1).max()))
+        whole, pieces = max(int(np.ceil(farthest / (PIECE * self.edge))), 1), []
+        for piece in range(min(whole, PIECES)):
+            begin, end = (start + i / whole * moved for i in (piece, piece + 1))
+            pieces.append(self._near_way(begin, end, 0.5 * self.law.distance + aside))
+            if self._share(begin, end, pieces[-1], self.folded) < 1:  # or a tenth as far apart: pairs that pass
+                share = self._share(begin, end, self._near_way(begin, end, 0.0), self.folded)
+                if share < 1:
+                    return KEPT * (piece + share) / whole, SweptPairs(whole, pieces)
+        return (1.0 if whole <= PIECES else PIECES / whole), SweptPairs(whole, pieces)
+
+    def _near_way(self, begin: Positions, end: Positions, reach: float) -> "ipctk.Candidates":
+        """Return the pairs whose boxes meet on a way, each wider by ``reach`` [m]."""
+        candidates = self.ipctk.Candidates()
+        candidates.build(self.mesh, np.asfortranarray(begin), np.asfortranarray(end), reach, self.ipctk.LBVH())
+        return candidates
+
+    def free_share_in_creases(self, start: Positions, moved: Rows) -> float:
+        """Return the free share of a way on which only pairs in creases can meet."""
+        return _kept(self._share(start, start + moved, self.folded))
+
+    def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
+        ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
+        return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
+
+
+def _kept(share: float) -> float:
+    return share if share >= 1 else KEPT * share
+
+
+def crossings(surface: Surface) -> Indices:
+    """Return the triangles (k,) that edges of others cross or that have such an edge, ascending."""
+    barrier = Barrier(surface, BarrierLaw(1.0, 1.0, 0.0, 1.0))
+    ipctk, mesh = barrier.ipctk, barrier.mesh
+    points = surface.points
+    phase = ipctk.LBVH()
+    phase.can_vertices_collide = mesh.can_collide
+    phase.build(np.asfortranarray(points), mesh.edges, mesh.faces)
+    cut, crossing = set(), set()
+    for pair in phase.detect_edge_face_candidates():
+        edge, face = mesh.edges[pair.edge_id], mesh.faces[pair.face_id]
+        if not set(edge) & set(face) and ipctk.is_edge_intersecting_triangle(*points[edge], *points[face]):
+            crossing.add(pair.edge_id)
+            cut.add(pair.face_id)
+    cut |= set(np.flatnonzero(np.isin(mesh.faces_to_edges, list(crossing)).any(axis=1)).tolist())
+    return np.array(sorted(cut), np.int64)

@@ -1,0 +1,113 @@
+"""The surface that meets itself: the body's own or a coarser one, without the triangles that cut others at rest."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.comm import log, on_root
+from msmpetsc.contact.obstacles.friction import STICK
+from msmpetsc.contact.surface.barrier import BarrierLaw, crossings
+from msmpetsc.contact.surface.pairs import CollisionSurface
+from msmpetsc.contact.surface.points import SurfacePoints
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.prepare import simplify
+from msmpetsc.geometry.surface import Surface, compact, joined
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.motion import SelfContactTable
+from msmpetsc.scene.schema import Scene
+
+NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
+MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart
+FEWEST = 20  # triangles of a body
+HASTE = 4  # of the decimation: with its usual 7 bunny and lung were twice and four times as far off
+PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
+
+
+def collision_surface(
+    comm: MPI.Comm,
+    table: SelfContactTable,
+    scene: Scene,
+    bodies: Sequence[Body],
+    cages: Cages,
+    lattice: Lattice,
+) -> CollisionSurface:
+    """Return the surface of all bodies that meets itself (collective).
+
+    Raises InputError on all ranks where more than a tenth of its triangles cut others at rest.
+    """
+    prepared = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table))
+    surfaces, off = prepared or ([], 0.0)
+    points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
+    embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
+    sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)
+    distance = table.distance or max(NEAR * float(np.linalg.norm(sides)), comm.bcast(off))
+    stiffness = _stiffness(comm, lattice, distance, scene.time.step)
+    law = BarrierLaw(distance, stiffness, table.friction, STICK * float(sides.max()))
+    return CollisionSurface(joined(surfaces), SurfacePoints(comm, lattice, embedding), law)
+
+
+def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: float) -> float:
+    """Return kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what
+    its inertia adds in a step, rho h / t^2.
+
+    Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness) takes both of each contact; with those of
+    the stiffest cell it is the same at all times, and so is the energy of a given state.
+    """
+    mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
+    layer = (PER_EDGE * lattice.stiffest(comm) + mass / time_step**2) / lattice.cell_size**2
+    return distance**2 * layer
+
+
+def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:
+    """Return the bodies' surfaces, of about as many triangles together as asked for, all of them if None, without those
+    that cut others, and the median distance [m] of their own points from them. Raises InputError where too many do."""
+    off = 0.0
+    if table.surface is not None:
+        share = table.surface / sum(len(body.triangles) for body in bodies)
+        coarser = [_coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies]
+        bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
+    whole = joined(bodies)
+    assert whole is not None
+    cut = crossings(whole)
+    if len(cut) == 0:
+        return bodies, off
+    at = ", ".join(f"{c:.4g}" for c in whole.points[whole.triangles[cut[0]]].mean(axis=0))
+    what = f"self_contact: {len(cut)} of {len(whole.triangles)} triangles cut others at rest, the first at ({at}) m"
+    if len(cut) > MOST_CUT * len(whole.triangles):
+        raise InputError(f'{what}, too many to leave out: mesh.prepare = ["union"] or ["repair"] may mend the mesh')
+    log.warning("%s: they are left out, and may be crossed", what)
+    of_body = np.split(
+        ~np.isin(np.arange(len(whole.triangles)), cut), np.cumsum([len(b.triangles) for b in bodies])[:-1]
+    )
+    return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)], off
+
+
+def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
+    """Return the median distance [m] of the bodies' points from the coarser surfaces, and say the greatest, of which a
+    part that was lost makes much."""
+    import igl
+
+    squares = [
+        igl.point_mesh_squared_distance(body.points, coarse.points, coarse.triangles)[0]
+        for body, coarse in zip(bodies, coarser, strict=True)
+    ]
+    off = np.sqrt(np.concatenate(squares))
+    if off.max() > distance:
+        log.warning(
+            "self_contact.surface: the surface drawn is off the one of %d triangles that meets itself by up to %.2g m, "
+            "half of it by more than %.2g m: where it touches, it may cross by as much; more triangles bring it nearer",
+            sum(len(coarse.triangles) for coarse in coarser), off.max(), np.median(off),
+        )  # fmt: skip
+    return float(np.median(off))
+
+
+def _coarser(surface: Surface, triangles: int) -> Surface:
+    """Return a surface of about so many triangles with its points on the given one, so that they lie in its cells."""
+    import igl
+
+    reduced = simplify(surface, triangles, HASTE)
+    _, _, nearest = igl.point_mesh_squared_distance(reduced.points, surface.points, surface.triangles)
+    return compact(np.ascontiguousarray(nearest), reduced.triangles)

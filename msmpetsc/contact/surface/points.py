@@ -1,0 +1,62 @@
+"""Points of the surface that meets itself, as the nodes carry them: S = W q, and forces on them back to the nodes.
+
+Each rank has the columns of W that belong to its nodes, so that S is the sum of what the ranks send to rank 0, and a
+force f on the points is W^T f on each rank's nodes. Rank 0 has the whole of S, as it has the surface mesh.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import coo_array, csr_array
+
+from msmpetsc.backend.arrays import Indices, Positions
+from msmpetsc.comm import Route
+from msmpetsc.geometry.embedding import Embedding
+from msmpetsc.lattice.lattice import Lattice
+
+
+class Carried(NamedTuple):
+    """Some of the points as this rank's nodes carry them: where they are among those, and their weights (k, owned)."""
+
+    at: Indices
+    weights: csr_array
+
+
+class SurfacePoints:
+    """W by columns. All methods but ``carried`` are collective.
+
+    total  : number of points
+    spread : greatest sum of the sizes of a point's weights: no point moves farther than that times the farthest node
+    rows   : (k,) the points that nodes of this rank carry, ascending; ``weights`` (k, owned) theirs
+    """
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
+        counts = comm.allgather(embedding.points)
+        self.comm, self.total = comm, sum(counts)
+        first, per_point = sum(counts[: comm.rank]), np.diff(embedding.indptr)
+        sizes = np.add.reduceat(np.abs(embedding.weights), embedding.indptr[:-1]) if embedding.points else np.zeros(1)
+        self.spread = comm.allreduce(float(sizes.max()), MPI.MAX)
+        to_owner = Route(comm, lattice.table.owner_of_index(embedding.indices))
+        points = to_owner.send(first + np.repeat(np.arange(embedding.points), per_point))
+        nodes = to_owner.send(embedding.indices) - lattice.table.first
+        self.rows, row = np.unique(points, return_inverse=True)
+        shape = (len(self.rows), lattice.owned)
+        self.weights = coo_array((to_owner.send(embedding.weights), (row.ravel(), nodes)), shape=shape).tocsr()
+        self.to_root = Route(comm, np.zeros(len(self.rows), np.int64))
+        self.received = np.split(self.to_root.send(self.rows), np.cumsum(self.to_root.received)[:-1])
+
+    def __call__(self, q: Positions) -> Positions:
+        """Return the points (total, 3) [m] of positions q (owned or more, 3) on rank 0; (0, 3) on the others."""
+        parts = self.to_root.send(self.weights @ q[: self.weights.shape[1]])
+        points = np.zeros((self.total if self.comm.rank == 0 else 0, 3))
+        first = 0
+        for rows in self.received if self.comm.rank == 0 else ():  # in the order of the ranks: the same sum each time
+            points[rows] += parts[first : first + len(rows)]
+            first += len(rows)
+        return points
+
+    def carried(self, numbers: Indices) -> Carried:
+        """Return what this rank's nodes carry of the points with these numbers (k,), ascending."""
+        at = np.flatnonzero(np.isin(numbers, self.rows, assume_unique=True))
+        return Carried(at, self.weights[np.searchsorted(self.rows, numbers[at])])

@@ -1,0 +1,194 @@
+"""Self-contact as a term of the energy that a step minimises: the barrier between the surface's parts, and friction.
+
+Rank 0 computes what is of points; ranks send it what their nodes make of S = W q, and get the rows of forces that are
+not zero. The Hessian is never formed on nodes: W^T (H_c (W v)) over the points in contact takes a hundredth of that.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
+from msmpetsc.contact.surface.points import Carried
+from msmpetsc.contact.surface.surface_friction import SurfaceFriction
+
+TINY = np.finfo(float).tiny
+SMALL = 1e-4  # of the barrier's distance: points that move less change the energy by their mean force times that
+
+
+@dataclass(frozen=True)
+class SurfaceHessian:
+    """W^T H_c W over k points in contact.
+
+    carried : those points, as this rank's nodes carry them
+    points  : H_c (3k, 3k) [N/m], on all ranks
+    """
+
+    comm: MPI.Comm
+    carried: Carried
+    points: csr_array
+
+    def add_product(self, v: Rows, product: Rows) -> None:
+        """Add the Hessian times v (owned or more, 3) to the owned rows of ``product`` (collective)."""
+        at, weights = self.carried
+        moved = np.zeros((self.points.shape[0] // 3, 3))
+        moved[at] = weights @ v[: weights.shape[1]]
+        if self.comm.size > 1:
+            total = np.empty_like(moved)
+            self.comm.Allreduce(moved, total)
+            moved = total
+        forces = (self.points @ moved.ravel()).reshape(-1, 3)
+        product[: weights.shape[1]] += weights.T @ forces[at]
+
+    @cached_property
+    def blocks(self) -> Rows:
+        """The 3 x 3 blocks (owned, 9) [N/m] of its diagonal."""
+        at, weights = self.carried
+        own = (3 * at[:, None] + np.arange(3)).ravel()
+        points = self.points[own][:, own]
+        blocks = np.empty((weights.shape[1], 9))
+        for row in range(3):
+            for column in range(3):
+                acting = points[row::3][:, column::3] @ weights
+                blocks[:, 3 * row + column] = (weights * acting).sum(axis=0)
+        return blocks
+
+
+class SurfaceContact:
+    """Self-contact in one step. All methods are collective; positions are (owned or more, 3) [m].
+
+    rubs     : there is friction
+    friction : of the step, on rank 0
+    """
+
+    def __init__(self, contacts: Contacts, start: Positions | None = None, time_step: float = 0.0):
+        """Without a ``start`` of the step there is no friction."""
+        self.contacts, self.comm = contacts, contacts.comm
+        self.rubs = False
+        self.friction: SurfaceFriction | None = None
+        self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
+        if start is not None and contacts.law.friction > 0:
+            self._start_friction(contacts.find(start), contacts.law.stick * time_step)
+
+    def _start_friction(self, moment: ContactsAt, stick: float) -> None:
+        self.rubs, barrier = moment.count > 0, self.contacts.barrier
+        if self.rubs and barrier and moment.contacts is not None and moment.points is not None:
+            self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
+
+    def _acting(self, q: Positions) -> ContactsAt | None:
+        """Return the contacts at q, with the points where there is friction; None where nothing acts."""
+        moment = self.contacts.find(q)
+        if moment.count == 0 and not self.rubs:
+            return None
+        return moment if moment.points is not None else self.contacts.with_points(moment)
+
+    def presses(self, q: Positions) -> bool:
+        """Return whether it acts at q."""
+        return self._acting(q) is not None
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return this rank's part of the energy at q less that at base, friction included [J].
+
+        Of a small move it is the mean of the forces at both times that: a difference of energies would lose its digits.
+        """
+        after, before = self._acting(q), self._acting(base)
+        if after is None and before is None:
+            return 0.0
+        moved = self.contacts.points(q - base)
+        if moved.size and np.abs(moved).max() < SMALL * self.contacts.law.distance:
+            return sum(0.5 * self._work(moment, moved) for moment in (before, after))
+        return self._energy(after) - self._energy(before)
+
+    def _work(self, moment: ContactsAt | None, moved: Rows) -> float:
+        """Return the gradient times a move of the points (p, 3) [m], on rank 0 [J]."""
+        forces = self._forces(moment) if moment else None
+        if forces is None:
+            return 0.0
+        touched, gradient = forces
+        return float(np.vdot(gradient, moved[touched]))
+
+    def _energy(self, moment: ContactsAt | None) -> float:
+        barrier, energy = self.contacts.barrier, 0.0
+        if moment is None or barrier is None or moment.points is None:
+            return 0.0
+        if moment.contacts is not None:
+            energy += barrier.energy(moment.contacts, moment.points)
+        return energy + (self.friction.energy(moment.points) if self.friction else 0.0)
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
+        moment = self._acting(q)
+        if moment is None:
+            return
+        touched, forces = self.comm.bcast(self._forces(moment))
+        at, weights = self.contacts.points.carried(touched)
+        gradient[: weights.shape[1]] += weights.T @ forces[at]
+
+    def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
+        """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
+        barrier = self.contacts.barrier
+        if barrier is None or moment.points is None:
+            return None
+        forces = np.zeros_like(moment.points)
+        if moment.contacts is not None:
+            forces += barrier.gradient(moment.contacts, moment.points)
+        if self.friction:
+            forces += self.friction.gradient(moment.points)
+        touched = np.flatnonzero(forces.any(axis=1))
+        return touched, forces[touched]
+
+    def hessian(self, q: Positions, projected: bool) -> SurfaceHessian | None:
+        """Return the Hessian at q, without the negative part of each pair if ``projected``; None where nothing acts."""
+        moment = self._acting(q)
+        if moment is None:
+            return None
+        known = self._hessians.get(projected)
+        if known is None or known[0] is not moment:
+            touched, points = self.comm.bcast(self._curvature(moment, projected))
+            known = moment, SurfaceHessian(self.comm, self.contacts.points.carried(touched), points)
+            self._hessians[projected] = known
+        return known[1]
+
+    def concavity(self, q: Positions) -> Floats:
+        """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
+
+        With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w v)^2 is no more
+        than sum |w| times sum |w| v^2.
+        """
+        whole, kept = (self.hessian(q, projected) for projected in (False, True))
+        if whole is None or kept is None:
+            return np.zeros(self.contacts.owned)
+        sums = np.asarray(np.abs(kept.points - whole.points).sum(axis=1)).reshape(-1, 3).max(axis=1)
+        at, weights = kept.carried
+        return self.contacts.points.spread * (np.abs(weights).T @ sums[at])
+
+    def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[Indices, csr_array] | None:
+        """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""
+        barrier = self.contacts.barrier
+        if barrier is None or moment.points is None:
+            return None
+        parts = barrier.hessian(moment.contacts, moment.points, projected) if moment.contacts is not None else []
+        parts += self.friction.hessian(moment.points) if self.friction else []
+        whole = csr_array(sum(parts))
+        touched = np.flatnonzero(np.diff(whole.indptr).reshape(-1, 3).any(axis=1))
+        numbers = (3 * touched[:, None] + np.arange(3)).ravel()
+        return touched, csr_array(whole[numbers][:, numbers])
+
+    def bound(self, q: Positions) -> Floats:
+        """Return (owned,) [N/m] no less than each block of the projected Hessian: powers of 4, which change seldom."""
+        hessian = self.hessian(q, True)
+        return np.zeros(self.contacts.owned) if hessian is None else block_bound(hessian.blocks)
+
+    def free_share(self, q: Positions, end: Positions) -> float:
+        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
+        return self.contacts.free_share(q, end)
+
+
+def block_bound(blocks: Rows) -> Floats:
+    """Return (n,) no less than each block (n, 9): powers of 4, which change seldom."""
+    norms = np.abs(blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
+    return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)

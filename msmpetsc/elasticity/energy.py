@@ -1,0 +1,134 @@
+"""The elastic energy of a lattice, whatever its law: the interface of the solver to a material."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Array, Floats, Positions, Rows, on_host
+from msmpetsc.elasticity.cell_volume import CellGather, CellScatter, least_volumes
+from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
+from msmpetsc.lattice.lattice import Lattice
+
+ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
+RESISTANCE = 1.0  # K of a corner, of its material's k1 h^2: an eighth left a lung pressed to 30% torn
+
+# Floating point operations of the CPU's loops over springs and cells, for PETSc's log, one spring a turn: Hooke's law
+# first, what stiffening adds second. Each +, -, x, /, square root and maximum counts as one, as PETSc counts its own.
+# p_a - p_b 3, its length 6, the pull k (1 - r / l) 4, times p_a - p_b 3, added to both ends 6; its strain and law 6
+GRADIENT = 22, 6
+# three differences 9, two lengths 12, l + l' 1, how much longer it is 10, the energy 6; two strains and the law 11
+CHANGE = 38, 11
+# p_a - p_b 3, its length 7, 1 - r / l 2, along it 4, c and e 4; its strain and both moduli 10
+HESSIAN = 20, 10
+# v_a - v_b 3, e . d 5, c d + (e . d) e 9, added to both ends 6
+PRODUCT = 23
+# edges and cofactors of a corner 36, its lack of volume 8, its slope 4; those few that resist have more, not counted
+CORNER = 48
+LEAST_VOLUME = 155  # of a cell: twelve edges 36, eight corners' volumes 112, their minimum 7
+# of a node, all its coordinates: M (x - y) + t^2 (grad E - f), the inertia and work of a change, M v + t^2 p
+GRADIENT_ROW, CHANGE_ROW, PRODUCT_ROW = 15, 36, 9
+
+
+@dataclass(frozen=True)
+class Flops:
+    """Operations of one call on this rank: the gradient of g, a change of g, the Hessian at a point, a product."""
+
+    gradient: int
+    change: int
+    hessian: int
+    product: int
+
+    @classmethod
+    def of_lattice(cls, lattice: Lattice) -> "Flops":
+        """Return those of a lattice, M included."""
+        springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
+        cells = len(lattice.local_cells) if stiffens else 0
+        gradient, change, hessian = (a + stiffens * b for a, b in (GRADIENT, CHANGE, HESSIAN))
+        return cls(
+            gradient * springs + 8 * CORNER * cells + GRADIENT_ROW * owned,
+            change * lattice.springs_owned + 2 * LEAST_VOLUME * cells + CHANGE_ROW * owned,
+            hessian * springs + LEAST_VOLUME * cells,
+            PRODUCT * springs + PRODUCT_ROW * owned,
+        )
+
+
+class Elasticity:
+    """E of this rank's part of a lattice, its gradient and its Hessian.
+
+    It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening ones and of cells that
+    resist being turned inside out (elasticity.inversion).
+
+    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
+    owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
+    """
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
+        on_cpu = on_host(lattice.nodes)
+        self.springs: SpringScatter | SpringGather = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
+        self.cells: CellScatter | CellGather | None = None
+        if lattice.stiffening > 0:
+            volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
+            self.cells = (CellScatter if on_cpu else CellGather).of_lattice(
+                lattice, RESISTANCE * resistance, ONSET * volume
+            )
+        self.parts = [part for part in (self.springs, self.cells) if part]
+
+    def energy(self, q: Positions) -> float:
+        """Return E [J] of what this rank owns."""
+        return sum(part.energy(q) for part in self.parts)
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return E(q) - E(base) [J] of what this rank owns."""
+        return sum(part.change(q, base) for part in self.parts)
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add grad E [N] to ``gradient`` (l, 3)."""
+        for part in self.parts:
+            part.add_gradient(q, gradient)
+
+    def concavity(self, q: Positions) -> Floats:
+        """Return the diagonal (owned,) [N/m] of a matrix: the springs' Hessian is no less than minus that.
+
+        It is 0 at a node without compressed springs.
+        """
+        concavity = np.zeros(len(q), like=q)
+        self.springs.add_concavity(q, concavity)
+        return concavity[: self.owned]
+
+    def resists(self, q: Positions) -> bool:
+        """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
+        if self.cells is None or not len(self.cells.cells):
+            return False
+        return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
+
+    def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
+        """Return the Hessian of E at q (l, 3) [m].
+
+        projected : without its negative parts, as of compressed springs
+        dtype     : of what is stored of it
+        """
+        return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
+
+    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the owned rows of
+        ``blocks`` (l, 9) [N/m].
+
+        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, and four of a
+        cell's corner, whose D is twice that.
+        """
+        for part in self.parts:
+            part.add_half_bound(q, blocks)
+
+
+@dataclass(frozen=True)
+class Hessian:
+    """The Hessian of E at one q, ready for many products."""
+
+    parts: list[Product]
+
+    def add_product(self, v: Array, product: Array) -> None:
+        """Add Hessian v [N] to ``product`` (l, 3)."""
+        for add in self.parts:
+            add(v, product)

@@ -1,0 +1,55 @@
+"""Where it is worst, for messages of trouble: a node or a cell, by its point in the body at rest."""
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
+from msmpetsc.elasticity.cell_volume import inverted_cells
+from msmpetsc.lattice.lattice import Lattice
+
+
+def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: Floats) -> str:
+    """Describe the node where a measure is greatest, or not a number (collective).
+
+    rows, measure : (k,) local nodes, and what is measured of each
+    """
+    rows, measure = to_host(rows), np.nan_to_num(to_host(measure), nan=np.inf)
+    best = int(np.argmax(measure)) if len(rows) else 0
+    candidate: tuple[float, int, Floats | None] = (-1.0, 0, None)
+    if len(rows):
+        candidate = measure[best], lattice.global_numbers[rows[best]], to_host(lattice.nodes[int(rows[best])])
+    _, number, point = max(comm.allgather(candidate), key=lambda candidate: candidate[0])
+    return f"node {number}, {rest_point(lattice, number, point)}"
+
+
+def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> tuple[int, str]:
+    """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective)."""
+    cells = lattice.local_cells[: lattice.cells_owned]
+    count, worst, least = inverted_cells(q, cells)
+    total = comm.allreduce(count)
+    if not total:
+        return 0, ""
+    number, point = 0, np.zeros(3)
+    if worst >= 0:
+        number, point = lattice.global_numbers[int(cells[worst][0])], to_host(lattice.nodes[cells[worst]].mean(axis=0))
+    _, number, point = min(comm.allgather((least, number, point)), key=lambda candidate: candidate[0])
+    return total, rest_point(lattice, number, point)
+
+
+def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
+    """Return ", 3 cells are inside out", and what to do about it; "" if none is (collective)."""
+    count, _ = worst_inverted(comm, lattice, q)
+    if not count:
+        return ""
+    law = "" if lattice.stiffening > 0 else ' (material.law = "stiffening" resists that)'
+    return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
+
+
+def rest_point(lattice: Lattice, number: int, point: Floats) -> str:
+    """Return a point (3,) [m] at rest in words, with the body of the node of this global number."""
+    return f"{of_body(lattice, number)}at rest at ({', '.join(f'{x:.4g}' for x in point)}) m"
+
+
+def of_body(lattice: Lattice, number: int) -> str:
+    """Return "of body.1 ", the body of the node of this global number; "" where there is but one."""
+    return f"of body.{lattice.body_of(number)} " if len(lattice.first_of_body) > 1 else ""

@@ -1,0 +1,334 @@
+"""What acts on a body from outside at a time: loads, anchors, obstacles."""
+
+from dataclasses import replace
+from functools import reduce
+from itertools import compress
+from typing import Any
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
+from msmpetsc.build import Model
+from msmpetsc.constraints.loads import Anchor, Load, OwnForce
+from msmpetsc.contact.obstacles.friction import Movers, apply_friction
+from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
+from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
+from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
+from msmpetsc.contact.surface.term import SurfaceContact
+
+
+class Environment:
+    """Loads, anchors and obstacles of a model. An implicit step asks once for its end, an explicit one in each substep.
+
+    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
+    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (faces.side_of): the
+    penalties' first, then the exchanges'.
+    """
+
+    def __init__(self, model: Model):
+        self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
+        self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
+        self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
+        self.penalties, self.exchanges = model.penalties, model.exchanges
+        self.self_contact = NearPairs(self.lattice.table.comm, model.collision) if model.collision else None
+        self._contacts = Contacts(self.self_contact) if self.self_contact else None  # of the last step that was begun
+        self.touches = bool(self.penalties or self.self_contact)
+        self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
+        self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
+        self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
+        self.strikes = bool(self.exchanges) or any(p.restitution is not None for p in self.penalties)
+        nodes = self.lattice.nodes
+        self.no_sides: Indices = np.zeros((len(self.obstacles), len(nodes)), np.int8, like=nodes)
+        self._states_of_loads: list[bool | tuple[float, ...]] = []
+        self._load = np.zeros((self.lattice.owned, 3), like=nodes)
+
+    def events(self) -> list[float]:
+        """Return the times [s] at which a load, an anchor or an obstacle begins, ends or turns."""
+        paths = [*(anchor.path for anchor in self.anchors), *(obstacle.path for obstacle in self.obstacles)]
+        times = [time for path in paths for time in path.times.tolist()]
+        times += [time for load in self.pulling for time in load.events]
+        times += [time for obstacle in self.obstacles for time in (obstacle.start, obstacle.stop) if time is not None]
+        return times + [anchor.stop for anchor in self.anchors if anchor.stop is not None]
+
+    def begin_step(self, q: Positions, v: Rows, time: float) -> None:
+        """Evaluate the forces that are functions, at the state (l, 3) [m], [m/s] that starts a step; they then stay.
+
+        So a step is explicit in them: they are of first order in its length, whatever the integrator.
+        """
+        owned = self.lattice.owned
+        for number, force in enumerate(self.own_forces):
+            self._own[number] = like(q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time))
+
+    def load(self, time: float) -> Rows:
+        """Return the external force f_ext (owned, 3) [N], not to be written to."""
+        load = self.given_load(time)
+        for force, own in zip(self.own_forces, self._own, strict=True):
+            if force.acts_at(time) and len(own):
+                load = load + own
+        return load
+
+    def given_load(self, time: float) -> Rows:
+        """Return the part of f_ext that has a potential, (owned, 3) [N]: gravity and forces that are no functions."""
+        states = [load.state_at(time) for load in self.loads]
+        if states != self._states_of_loads:
+            self._states_of_loads = states
+            self._load = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
+            for load in compress(self.loads, states):
+                self._load += load.force_at(time)
+        return self._load
+
+    def load_beyond(self, time: float, end: float) -> Rows | None:
+        """Return how much more forces (owned, 3) [N] that change pull at a time than at the end of its step; or None.
+
+        None stands for a scene without such forces.
+        """
+        beyond = None
+        for load in self.loads:
+            if load.table is not None:
+                beyond = np.zeros_like(self._load) if beyond is None else beyond
+                if load.acts_at(time) and load.acts_at(end):
+                    beyond += load.force_at(time) - load.force_at(end)
+        return beyond
+
+    def anchors_at(self, time: float) -> list[Anchor]:
+        """Return the anchors that have not let go."""
+        return [anchor for anchor in self.anchors if anchor.holds_at(time)]
+
+    def fixed_at(self, time: float) -> Mask:
+        """Return the nodes (l,) bool that are no unknowns, pinned or held by an anchor."""
+        return reduce(np.logical_or, (anchor.where for anchor in self.anchors_at(time)), self.lattice.pinned)
+
+    def prescribed(self, q: Positions, time: float) -> Positions | None:
+        """Return q with the anchored nodes where they will be; None if there are none."""
+        anchors = self.anchors_at(time)
+        if not anchors:
+            return None
+        for anchor in anchors:
+            target = self.lattice.nodes + like(q, anchor.path.displacement_at(time))
+            q = np.where(anchor.where[:, None], target, q)
+        return q
+
+    def is_same(self, begin: float, end: float) -> bool:
+        """Return whether loads, anchors and obstacles are at one time [s] just as at another."""
+
+        def at(time: float) -> list[Any]:
+            loads = [load.state_at(time) for load in self.pulling]
+            anchors = [anchor.holds_at(time) and tuple(anchor.path.displacement_at(time)) for anchor in self.anchors]
+            return [
+                *loads,
+                *anchors,
+                *(o.acts_at(time) and tuple(o.path.displacement_at(time)) for o in self.obstacles),
+            ]
+
+        return at(begin) == at(end)
+
+    def last_change(self, until: float) -> float:
+        """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
+        return max((time for time in self.events() if time <= until), default=0.0)
+
+    def contact_faces(
+        self,
+        q: Positions,
+        end: Positions,
+        time: float,
+        time_step: float,
+        before: Indices | None,
+        held: Mask,
+    ) -> Indices:
+        """Return the sides (o, n) of nodes that go straight from q to ``end`` (n, 3) in a step.
+
+        A plane has but one face, which needs no name.
+
+        before : (o, n) the sides when the step began
+        held   : (n,) bool, the nodes that do not give way: they have no side
+        """
+        if not self.has_sides:
+            return self.no_sides[:, : len(q)]
+        sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
+        for row, obstacle in enumerate(self.obstacles):
+            if obstacle.has_sides:
+                side_before = None if before is None else before[row]
+                sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
+        return sides
+
+    def same_push(self, q: Positions, time: float, sides_a: Indices, sides_b: Indices) -> bool:
+        """Return whether penalties press on this rank's nodes at q just the same with either sides (o, l)."""
+        rows = q[: self.lattice.owned]
+        states = zip(self._states(time, sides_a), self._states(time, sides_b), strict=True)
+        return all(
+            np.array_equal(np.maximum(a.depths(rows)[0], 0), np.maximum(b.depths(rows)[0], 0)) for a, b in states
+        )
+
+    def contact(
+        self,
+        q: Positions,
+        end: Positions,
+        time: float,
+        time_step: float,
+        sides: Indices,
+        before: Positions | None = None,
+    ) -> Contact | None:
+        """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
+
+        before : (l, 3) [m] positions one step before q, of a step that looks back to them
+        """
+        owned, surface = self.lattice.owned, None
+        last = None if before is None else before[:owned]
+        pressing = self._pressing(time, sides)
+        states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
+        if self.self_contact:
+            self._contacts = self.self_contact.step(q, end)
+            surface = SurfaceContact(self._contacts, q, time_step)
+        return Contact(states, owned, surface) if states or surface else None
+
+    def forget(self) -> None:
+        """Know nothing of the steps before (collective)."""
+        if self.self_contact:
+            self.self_contact.forget()
+            self._contacts = Contacts(self.self_contact)
+
+    def touch(self, q: Positions) -> Touch:
+        """Return what there is of contacts of the surface with itself at q (collective)."""
+        return self._contacts.touch(q) if self._contacts else Touch()
+
+    def push(self, time: float, sides: Indices | None) -> Contact | None:
+        """Return what presses at a time, without friction; None if nothing does. None stands for no sides."""
+        states = self._states(time, sides)
+        return Contact(states, self.lattice.owned) if states else None
+
+    def _states(self, time: float, sides: Indices | None) -> list[ContactState]:
+        return [p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)]
+
+    def apply_friction(
+        self, nodes: Movers, time: float, duration: float, substep: tuple[float, float], sides: Indices
+    ) -> None:
+        """Apply friction of obstacles as they stand at a time, for a ``duration`` [s], to this rank's nodes.
+
+        substep : its begin and end [s], between which an obstacle carries along what it holds
+        """
+        begin, end = substep
+        for p, side in self._pressing(time, sides):
+            if p.friction > 0:
+                carried = like(nodes.q, p.obstacle.path.displacement_between(begin, end) / (end - begin))
+                pressed = p.state_at(time, side).pressed(nodes.q)
+                apply_friction(nodes, pressed, carried, p.friction * p.stiffness * duration)
+
+    def contact_stiffness_bound(self, q: Positions, speed: float, start: float, time: float, sides: Indices) -> Floats:
+        """Return (owned,) [N/m] no less than what obstacles add to a node's stiffness from start to ``time``.
+
+        q, speed : (owned, 3) [m] at the start, and no less than any node's speed [m/s]: twice the way that it
+            makes good is counted as inside already
+        """
+        stiffness = np.zeros(len(q), like=q)
+        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
+            if p.obstacle.acts_at(start) or p.obstacle.acts_at(time):
+                way = p.obstacle.path.displacement_between(start, time)
+                reach = 2 * (speed * (time - start) + np.linalg.norm(way))
+                inside, _ = p.obstacle.depths(q, start)
+                stiffness += p.stiffness * ((inside > -reach) | (side > 0))
+        return stiffness
+
+    def power(self, q: Positions, time: float, begin: float, end: float, sides: Indices) -> float:
+        """Return the power [W] of the push of penalties at ``time`` on this rank's nodes (owned, 3) [m].
+
+        begin, end : the substep [s] as in which obstacles move
+        """
+        power = 0.0
+        for p, side in self._pressing(time, sides):
+            way = p.obstacle.path.displacement_between(begin, end)
+            if way.any():
+                _, depth, normal = p.state_at(time, side).pressed(q)
+                power += p.stiffness / (end - begin) * float(depth @ (normal @ like(q, way)))
+        return power
+
+    def energy_of_new_obstacles(self, q: Positions, begin: float, end: float, sides: Indices) -> float:
+        """Return the energy [J], at a substep's end, of the push of penalties that were not there when it began."""
+        new = [p.state_at(end, side) for p, side in self._pressing(end, sides) if not p.obstacle.acts_at(begin)]
+        return Contact(new, self.lattice.owned).energy(q) if new else 0.0
+
+    def friction_work_bound(
+        self,
+        before: tuple[Positions, Indices | None],
+        after: tuple[Positions, Indices | None],
+        time: float,
+        time_step: float,
+    ) -> float:
+        """Return no less than the work [J] that friction of moving obstacles does on this rank's nodes in a step.
+
+        It is mu N times how far they go.
+
+        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
+        """
+        work = 0.0
+        for row, p in enumerate(self.penalties):
+            way = float(np.linalg.norm(p.obstacle.path.displacement_between(time - time_step, time)))
+            if p.obstacle.acts_at(time) and p.friction > 0 and way > 0:
+                for state, when in ((before, time - time_step), (after, time)):
+                    work += p.friction * p.stiffness * float(self._pushed(row, state, when).sum()) * way
+        return work
+
+    def change_of_push(
+        self,
+        before: tuple[Positions, Indices | None],
+        after: tuple[Positions, Indices | None],
+        time: float,
+        time_step: float,
+    ) -> Floats:
+        """Return by how much the push of penalties on this rank's nodes changes in a step, (owned,) [N].
+
+        before, after : positions (owned, 3) [m] and sides (o, owned or more), None where there are none
+        """
+        change = np.zeros(self.lattice.owned, like=self.lattice.mass)
+        for row, p in enumerate(self.penalties):
+            depths = [
+                self._pushed(row, state, when) if p.obstacle.acts_at(when) else np.zeros_like(change)
+                for state, when in ((before, time - time_step), (after, time))
+            ]
+            change += p.stiffness * np.abs(depths[1] - depths[0])
+        return change
+
+    def _pushed(self, row: int, state: tuple[Positions, Indices | None], time: float) -> Floats:
+        """Return how deep nodes (owned,) of a state are in a penalty's obstacle at a time [s], 0 outside [m]."""
+        q, sides = state
+        side = (self.no_sides if sides is None else sides)[row, : len(q)]
+        return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
+
+    def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
+        sides = (self.no_sides if sides is None else sides)[self.pressing]
+        return [(p, side) for p, side in zip(self.penalties, sides, strict=True) if p.obstacle.acts_at(time)]
+
+    def strike(
+        self, q: Positions, q_previous: Positions, step: StepTaken, held: Mask
+    ) -> tuple[Positions, Positions, float]:
+        """Return q_n and q_(n-1) after obstacles that nodes bounce off, and their work [J] on this rank's nodes.
+
+        The arrays are the very same if nothing is struck.
+
+        step : with the sides (o, l) of all obstacles
+        held : (l,) bool, the nodes that do not give way
+        """
+        free, work = ~held[:, None], 0.0
+        sides = self.no_sides if step.sides is None else step.sides
+        for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):
+            after, before = exchange.exchanged(q, q_previous, replace(step, sides=side))
+            if after is not q:
+                after, before = np.where(free, after, q), np.where(free, before, q_previous)
+                work += self._impulse_work(exchange.obstacle, (after - before) - (q - q_previous), step)
+                q, q_previous = after, before
+        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
+            if p.restitution is not None:
+                before = slowed(p.obstacle, p.restitution, q, q_previous, replace(step, sides=side))
+                if before is not q_previous:
+                    before = np.where(free, before, q_previous)
+                    work += self._impulse_work(p.obstacle, q_previous - before, step)
+                    q_previous = before
+        return q, q_previous, work
+
+    def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:
+        """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""
+        if not obstacle.path.leads_away:
+            return 0.0
+        way = obstacle.path.displacement_between(step.time - step.length, step.time)
+        mass = self.lattice.mass
+        return float(to_host(mass @ change[: len(mass)]) @ way) / step.length**2

@@ -1,0 +1,88 @@
+"""The chosen frames of a result as any format has them: points, cells and data, one frame in memory at a time."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from msmpetsc.errors import InputError
+from msmpetsc.fields import LATTICE
+from msmpetsc.results.reader import Result
+
+Mesh = Literal["surface", "lattice"]
+
+
+class Moments:
+    """Frames of the surface's triangles or of the lattice's cells.
+
+    frames : numbers of those chosen
+    times  : (t,) [s]
+    rest   : (n, 3) points at rest [m]
+    cells  : (c, 3) or (c, 8) corner points, in VTK's order
+    """
+
+    def __init__(self, run: Result, mesh: Mesh, frames: Sequence[int]):
+        """Raises InputError for a result without a surface, where that is asked for, or a damaged one."""
+        self.run, self.mesh, self.frames = run, mesh, list(frames)
+        if mesh == "surface" and "surface/points" not in run:
+            raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
+        self.times = run.frames.time[:][self.frames]
+        names = ("surface/points", "surface/triangles") if mesh == "surface" else ("lattice/nodes", "lattice/cells")
+        self.rest, cells = run[names[0]][:], run[names[1]][:]
+        self.cells = cells.astype(np.int64)
+        if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.rest):
+            raise InputError(f"{run.path} is damaged: {names[1]} names points beyond the {len(self.rest)} there are")
+
+    def points(self, frame: int) -> np.ndarray:
+        """Return the points of a frame, (n, 3) [m]."""
+        if self.mesh == "lattice":
+            return self.run.frames.position[frame]
+        if "surface" in self.run.frames:
+            return self.run.frames.surface[frame]
+        return self.run.embedding @ self.run.frames.position[frame]
+
+    def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
+        """Return what is known at the points: of the lattice masses, and which are pinned, too.
+
+        displacement : from rest, (n, 3) [m]
+        velocity     : the mean since the frame before, (n, 3) [m/s]; 0 at the first
+        """
+        points = self.points(frame)
+        velocity = np.zeros_like(points)
+        if frame > 0:
+            before, now = self.run.frames.time[frame - 1 : frame + 1]
+            velocity = (points - self.points(frame - 1)) / (now - before)
+        data = {"displacement": (points - self.rest).astype(points.dtype), "velocity": velocity.astype(points.dtype)}
+        if self.mesh == "surface":
+            return data
+        pinned = np.zeros(len(self.rest), np.uint8)
+        if "pinned" in self.run.lattice:
+            pinned[self.run.lattice.pinned[:]] = 1
+        return data | {"pinned": pinned} | self._constant("n", "nodes")
+
+    def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
+        """Return what is known of the lattice's cells: strain, (c, 6) [-], and all that the file has of each."""
+        if self.mesh == "surface":
+            return {}
+        return {"strain": green_strain(self.rest, self.cells, self.points(frame))} | self._constant("c", "cells")
+
+    def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
+        arrays = self.run.lattice
+        return {name: arrays[name][:] for name in arrays if name != points and LATTICE[name].shape == (letter,)}
+
+
+def green_strain(rest: np.ndarray, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return Green's strain (F^T F - I) / 2 at the cells' centres, (c, 6) [-]: xx, yy, zz, xy, yz, xz, as VTK has it.
+
+    rest, points : (n, 3) [m]; cells (c, 8), all cubes of one size and alike at rest
+    """
+    if not len(cells):
+        return np.empty((0, 6))
+    corners = rest[cells[0]]
+    sides = np.ptp(corners, axis=0)
+    gradients = np.sign(corners - corners.mean(axis=0)) / (4 * sides)  # (8, 3) of the trilinear functions [1/m]
+    F = np.zeros((len(cells), 3, 3))
+    for corner, gradient in enumerate(gradients):
+        F += points[cells[:, corner], :, None] * gradient
+    strain = 0.5 * (F.transpose(0, 2, 1) @ F - np.eye(3))
+    return strain[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]

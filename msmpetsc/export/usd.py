@@ -1,0 +1,93 @@
+"""USD, by its own library: a mesh for each body, whose points have a sample a frame.
+
+.usda is text, .usdc and .usd are binary. Normals go with the points, for without them programs draw each triangle flat.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+
+from msmpetsc.errors import one_line
+from msmpetsc.export.gltf import normals
+from msmpetsc.export.moments import Moments
+
+CLAY = (0.8, 0.55, 0.4)
+UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}  # the axes that USD knows as upward
+SAVED = 16  # frames: so many are in memory at a time, where the format is binary
+
+
+def write_usd(moments: Moments, path: Path) -> None:
+    """Write the frames. Raises OSError where the library cannot."""
+    path.touch()  # or the library would say why not, in many lines
+    try:
+        stage = Usd.Stage.CreateNew(str(path))
+        root = UsdGeom.Xform.Define(stage, f"/{Tf.MakeValidIdentifier(moments.run.path.stem)}")
+        stage.SetDefaultPrim(root.GetPrim())
+        UsdGeom.SetStageUpAxis(stage, up_axis(moments.run.scene))
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        rate = frames_a_second(moments.times)
+        stage.SetTimeCodesPerSecond(rate)
+        stage.SetFramesPerSecond(rate)
+        codes = np.round(moments.times * rate, 6)
+        stage.SetStartTimeCode(codes[0])
+        stage.SetEndTimeCode(codes[-1])
+        of_point = moments.run.body_of("surface")
+        bodies = [Body(stage, root.GetPath(), moments, of_point, number) for number in np.unique(of_point)]
+        for count, (frame, code) in enumerate(zip(moments.frames, codes, strict=True), 1):
+            points = moments.points(frame)
+            for body in bodies:
+                body.add(points, float(code))
+            if path.suffix != ".usda" and count % SAVED == 0:
+                stage.Save()
+        stage.Save()
+    except Tf.ErrorException as error:
+        raise OSError(one_line(error)) from error
+
+
+class Body:
+    """The mesh of one body, to which frames are added."""
+
+    def __init__(self, stage: Any, root: Any, moments: Moments, of_point: np.ndarray, number: int):
+        """Define what stays as it is: triangles, colour and points at rest."""
+        self._rows = np.flatnonzero(of_point == number)
+        own = moments.cells[of_point[moments.cells[:, 0]] == number]
+        self._triangles = np.searchsorted(self._rows, own)
+        self._rest = moments.rest[self._rows]
+        name = "body" if of_point.max() == 0 else f"body_{number}"
+        self._mesh = UsdGeom.Mesh.Define(stage, root.AppendChild(name))
+        self._mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)  # or it would be rounded off
+        self._mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(own), 3))
+        self._mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(self._triangles.ravel().astype(np.int32)))
+        self._mesh.CreateDisplayColorAttr([Gf.Vec3f(*CLAY)])
+        self._mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        kind = Sdf.ValueTypeNames.FloatArray
+        self._displacement = UsdGeom.PrimvarsAPI(self._mesh).CreatePrimvar("displacement", kind, UsdGeom.Tokens.vertex)
+
+    def add(self, points: np.ndarray, code: float) -> None:
+        """Add the sample of a time code, of the points (v, 3) [m] of all bodies."""
+        own = points[self._rows]
+        length = np.linalg.norm(own - self._rest, axis=1).astype(np.float32)
+        corners = np.array([own.min(axis=0), own.max(axis=0)])
+        self._mesh.CreatePointsAttr().Set(_vectors(own), code)
+        self._mesh.CreateNormalsAttr().Set(_vectors(normals(own, self._triangles)), code)
+        self._mesh.CreateExtentAttr().Set(_vectors(corners), code)
+        self._displacement.Set(Vt.FloatArray.FromNumpy(length), code)
+
+
+def up_axis(scene: dict[str, Any]) -> str:
+    """Return the axis that is upward in a scene: against its gravity as far as USD knows that one, z without it."""
+    acceleration = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
+    return UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z) if acceleration.any() else UsdGeom.Tokens.z
+
+
+def frames_a_second(times: np.ndarray) -> float:
+    """Return how many frames there are in a second of times (t,) [s], so that a frame is one time code if all are
+    spaced alike."""
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    return float(f"{1 / spacing:.9g}")
+
+
+def _vectors(rows: np.ndarray) -> Any:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

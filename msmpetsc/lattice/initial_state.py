@@ -1,0 +1,89 @@
+"""How bodies are at time 0: where their nodes are, and how fast."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.scene.motion import Start, Twist
+
+InitialState = tuple[Positions, Rows]  # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
+
+
+def at_rest(lattice: Lattice) -> InitialState:
+    """Return the rest shape, without a copy."""
+    return lattice.nodes, np.zeros_like(lattice.nodes)
+
+
+def initial_state(
+    comm: MPI.Comm, starts: Sequence[Start | None], lattice: Lattice, held: Mask, bounds: Rows
+) -> InitialState:
+    """Return where nodes are, and how fast, as each body's start has it (collective).
+
+    starts : of each body; None: at rest
+    held   : (l,) bool, nodes that stay at rest where they are
+    bounds : (b, 2, 3) each body's bounding box at rest [m]
+    """
+    if not any(starts):
+        return at_rest(lattice)
+    (q, velocity), body = at_rest(lattice), lattice.body
+    q = q.copy()
+    for number, start in enumerate(starts):
+        if start is not None:
+            own = np.flatnonzero(body == number)
+            owned = int((own < lattice.owned).sum())
+            q[own] = moved(start, lattice.nodes[own], lattice.global_numbers[own], bounds[number])
+            q[own[held[own]]] = lattice.nodes[own[held[own]]]
+            middle = centre_of_mass(comm, q[own], lattice.mass[own[:owned]])
+            velocity[own] = np.array(start.velocity) + np.cross(start.spin, q[own] - middle)
+    velocity[held] = 0
+    return q, velocity
+
+
+def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
+    """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
+    middle = bounds.mean(axis=0)
+    q = middle + np.array(start.scale) * (nodes - middle)
+    if start.twist is not None:
+        q = twisted(q, start.twist, nodes, bounds)
+    if start.scatter > 0:
+        anywhere = bounds[0] + uniform(numbers) * (bounds[1] - bounds[0])
+        q = (1 - start.scatter) * q + start.scatter * anywhere
+    return q
+
+
+def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Positions:
+    """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
+
+    The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin, all degrees where
+    they end.
+    Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 - cos(angle))
+    """
+    a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
+    extent = np.abs(a) @ (bounds[1] - bounds[0])
+    angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
+    p = q - middle
+    along = (p @ a)[:, None] * a
+    return middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+
+
+def uniform(numbers: Indices) -> Rows:
+    """Return three random numbers in [0, 1) for each global node number (n,), (n, 3), whatever ranks there are.
+
+    SplitMix64 (Steele, Lea and Flood 2014), its number 3 n + c.
+    """
+    z = (3 * numbers[:, None] + np.arange(1, 4)).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return ((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
+
+
+def centre_of_mass(comm: MPI.Comm, q: Positions, mass: Floats) -> Floats:
+    """Return the centre of mass (3,) [m] of all ranks' nodes (collective).
+
+    q, mass : (l, 3) [m]; (owned,) [kg]
+    """
+    total = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
+    return total[:3] / total[3]

@@ -1,0 +1,318 @@
+"""The lattice of a body: cell corners become masses, pairs of corners within a cell become springs.
+
+Each rank holds the nodes it owns, the ghost nodes that its springs reach, and every spring with an
+end that it owns. Global node numbers follow Morton order, so they do not depend on the number of ranks.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.comm import SortedKeys, starts
+from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.grid import decode_morton, encode_morton
+from msmpetsc.lattice.cell_fractions import CORNERS as CORNERS
+from msmpetsc.lattice.cell_fractions import shares_of_mass, shares_of_pairs
+from msmpetsc.lattice.material import CellMaterial, calibrated_stiffness, edge_stiffness
+
+# the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
+DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
+KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
+NO_CELLS = np.empty((0, 8), np.int64)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """This rank's part of a lattice. Local node numbers: the ``owned`` nodes first, then the ghosts.
+
+    table       : global node numbers by grid key; ``table.first`` is the first owned one
+    nodes       : (l, 3) rest positions [m]
+    ghosts      : (l - owned,) global numbers of the ghost nodes
+    mass        : (owned,) [kg]
+    cells       : (c, 8) global corner nodes of the cells this rank owns
+    cell_kind   : (c,) geometry.cages' BOUNDARY or INTERIOR
+    springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
+                  lower-numbered end first, the others to the rank of their lower-numbered end
+    rest_length : (s,) [m]
+    stiffness   : (s,) [N/m]
+    pinned      : (l,) bool, nodes that do not move
+    stiffening  : of the springs' law (elasticity.springs) [-]; 0 for Hooke's
+    local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
+                  first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
+    cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
+    cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
+    first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
+    """
+
+    table: SortedKeys
+    cell_size: float
+    nodes: Positions
+    ghosts: Indices
+    mass: Floats
+    cells: Indices
+    cell_kind: Array
+    springs: Indices
+    springs_owned: int
+    rest_length: Floats
+    stiffness: Floats
+    pinned: Mask
+    stiffening: float = 0.0
+    local_cells: Indices = field(default_factory=lambda: NO_CELLS)
+    cells_owned: int = 0
+    cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
+    cell_share: Floats = field(default_factory=lambda: np.empty(0))
+    first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
+
+    @property
+    def owned(self) -> int:
+        """Number of nodes that this rank owns."""
+        return len(self.mass)
+
+    @property
+    def global_numbers(self) -> Indices:
+        """Global number (l,) of each local node."""
+        return np.concatenate([self.table.first + np.arange(self.owned), self.ghosts])
+
+    def body_of(self, numbers: int | Indices) -> Indices:
+        """Return the number of the body that each of some nodes, by their global numbers, belongs to."""
+        return np.searchsorted(self.first_of_body, numbers, side="right") - 1
+
+    @property
+    def body(self) -> Indices:
+        """Number (l,) of the body that each local node belongs to."""
+        return self.body_of(self.global_numbers)
+
+    def stiffest(self, comm: MPI.Comm) -> float:
+        """Return the greatest stiffness of any spring [N/m] (collective)."""
+        return comm.allreduce(self.stiffness.max(initial=0), MPI.MAX)
+
+    def pin(self, where: Mask) -> "Lattice":
+        """Return this lattice with the nodes ``where`` (l,) bool held fast."""
+        return replace(self, pinned=self.pinned | where)
+
+
+def build_lattice(
+    cages: Cages,
+    density: float,
+    young_modulus: float | None = None,
+    stiffness: float | None = None,
+    stiffening: float = 0.0,
+    of_cells: Callable[[Indices], CellMaterial] | None = None,
+    topology: "Topology | None" = None,
+) -> Lattice:
+    """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
+
+    density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
+    young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
+    stiffness     : [N/m] for every spring, as in the paper
+    stiffening    : of the springs' law (elasticity.springs) [-]
+    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (lattice.region)
+    topology      : that of the cages, where it is known already
+    """
+    h, net = cages.grids.cell_size, topology or topology_of(cages)
+    mass, of_spring, of_cell = _sums(net, h, density, stiffness or young_modulus, of_cells)
+    if stiffness is None:
+        of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
+    kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)
+    return Lattice(
+        table=net.table,
+        cell_size=h,
+        nodes=cages.grids.node_positions(net.ijk),
+        ghosts=net.ghosts,
+        mass=mass,
+        cells=net.corners,
+        cell_kind=cages.kind,
+        cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
+        springs=net.springs,
+        springs_owned=net.springs_owned,
+        rest_length=h * np.sqrt(net.kind),
+        stiffness=np.broadcast_to(of_spring, len(net.springs)).copy(),
+        pinned=np.zeros(len(net.ijk), bool),
+        stiffening=stiffening,
+        local_cells=net.cells[kept],
+        cells_owned=cells_owned,
+        cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
+        first_of_body=_first_of_body(cages, net.ijk[: len(mass)]),
+    )
+
+
+def _first_of_body(cages: Cages, ijk: Indices) -> Indices:
+    """Return the global number (b,) of the first node of each body; ijk (owned, 3) of the owned nodes (collective)."""
+    bodies = len(cages.grids.grids)
+    nodes = cages.table.comm.allreduce(np.bincount(cages.grids.body_of(ijk), minlength=bodies))
+    return starts(nodes)
+
+
+class Topology(NamedTuple):
+    """Nodes, cells and springs of a rank before they are of a material. Fields as in Lattice, or as said here.
+
+    corners : (c, 8) global corner nodes of the cells this rank owns
+    ijk     : (l, 3) grid index of the nodes, owned and ghosts
+    octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
+    cells   : (c, 8) local corner nodes of all cells around the owned nodes
+    share   : (c, 8) of the corners of these cells; None where all are whole
+    kind    : (s,) of the springs, their squared lengths in cells
+    sharing : (s,) number of cells that share each spring
+    """
+
+    table: SortedKeys
+    corners: Indices
+    ijk: Indices
+    octants: Mask
+    ghosts: Indices
+    cells: Indices
+    share: Rows | None
+    springs: Indices
+    springs_owned: int
+    kind: Indices
+    sharing: Indices
+
+
+def topology_of(cages: Cages) -> Topology:
+    """Return this rank's nodes, cells and springs (collective)."""
+    corner_keys = encode_morton(cages.ijk[:, None, :] + CORNERS)
+    table = SortedKeys(cages.table.comm, corner_keys.ravel())
+    corners = table.find(corner_keys)
+    owned = len(table.keys)
+    ijk, cells, octants = _local_cells(cages, table)
+    ghosts = table.find(encode_morton(ijk[owned:]))
+    share = cages.share_of(ijk[cells[:, 0]])
+    share = None if share is None else share[:, *CORNERS.T]
+    numbers = np.concatenate([table.first + np.arange(owned), ghosts])
+    return Topology(table, corners, ijk, octants, ghosts, cells, share, *_springs(cells, numbers, owned))
+
+
+def _sums(
+    net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[Indices], CellMaterial] | None
+) -> tuple[Floats, float | Floats, float | Floats]:
+    """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
+
+    given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
+    """
+    assert given is not None
+    if of_cells is None and net.share is None:
+        return density * h**3 / 8 * net.octants.sum(axis=1), given, given
+    owned, cells = len(net.octants), len(net.cells)
+    if of_cells is None:
+        made_of = CellMaterial(np.full(cells, density), np.full(cells, given))
+    else:
+        made_of = of_cells(net.ijk[net.cells[:, 0]])
+    share = np.ones((cells, 8)) if net.share is None else net.share
+    of_pairs = shares_of_pairs(share)
+    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density[:, None] * shares_of_mass(of_pairs), owned)
+    of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
+    return mass, of_spring, share.mean(axis=1) * made_of.spring
+
+
+def _kept_cells(local_cells: Indices, owned: int, stiffening: float) -> tuple[Indices, int]:
+    """Return which cells a lattice keeps, those of this rank first, and how many these are.
+
+    The others, of which an owned node is a corner, matter only where the law stiffens.
+    """
+    first_owned = local_cells[:, 0] < owned
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & (stiffening > 0))])
+    return kept, int(first_owned.sum())
+
+
+def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
+    """Return the cells around the owned nodes.
+
+    They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
+    which of the 8 cells around each owned node are valid, (owned, 8) bool.
+    """
+    ijk = decode_morton(table.keys)
+    around = encode_morton(ijk[:, None, :] - CORNERS)
+    octants = cages.table.find(around) >= 0
+    cell_keys = np.unique(around[octants])
+    corner_keys = encode_morton(decode_morton(cell_keys)[:, None, :] + CORNERS)
+    ghost_keys = np.setdiff1d(corner_keys, table.keys)
+    keys = np.concatenate([table.keys, ghost_keys])
+    order = np.argsort(keys)
+    local = order[np.searchsorted(keys, corner_keys, sorter=order)]
+    return decode_morton(keys), local, octants
+
+
+def _sums_of_nodes(cells: Indices, values: Rows, owned: int) -> Array:
+    """Return the sum (owned,) of the ``values`` (c, 8) of the corners of cells (c, 8) that are each owned node."""
+    return np.bincount(cells.ravel(), values.ravel(), owned)[:owned]
+
+
+def _sums_of_springs(cells: Indices, values: Floats, share: Rows, ijk: Indices, springs: Indices, owned: int) -> Floats:
+    """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
+
+    share : (c, 8, 8) of its value that a cell gives to the spring between two of its corners
+    ijk   : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
+    """
+    direction = (ijk[springs[:, 1]] - ijk[springs[:, 0]] + 1) @ np.array([9, 3, 1])
+    return _sums_by_direction(cells, values, share, owned)[springs[:, 0], direction]
+
+
+@numba.njit(cache=True)
+def _sums_by_direction(cells, values, share, owned):
+    sums = np.zeros((owned, 27))
+    for i in range(len(cells)):
+        for a in range(8):
+            if cells[i, a] < owned:
+                for b in range(8):
+                    sums[cells[i, a], DIRECTION[a, b]] += values[i] * share[i, a, b]
+    return sums
+
+
+@numba.njit(cache=True)
+def _springs(cells, numbers, owned):
+    """Return the springs between the corners of cells, each once.
+
+    cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned
+    returns : (s, 2) local ends, how many this rank owns, kind (s,), cells sharing each (s,)
+    """
+    neighbour = np.full((owned, 27), -1, np.int32)
+    sharing = np.zeros((owned, 27), np.uint8)
+    for cell in cells:
+        for a in range(8):
+            if cell[a] < owned:
+                for b in range(8):
+                    neighbour[cell[a], DIRECTION[a, b]] = cell[b]
+                    sharing[cell[a], DIRECTION[a, b]] += 1
+    count = 0
+    for node in range(owned):
+        for direction in range(27):
+            far = neighbour[node, direction]
+            count += far >= 0 and direction != 13 and (numbers[far] > numbers[node] or far >= owned)
+    springs = np.empty((count, 2), np.int32)
+    kind = np.empty(count, np.int64)
+    shared = np.empty(count, np.int64)
+    low, high = 0, count  # springs of this rank fill the front, the others the back
+    for node in range(owned):
+        row = neighbour[node]
+        for direction in np.argsort(numbers[row]):
+            far = row[direction]
+            if far < 0 or direction == 13:
+                continue
+            if numbers[far] > numbers[node]:
+                s = low
+                low += 1
+            elif far >= owned:
+                high -= 1
+                s = high
+            else:
+                continue
+            springs[s, 0], springs[s, 1] = node, far
+            kind[s], shared[s] = KIND[direction], sharing[node, direction]
+    return springs, low, kind, shared
+
+
+# bytes of each array of a Lattice, for one cell, node (ghosts too) or spring: a forecast of memory asks for them
+BYTES_OF_CELL = {"cells": 8 * 8, "cell_kind": 1, "cell_share": 8, "local_cells": 8 * 8, "cell_stiffness": 8}
+BYTES_OF_NODE = {"nodes": 3 * 8, "mass": 8, "pinned": 1, "table": 8}
+BYTES_OF_SPRING = {"springs": 2 * 4, "rest_length": 8, "stiffness": 8}
+
+
+def lattice_bytes(cells: float | Array, nodes: float | Array, springs: float | Array) -> float | Array:
+    """Return the bytes of a lattice's arrays, of which there are so many; numbers, or arrays of a number a rank."""
+    counts = ((cells, BYTES_OF_CELL), (nodes, BYTES_OF_NODE), (springs, BYTES_OF_SPRING))
+    return sum(count * sum(sizes.values()) for count, sizes in counts)

@@ -1,0 +1,167 @@
+"""What each of R ranks would hold of a lattice that is built on one: counted without MPI.
+
+The ranks cut cells and nodes, both in Morton order, as comm.SortedKeys does: at splitters of a sample. The sample
+depends on what each rank brings to it, slabs of cells and then the corners of its cells, so that is repeated too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Array, Indices
+from msmpetsc.comm import sample_of, splitters_of
+from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.interior import Slab
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.scene.body import CagesTable
+
+MOST = 1 << 40  # cells: the scene's own limit is for runs
+INNER_SPRINGS = 13  # of each cell, where cells have neighbours on all sides
+
+
+@dataclass(frozen=True)
+class Partition:
+    """What each rank holds, one number a rank, (R,): whole where they were counted, fractions where they were scaled.
+
+    cells, nodes : that the rank owns
+    ghosts       : nodes of others that its springs reach
+    inner, cut   : springs of which it owns both ends, or one
+    neighbours   : ranks that its ghosts come from: messages that it gets in one exchange, and sends
+    """
+
+    cells: Array
+    nodes: Array
+    ghosts: Array
+    inner: Array
+    cut: Array
+    neighbours: Array
+
+    @property
+    def ranks(self) -> int:
+        """Number of ranks R."""
+        return len(self.nodes)
+
+    @property
+    def springs(self) -> Array:
+        """Number of springs (R,) that each rank keeps."""
+        return self.inner + self.cut
+
+    @property
+    def nonzeros(self) -> Array:
+        """Number of nonzeros (R,) of A: a row for each node, its diagonal and the far ends of its springs."""
+        return self.nodes + 2 * self.inner + self.cut
+
+    @property
+    def all_springs(self) -> float:
+        """Number of springs, each counted once."""
+        return self.inner.sum() + self.cut.sum() / 2
+
+    def scaled(self, cells: float) -> "Partition":
+        """Return the partition of the same body with more cells on as many ranks.
+
+        What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs as they do around
+        a cube of as many nodes as a rank has.
+        """
+        f = cells / self.cells.sum()
+        nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)
+        springs = INNER_SPRINGS * cells + (self.all_springs - INNER_SPRINGS * self.cells.sum()) * f ** (2 / 3)
+        before, after = np.cbrt(self.nodes.mean()), np.cbrt(nodes / self.ranks)
+        cut = self.cut * _cut_springs(after) / _cut_springs(before)
+        inner = self.inner * (springs - cut.sum() / 2) / max(self.inner.sum(), 1)
+        ghosts = self.ghosts * _shell(after) / _shell(before)
+        return Partition(self.cells * f, self.nodes * nodes / self.nodes.sum(), ghosts, inner, cut, self.neighbours)
+
+
+def _shell(side: float) -> float:
+    """Return the number of nodes around a cube of side^3 nodes."""
+    return (side + 2) ** 3 - side**3
+
+
+def _cut_springs(side: float) -> float:
+    """Return the number of springs from a cube of side^3 nodes to those around: 26 a node, less twice those within."""
+    return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
+
+
+def partition_of(bodies: Sequence[Body], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
+    """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
+
+    That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
+    """
+    h = wanted.cell_size
+    area, enclosed = (sum(abs(getattr(body.report, name)) for body in bodies) for name in ("area", "volume"))
+    guess: float
+    if wanted.count is not None:
+        guess = wanted.count
+    else:
+        assert h is not None  # the schema has one of the two
+        guess = _cells(enclosed, 3 / 4 * area, h)  # as choose_cell_size does
+    if h and guess <= most:
+        size = h
+    else:
+        size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
+    cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
+    partition = count_partition(bodies, cages, build_lattice(cages, 1.0, 1.0), ranks)
+    counted = int(partition.cells.sum())
+    if guess > most:
+        cells = wanted.count
+        if cells is None:
+            assert h is not None
+            volume = enclosed if all(body.report.closed for body in bodies) else counted * size**3
+            cells = round(_cells(volume, (counted * size**3 - volume) / size, h))
+        partition = partition.scaled(cells)
+    return partition, counted
+
+
+def _cells(volume: float, area: float, h: float) -> float:
+    """Return how many cells of side h [m] fill a volume [m^3] and stick out of an area [m^2]."""
+    return volume / h**3 + area / h**2
+
+
+def count_partition(bodies: Sequence[Body], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
+    """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
+    cell_rank = _ranks_of_cells(bodies, cages, ranks)
+    rank = _ranks_of_nodes(lattice, cell_rank, ranks)
+    of_end = rank[lattice.springs]
+    across = of_end[:, 0] != of_end[:, 1]
+    to, node = of_end[across].ravel(), lattice.springs[across][:, ::-1].ravel()
+    ghosts = np.unique(to * len(rank) + node)
+    holder, owner = ghosts // len(rank), rank[ghosts % len(rank)]
+    counts = {
+        "cells": cell_rank,
+        "nodes": rank,
+        "ghosts": holder,
+        "inner": of_end[~across, 0],
+        "cut": to,
+        "neighbours": np.unique(holder * ranks + owner) // ranks,
+    }
+    return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
+
+
+def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> Indices:
+    """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
+    grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
+    of_cell = grids.body_of(ijk)
+    for number, (body, grid) in enumerate(zip(bodies, grids.grids, strict=True)):
+        axis, own = int(np.argmax(np.ptp(body.bounds, axis=0))), of_cell == number
+        slab[own] = Slab.owner((ijk[own] - grids.first(number))[:, axis], ranks, int(grid.shape[axis]))
+    keys = cages.table.keys
+    return _cut(keys, [keys[part] for part in _parts(slab, ranks)], ranks)
+
+
+def _ranks_of_nodes(lattice: Lattice, cell_rank: Indices, ranks: int) -> Indices:
+    """Return the rank (n,) of each node; each rank first finds the corners of its cells."""
+    keys = lattice.table.keys
+    return _cut(keys, [keys[np.unique(lattice.cells[part])] for part in _parts(cell_rank, ranks)], ranks)
+
+
+def _parts(rank: Indices, ranks: int) -> list[Indices]:
+    """Return what each rank has, in ascending order."""
+    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank, minlength=ranks))[:-1])
+
+
+def _cut(keys: Indices, brought: list[Indices], ranks: int) -> Indices:
+    """Return the rank of each of the ascending keys, when the ranks have ``brought`` these to the sort."""
+    total = sum(map(len, brought))
+    sample = np.concatenate([sample_of(part, total, ranks) for part in brought])
+    return np.searchsorted(splitters_of(sample, ranks), keys, side="right")

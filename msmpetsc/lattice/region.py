@@ -1,0 +1,181 @@
+"""Which nodes or cells a scene means by a region, and the materials of the parts that regions make.
+
+A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.comm import log, on_root
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.grid import encode_morton
+from msmpetsc.geometry.inside import frame_of, inside_bodies
+from msmpetsc.lattice.cell_fractions import CORNERS
+from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.material import CellMaterial
+from msmpetsc.scene.bodies import OfBody
+from msmpetsc.scene.body import Material, Region
+from msmpetsc.scene.schema import Scene
+
+
+@dataclass(frozen=True)
+class Finder:
+    """Finds a region's nodes in the lattice of bodies, or its cells.
+
+    folder : where files of painted points lie
+    """
+
+    bodies: tuple[Body, ...]
+    cages: Cages
+    folder: Path
+
+    @property
+    def comm(self) -> MPI.Comm:
+        return self.bodies[0].comm
+
+    @property
+    def bounds(self) -> Rows:
+        """Bounding box at rest (b, 2, 3) [m] of each body."""
+        return np.array([body.bounds for body in self.bodies])
+
+    def find(self, table: OfBody, lattice: Lattice, points: Positions) -> Mask:
+        """Return the local nodes that the region of a scene's table means, (l,) bool (collective).
+
+        points : (l, 3) of the bodies that nodes are nearest to [m]: a node that sticks out is where its body is
+
+        Raises InputError on all ranks if there are none.
+        """
+        region = table.table.region
+        if region.painted is None:
+            where = self.inside(table, points, lattice.body)
+            around = self.inside(table, lattice.nodes, lattice.body)
+        else:
+            keys = np.unique(encode_morton(self._painted_cells(table)[:, None, :] + CORNERS))
+            nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
+            where = around = np.isin(encode_morton(nodes), keys)
+        found, near = self.comm.allreduce(np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)]))
+        if found == 0:
+            raise InputError(f"{table.key}.region holds no node of the lattice{self._beside(table)}")
+        if found < near:
+            log.warning(
+                "%s.region only grazes the body: it means %d nodes, not %d that stick out into it from beside it%s",
+                table.key, found, near, self._beside(table),
+            )  # fmt: skip
+        return where
+
+    def inside(self, table: OfBody, points: Positions, body: Indices) -> Mask:
+        """Return which points (n, 3) [m] of bodies (n,) lie in a table's region that is not painted, (n,) bool."""
+        return inside_bodies(table.table.region, points, self.bounds, body, table.body)
+
+    def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
+        """Return which cells (c,) bool have their middles in a region, or hold a painted point (collective).
+
+        The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises InputError on all ranks if
+        the region means none.
+        """
+        region, grids = table.table.region, self.cages.grids
+        if region.painted is None:
+            share = self.cages.share_of(ijk)
+            middles = grids.node_positions(ijk + (0.5 if share is None else _middles(share)))
+            where = self.inside(table, middles, grids.body_of(ijk))
+        else:
+            where = np.isin(encode_morton(ijk), encode_morton(self._painted_cells(table)))
+        if not self.comm.allreduce(bool(where.any()), MPI.LOR):
+            raise InputError(f"{table.key}.region holds the centre of no cell{self._beside(table)}")
+        return where
+
+    def _beside(self, table: OfBody) -> str:
+        """Return where a table's bodies and its region are, for a message."""
+        bounds = self.bounds if table.body is None else self.bounds[[table.body]]
+        body = _in_words(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
+        region = table.table.region
+        return f": the body is {body}" + ("" if region.painted else f", the region {_extent(region, bounds[0])}")
+
+    def _painted_cells(self, table: OfBody) -> Indices:
+        """Return the cells (k, 3) that painted points of a body's surface lie in (collective)."""
+        key, number = table.key, table.body or 0  # without a body there is but one: the scene's own
+        surface, grid = self.bodies[number].surface, self.cages.grids.grids[number]
+
+        def cells() -> Indices:
+            assert surface is not None  # it is on rank 0, which alone is asked
+            points, numbers = surface.points, np.array(self._numbers(key, table.table.region.painted))
+            if numbers.max() >= len(points):
+                raise InputError(
+                    f"{key}.region.painted: there is no point {numbers.max()}: the surface has {len(points)}"
+                )
+            return np.unique(grid.to_cells(points[numbers]).astype(np.int64), axis=0)
+
+        return self.comm.bcast(on_root(self.comm, cells)) + self.cages.grids.first(number)
+
+    def _numbers(self, key: str, painted: str | tuple[int, ...]) -> list[int]:
+        if not isinstance(painted, str):
+            return list(painted)
+        path = self.folder / painted
+        try:
+            if path.exists() and not path.is_file():
+                raise InputError(f"{key}.region.painted: {path} is not a file of numbers")
+            numbers = [int(word) for word in path.read_text().split()]
+        except OSError as error:
+            raise InputError(f"{key}.region.painted: {path} cannot be read: {error.strerror}") from None
+        except ValueError:
+            raise InputError(f"{key}.region.painted: {path} is no list of whole numbers") from None
+        if not numbers or not 0 <= min(numbers) <= max(numbers) < 2**63:
+            raise InputError(f"{key}.region.painted: {path} must list point numbers, from 0")
+        return numbers
+
+
+def _middles(share: Rows) -> Rows:
+    """Return the centre of mass (c, 3), in cells from the low corner, of what is inside cells by corners' shares."""
+    whole = share.sum(axis=(1, 2, 3))
+    return np.stack([share.take(1, axis).sum(axis=(1, 2)) / whole for axis in (1, 2, 3)], axis=1)
+
+
+def _in_words(low: Floats, high: Floats) -> str:
+    ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
+    return "from ({}) to ({}) m".format(*ends)
+
+
+def _extent(region: Region, bounds: Rows) -> str:
+    """Return where a region that is not painted is [m], in words; bounds (2, 3) of its body."""
+    origin, scale, length = frame_of(region, bounds)
+    if region.box is not None:
+        return _in_words(*(origin + np.array(region.box) * scale))
+    if region.sphere is not None:
+        center, reach = origin + np.array(region.sphere.center) * scale, region.sphere.radius * length
+        return _in_words(center - reach, center + reach)
+    assert region.half_space is not None  # the schema has one of the four
+    point, normal = origin + np.array(region.half_space.point) * scale, region.half_space.normal
+    at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
+    return f"beyond ({at}) m towards ({along})"
+
+
+def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMaterial] | None:
+    """Return the function from the grid index (c, 3) of cells to what they are made of (collective).
+
+    It is None where all cells are of the same material.
+    """
+    material, parts, bodies = scene.material, list(scene.tables("part")), [body.material for body in scene.body]
+    if not parts and not any(bodies):
+        return None
+    (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
+    density, stiffness = (
+        np.array([getattr(own, name, None) or getattr(material, name) for own in bodies or [None]])
+        for name in ("density", spring)
+    )
+
+    def of_cells(ijk: Indices) -> CellMaterial:
+        body = finder.cages.grids.body_of(ijk)
+        cells = CellMaterial(density[body], stiffness[body])
+        for part in parts:
+            where = finder.find_cells(part, ijk)
+            cells.density[where] = part.table.density or cells.density[where]
+            cells.spring[where] = getattr(part.table, spring) or cells.spring[where]
+        return cells
+
+    return of_cells

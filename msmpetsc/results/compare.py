@@ -1,0 +1,263 @@
+"""Two runs of one lattice held against each other, frame by frame, without MPI and without PETSc.
+
+An error is the greatest difference at a frame over the scale of its field, which is the same for all frames:
+
+    position, surface                       the largest displacement from rest, at least 1e-6 of a body's longest side
+    kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
+                                            at least that of the stiffest spring strained by 1e-6
+    momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
+    anything else                           its own largest |value|
+
+each over both runs and all frames compared. What the digits of the coarser of the two stored types cannot tell apart
+is equal, and so are two NaN, or two infinities of one sign.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
+from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.fields import FRAME_FIELDS
+from msmpetsc.results.reader import Result
+
+ENERGIES = ("kinetic", "elastic", "potential", "contact")
+DEFAULT = ("position", "surface", *ENERGIES, "momentum")
+LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
+SAME_POINT = 1e-6  # of a cell
+SAME_TIME = 1e-6  # of the spacing of frames
+
+
+class DifferentLattices(InputError):
+    """Two runs are not of one lattice."""
+
+
+@dataclass
+class FieldError:
+    """How far one field of two runs is apart.
+
+    scale  : what errors are relative to
+    errors : (p,) relative, one a frame compared; inf where only one run has a number
+    worst  : (p,) the row, node or point, that is farthest apart; 0 for plain numbers
+    """
+
+    name: str
+    unit: str
+    scale: float = 0.0
+    errors: Floats = field(default_factory=lambda: np.empty(0))
+    worst: Indices = field(default_factory=lambda: np.empty(0, int))
+
+    def first_above(self, rtol: float) -> int | None:
+        """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
+        above = np.flatnonzero(self.errors > rtol)
+        return int(above[0]) if len(above) else None
+
+
+@dataclass
+class Comparison:
+    """Two runs compared, frame by frame.
+
+    pairs    : (p, 2) frames of equal time in the two runs
+    times    : (p,) [s]
+    left_out : fields that only one run has
+    """
+
+    pairs: Indices
+    times: Floats
+    fields: list[FieldError]
+    left_out: list[str]
+
+
+class Distances(NamedTuple):
+    """One field of two runs at p pairs of frames.
+
+    greatest : (p,) greatest distance of two rows
+    worst    : (p,) its row
+    size     : greatest size in any frame, from rest where the field is one of positions
+    """
+
+    greatest: Floats
+    worst: Indices
+    size: float
+
+
+@np.errstate(all="ignore")  # what overflows differs, and is reported as that
+def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
+    """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
+
+    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or not these fields in
+    common.
+    """
+    refuse_different_lattices(a, b)
+    chosen, left_out = _chosen(a, b, names)
+    times = a.frames.time[:]
+    pairs = common_times(times, b.frames.time[:])
+    if not len(pairs):
+        raise InputError(f"{a.path} and {b.path} have no finished frame of the same time")
+    distances = {name: _distances(a, b, name, pairs) for name in chosen}
+    scales = _scales(a, b, distances, pairs)
+    fields = []
+    for name, (greatest, worst, _) in distances.items():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            errors = np.where(greatest == 0, 0.0, greatest / scales[name])
+        fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
+    return Comparison(pairs, times[pairs[:, 0]], fields, left_out)
+
+
+def _chosen(a: Result, b: Result, names: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """Return the fields to compare, and those of DEFAULT that only one run has."""
+    shared = [name for name in a.frames if name in b.frames and name != "time"]
+    if names is None:
+        either = [name for name in DEFAULT if name in a.frames or name in b.frames]
+        return [n for n in either if n in shared], [n for n in either if n not in shared]
+    for name in names:
+        if name not in shared:
+            raise InputError(f"{a.path} and {b.path} do not both have frames/{name}{did_you_mean(name, shared)}")
+    return list(dict.fromkeys(names)), []
+
+
+def rest_of(run: Result, name: str) -> Positions | None:
+    """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
+    at_rest = FRAME_FIELDS[name].at_rest if name in FRAME_FIELDS else ""
+    return run[at_rest][:] if at_rest in run else None
+
+
+def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
+    a_rows, b_rows = a.frames[name], b.frames[name]
+    if a_rows.shape[1:] != b_rows.shape[1:]:
+        raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
+    rest = rest_of(a, name)
+    digits = max(float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0 for rows in (a_rows, b_rows))
+    greatest, worst, size = np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
+    for number, (a_frame, b_frame) in enumerate(pairs):
+        a_values, b_values = (np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame]))
+        apart = _row_lengths(difference(a_values, b_values, digits))
+        worst[number] = np.argmax(apart) if apart.size else 0
+        greatest[number] = apart[worst[number]] if apart.size else 0.0
+        for values in (a_values, b_values):
+            sizes = _row_lengths(values if rest is None else values - rest)
+            size = max(size, sizes[np.isfinite(sizes)].max(initial=0.0))
+    return Distances(greatest, worst, float(size))
+
+
+def difference(a: Array, b: Array, digits: float) -> Floats:
+    """Return |a - b| less what rounding to these relative `digits` may do.
+
+    It is 0 of two NaN, inf of a NaN and a number.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = np.abs(a - b) - digits * np.maximum(np.abs(a), np.abs(b))
+    apart = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, apart)
+    return np.maximum(np.where(np.isnan(apart), np.inf, apart), 0.0)
+
+
+def _row_lengths(rows: Array) -> Floats:
+    """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
+    if rows.ndim == 0:
+        return np.abs(rows)[None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.atleast_1d(np.linalg.norm(rows, axis=-1)).ravel()
+
+
+def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
+    """Return what the errors of each field are relative to."""
+    scales = {name: distance.size for name, distance in distances.items()}
+    side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
+    least = _least_energy(a)
+    energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
+    for name in scales:
+        if name in ENERGIES:
+            scales[name] = energy
+        elif name in FRAME_FIELDS and FRAME_FIELDS[name].at_rest:
+            scales[name] = max(scales[name], LEAST_STRAIN * side)
+    if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
+        scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
+    return scales
+
+
+def longest_side(points: Positions, body: Indices) -> float:
+    """Return the longest side [m] of the bounding box of any body's points (n, 3); ``body`` (n,) are their numbers."""
+    of_bodies = (points[body == number] for number in np.unique(body))
+    return float(max((np.ptp(own, axis=0).max() for own in of_bodies), default=0.0))
+
+
+def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
+    """Return the largest size of these energies at the frames compared, of both runs."""
+    runs = (a, pairs[:, 0]), (b, pairs[:, 1])
+    energies = [(name, run.frames[name][frames]) for run, frames in runs for name in names if name in run.frames]
+    # the potential energy's zero means nothing
+    values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
+    sizes = np.abs(np.concatenate([np.empty(0), *values]))
+    return float(sizes[np.isfinite(sizes)].max(initial=0.0))
+
+
+def _least_energy(run: Result) -> float:
+    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 where the file has no springs."""
+    if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
+        return 0.0
+    return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
+
+
+def rows_agree(a: Array, b: Array, slack: float) -> Mask:
+    """Tell which rows (n,) of a and b, (n, 3) or (n,) each, are apart by no more than `slack`."""
+    return (np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)) <= slack
+
+
+def refuse_different_lattices(a: Result, b: Result) -> None:
+    """Raise DifferentLattices with the first reason why the two are not of one lattice."""
+
+    def refuse(reason: str) -> None:
+        raise DifferentLattices(f"{a.path} and {b.path} are runs of different lattices: {reason}")
+
+    nodes, b_nodes = a.lattice.nodes[:], b.lattice.nodes[:]
+    sizes = cell_size(a, nodes), cell_size(b, b_nodes)
+    if len(nodes) != len(b_nodes):
+        refuse(f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m")
+    if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
+        refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
+    same = rows_agree(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0))
+    if not same.all():
+        node = int(np.argmin(same))
+        refuse(f"node {node} rests at {point_text(nodes[node])} in one, at {point_text(b_nodes[node])} in the other")
+    if "springs" not in a.lattice or "springs" not in b.lattice:
+        return
+    springs, b_springs = a.lattice.springs[:], b.lattice.springs[:]
+    if len(springs) != len(b_springs):
+        refuse(f"{len(springs)} and {len(b_springs)} springs")
+    if not np.array_equal(springs, b_springs) and not np.array_equal(_sorted(springs), _sorted(b_springs)):
+        refuse("their springs join other nodes")
+
+
+def cell_size(run: Result, nodes: Positions) -> float:
+    """Return the edge of a cell [m], from the first; 0 where the file has none."""
+    if "cells" not in run.lattice or not len(run.lattice.cells):
+        return 0.0
+    corners = run.lattice.cells[0].astype(np.int64)
+    if corners.min() < 0 or corners.max() >= len(nodes):
+        raise InputError(f"{run.path} is damaged: its first cell has corner {corners.max()} of {len(nodes)} nodes")
+    return float(np.ptp(nodes[corners], axis=0).max())
+
+
+def point_text(point: Floats) -> str:
+    """Return a point (3,) [m] for a message."""
+    return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
+
+
+def _sorted(springs: Indices) -> Indices:
+    """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
+    springs = np.sort(springs, axis=1)
+    return springs[np.lexsort(springs.T)]
+
+
+def common_times(a: Floats, b: Floats) -> Indices:
+    """Return the indices (p, 2) of equal times in two ascending series [s], equal to rounding."""
+    if not len(a) or not len(b):
+        return np.empty((0, 2), int)
+    slack = SAME_TIME * min((np.diff(b).min() if len(b) > 1 else 1.0), 1.0)
+    right = np.searchsorted(b, a).clip(1, max(1, len(b) - 1))
+    near = np.where(np.abs(b[right - 1] - a) <= np.abs(b[right % len(b)] - a), right - 1, right)
+    near = near.clip(0, len(b) - 1)
+    same = np.abs(b[near] - a) <= slack
+    return np.column_stack([np.nonzero(same)[0], near[same]])

@@ -1,0 +1,166 @@
+"""The disk below what is written: files that come whole or not at all, a lock, room for what is planned."""
+
+import fcntl
+import io
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from errno import EACCES, EAGAIN
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from msmpetsc.errors import InputError, one_line
+
+PARTS = count()  # numbers of parts: several threads write, and USD remembers the name of what failed
+LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could be too long for the file system
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a name to write a file under; it gets its own when it is whole, and of one that fails nothing is left.
+
+    That name ends alike, for many writers go by the ending. Links are followed; a file that is replaced keeps its
+    rights, and one that may not be written stays. Every file that a command leaves is written so, but for results,
+    which grow (results.writer).
+
+    Raises InputError, with the path and the system's reason in one line.
+    """
+    real = Path(os.path.realpath(path))
+    part = real.with_name(f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PARTS)}.part{real.suffix}")
+    try:
+        with plain_errors(path):
+            refuse_no_file(path)
+            real.parent.mkdir(parents=True, exist_ok=True)
+            if real.exists():
+                open(real, "r+b").close()
+            yield part
+            with open(part, "r+b") as file:
+                os.fsync(file.fileno())  # some file systems say only now that they are full
+            if real.exists():
+                shutil.copymode(real, part)
+            part.replace(real)
+    finally:
+        with suppress(OSError):  # of a folder that is none
+            part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a text or bytes as a whole file. Raises InputError."""
+    with whole_file(path) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def refuse_no_file(path: Path) -> None:
+    """Raise InputError for the name of a folder, a pipe or a device."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a file")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a pipe or a device, not a file")
+
+
+class Storage(io.FileIO):
+    """A file for HDF5 to write, which hears of no failure: with what it could not write, HDF5 crashes as it ends.
+
+    failure : the first, to be raised by who writes
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all of it where the file stands."""
+        left = memoryview(data).cast("B")
+        try:
+            while len(left):
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = self.failure or error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        """Give the file another length [byte]."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Raise after the block what failed so far: whatever HDF5 makes of it comes from it."""
+        try:
+            yield
+        finally:
+            if self.failure is not None:
+                raise self.failure
+
+
+class Lock:
+    """Held on a file beside `path` while that is written; the system itself takes it from a run that is killed."""
+
+    def __init__(self, path: Path):
+        """Take the lock. Raises InputError where another run has it."""
+        self.path = path.with_name(f".{path.name}.lock")
+        self._file = -1
+        while not self._take(path):
+            pass
+
+    def _take(self, path: Path) -> bool:
+        """Lock the file, or return False where the run that had it took its name away before it was locked.
+
+        Another run may by then have locked a new file of that name.
+        """
+        self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (EACCES, EAGAIN):  # else it is a file system without locks
+                os.close(self._file)
+                raise InputError(f"{path} is being written by another run") from None
+            return True
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
+                return True
+        os.close(self._file)
+        return False
+
+    def free(self) -> None:
+        """Give the lock back and remove its file."""
+        self.path.unlink(missing_ok=True)  # while it is locked: the name is still this file's
+        os.close(self._file)
+
+
+def bytes_taken(path: Path) -> int:
+    """Return what a file takes on the disk [byte], 0 for none."""
+    return path.stat().st_blocks * 512 if path.exists() else 0
+
+
+def refuse_small_disk(path: Path, planned: int) -> None:
+    """Raise InputError where `planned` [byte] are not free: better now than hours later."""
+    free = shutil.disk_usage(path.parent).free
+    if planned > free:
+        raise InputError(f"{path} will need {planned / 1e9:.3g} GB, and only {free / 1e9:.3g} GB are free there")
+
+
+def copy_sparse(source: int, path: Path) -> None:
+    """Copy the file of a descriptor to a new name; zeros, which frames to come are, take no room."""
+    with open(path, "xb") as copy:
+        for start in range(0, size := os.fstat(source).st_size, 2**20):
+            if (piece := os.pread(source, 2**20, start)).strip(b"\0"):
+                os.pwrite(copy.fileno(), piece, start)
+        copy.truncate(size)
+
+
+@contextmanager
+def plain_errors(path: Path) -> Iterator[None]:
+    """Turn errors of the file system into one line; HDF5 words them at length, and not always as OSError."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError) as error:
+        message = re.search(r"error message = '([^']*)'", str(error))
+        if not message and not isinstance(error, OSError):
+            raise
+        reason = message[1] if message else getattr(error, "strerror", None) or one_line(error)
+        raise InputError(f"{path} cannot be written: {reason}") from error

@@ -1,0 +1,125 @@
+"""How a result file is laid out, so that a kill at any moment leaves it whole: all metadata before the first frame.
+
+Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks allocated, nothing
+buffered. While frames are written, no metadata changes.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from msmpetsc.fields import FIELDS, FRAME_FIELDS, unit_of
+from msmpetsc.results.disk import Storage
+
+CHUNK_BYTES = 64 * 2**20
+
+
+def open_new(storage: Storage) -> h5py.File:
+    """Begin an empty file, of a kind that a kill cannot spoil.
+
+    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
+    cache: nothing waits to be written. No lock: a running result may be looked at.
+    """
+    return h5py.File(storage, "w", libver="earliest", rdcc_nbytes=0, locking=False)
+
+
+def open_again(storage: Storage) -> h5py.File:
+    """Open a file of that kind, to be written further."""
+    return h5py.File(storage, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+
+
+class Plan(NamedTuple):
+    """One dataset to be laid out: its name in the file, its shape and that of its chunks, its type."""
+
+    name: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The sizes of all that is written frame by frame.
+
+    frames  : planned, frame 0 included
+    nodes   : of all ranks
+    points  : surface points of all ranks; None where they are not stored
+    rows    : by name, shape of a node's part of the checkpoint's rows
+    numbers : names of the checkpoint's numbers
+    """
+
+    frames: int = 0
+    nodes: int = 0
+    points: int | None = None
+    surface_dtype: str = FRAME_FIELDS["surface"].dtype
+    rows: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    numbers: tuple[str, ...] = ()
+
+    def plans(self) -> Iterator[Plan]:
+        """Yield the datasets in the order in which they are laid out."""
+        for name, about in FRAME_FIELDS.items():
+            if name not in ("position", "surface"):
+                shape = (self.frames, *(size for size in about.shape[1:] if isinstance(size, int)))
+                yield Plan(f"frames/{name}", shape, shape, about.dtype)
+        yield _rows_plan("frames/position", self.frames, self.nodes, (3,), FRAME_FIELDS["position"].dtype)
+        if self.points is not None:
+            yield _rows_plan("frames/surface", self.frames, self.points, (3,), self.surface_dtype)
+        # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
+        # file before noting its new length; killed in between, it could not be opened.)
+        yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
+        if self.numbers:
+            count = len(self.numbers)
+            yield Plan("checkpoint/numbers", (2, count), (1, count), FIELDS["checkpoint/numbers"].dtype)
+        for name, shape in self.rows.items():
+            yield _rows_plan(f"checkpoint/{name}", 2, self.nodes, shape, "f8")
+
+    @property
+    def nbytes(self) -> int:
+        """Room that the datasets need [byte]."""
+        return sum(math.prod(plan.shape) * np.dtype(plan.dtype).itemsize for plan in self.plans())
+
+    def create(self, file: h5py.File) -> None:
+        """Lay out all datasets in a new file: no frame is finished, no checkpoint holds."""
+        for name in ("frames", "checkpoint"):
+            file.create_group(name)
+        for plan in self.plans():
+            _plan_dataset(file, plan)
+        file["frames/time"][...] = np.nan
+        file["checkpoint/step"][...] = -1
+        if self.numbers:
+            file["checkpoint/numbers"].attrs["names"] = " ".join(self.numbers)
+
+    def first_misfit(self, file: h5py.File) -> str | None:
+        """Return the name of the first dataset that a file does not have as planned; None if it has all."""
+        for plan in self.plans():
+            dataset = file.get(plan.name)
+            if dataset is None or dataset.shape != plan.shape or dataset.dtype != np.dtype(plan.dtype):
+                return plan.name
+        return None
+
+
+def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: str) -> Plan:
+    """Return the plan of a dataset (times, rows, *shape), whose chunks hold rows of one time."""
+    most = CHUNK_BYTES // (math.prod(shape) * np.dtype(dtype).itemsize)
+    return Plan(name, (times, rows, *shape), (1, min(max(1, rows), most), *shape), dtype)
+
+
+def _plan_dataset(file: h5py.File, plan: Plan) -> None:
+    """Create a dataset that can shrink, with all its room in the file set aside now and nothing written to it.
+
+    Through h5py's lower layer: its create_dataset insists on filling datasets that can change their size.
+    """
+    dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    dcpl.set_chunk(plan.chunks)
+    dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    dcpl.set_obj_track_times(False)  # the same run makes the same bytes
+    if plan.name == "frames/time":
+        dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
+    space, kind = h5py.h5s.create_simple(plan.shape, plan.shape), h5py.h5t.py_create(np.dtype(plan.dtype))
+    h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
+    file[plan.name].attrs["unit"] = unit_of(plan.name)

@@ -1,0 +1,362 @@
+"""Result files, read without MPI and without PETSc: ``msmpetsc.open``.
+
+What a file claims is checked when it is opened, before anything of that size is read: whoever made the file, it ends in
+an InputError of one line, or its arrays have the shapes and types of `msmpetsc.fields`.
+"""
+
+import math
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from msmpetsc.backend.arrays import Indices, Positions
+from msmpetsc.errors import InputError, one_line, printable
+from msmpetsc.fields import FIELDS, FRAME_FIELDS
+from msmpetsc.results.lazy import Arrays, LazyArray, xarray_variable
+from msmpetsc.scene.toml import toml_of
+
+if TYPE_CHECKING:  # who reads frames needs neither
+    from scipy.sparse import csr_array
+    from xarray import Dataset
+
+FORMAT, FORMAT_VERSION = "msmpetsc", 1
+NEEDED = ("lattice/nodes", "frames/time", "frames/position")
+PATIENCE = 10  # [s] to read a file's tables
+CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
+DEFLATE_MOST = 1032  # zlib packs no better than this
+AXES: dict[int | str, str] = {"T": "time", "n": "node", "v": "point", 3: "axis"}  # xarray's names of dimensions
+
+
+class StoredState(NamedTuple):
+    """The positions of a checkpoint, q_n and q_(n-1), (n, 3) [m] each, after `step` steps."""
+
+    step: int
+    q: Positions
+    q_previous: Positions
+
+
+class Result:
+    """A result file, opened to be read; also one that is being written, up to the frames finished by now.
+
+    attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
+    lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
+        have, because an older version wrote it or the scene did not ask for it, is not among them
+    file : the same as h5py has it, unchecked where the table of fields ends
+    """
+
+    def __init__(self, path: str | Path):
+        """Raises InputError, one line, if the file is no result, or damaged."""
+        self.path = Path(path)
+        self.file = open_result(path)
+        try:
+            with plain_damage(self.path):
+                self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
+                self._datasets = self._lazy(checked_datasets(self.file))
+        except BaseException:
+            self.close()
+            raise
+        self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
+        self.frames, self._checkpoint = map(self._group, ("frames", "checkpoint"))
+
+    def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
+        count = finished(self.file)
+        return {name: LazyArray(data, count if name.startswith("frames/") else None) for name, data in datasets.items()}
+
+    def _group(self, group: str) -> Arrays:
+        start = f"{group}/"
+        arrays = {name.removeprefix(start): array for name, array in self._datasets.items() if name.startswith(start)}
+        return Arrays(group, arrays)
+
+    def __enter__(self) -> "Result":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing. Afterwards only what was read already can be used."""
+        self.file.close()
+
+    def __repr__(self) -> str:
+        if not self.file:
+            return f"<closed {self.path}>"
+        nodes, frames = self.lattice.nodes.shape[0], len(self.frames.time)
+        return f"<{self.path}: {frames} frames of {nodes} nodes, {self.attributes.get('command', 'no command')}>"
+
+    def _repr_html_(self) -> str:
+        """Return the result as a notebook shows it: what it is of, and its arrays."""
+        title = self.scene.get("title") if "scene" in self.attributes else None
+        lines = [f"<b>{escape(str(title))}</b>"] if title else []
+        lines.append(f"<code>{escape(repr(self))}</code>")
+        if self.file and len(self.frames.time):
+            lines.append(f"t = {self.frames.time[0]:g} s to {self.frames.time[-1]:g} s")
+        arrays = [repr(group) for group in (self.frames, self.lattice, self.surface) if group] if self.file else []
+        listed = "\n".join(arrays)
+        return "<br>".join(lines) + (f"<details><summary>arrays</summary><pre>{escape(listed)}</pre></details>")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._datasets
+
+    def __getitem__(self, name: str) -> LazyArray:
+        """Return the array of a dataset by its name in the file, "lattice/nodes"; InputError where it has none."""
+        if name not in self._datasets:
+            raise InputError(f"{self.path} is damaged: it has no {name}")
+        return self._datasets[name]
+
+    @cached_property
+    def scene(self) -> dict[str, Any]:
+        """The scene as run, overrides included, as TOML has it: ``scene["material"]["density"]``."""
+        text = self.attributes.get("scene")
+        if not isinstance(text, str):
+            raise InputError(f"{self.path} does not say its scene")
+        try:
+            return toml_of(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{self.path}: its scene is not TOML: {one_line(error)}") from error
+
+    @cached_property
+    def embedding(self) -> "csr_array | None":
+        """W (v, n): surface points = W @ positions; None where the scene has output.surface = false."""
+        from scipy.sparse import csr_array
+
+        if not self._embedding:
+            return None
+        if len(self._embedding) < 3:
+            raise InputError(f"{self.path}: a part of embedding is missing")
+        parts = [self._embedding[name][:] for name in ("weights", "indices", "indptr")]
+        try:
+            W = csr_array(tuple(parts), shape=(len(parts[2]) - 1, len(self.lattice.nodes)))
+            W.check_format(full_check=True)
+        except ValueError as error:
+            raise InputError(f"{self.path}: embedding is no matrix: {one_line(error)}") from error
+        if "points" in self.surface and W.shape[0] != len(self.surface.points):
+            raise InputError(f"{self.path}: embedding has {W.shape[0]} rows for {len(self.surface.points)} points")
+        return W
+
+    def body_of(self, group: str) -> Indices:
+        """Return the number of the body of each node ("lattice", (n,)) or surface point ("surface", (v,))."""
+        if f"{group}/body" in self:
+            return self[f"{group}/body"][:].astype(np.int64)
+        return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
+
+    @property
+    def checkpoint(self) -> StoredState | None:
+        """The newest checkpoint by now, or None."""
+        if not {"step", "q", "q_previous"} <= self._checkpoint.keys():
+            return None
+        while True:
+            slot = newest_slot(self._checkpoint.step[:])
+            if slot is None:
+                return None
+            step = int(self._checkpoint.step[slot])
+            state = StoredState(step, self._checkpoint.q[slot], self._checkpoint.q_previous[slot])
+            if step >= 0 and self._checkpoint.step[slot] == step:  # or a running process has begun to replace it
+                return state
+
+    def to_xarray(self) -> "Dataset":
+        """Return the frames, read where they are used: with coordinates, the lattice at rest, units and long names."""
+        try:
+            import xarray
+        except ImportError as error:  # also of what xarray itself needs
+            raise InputError(f"to_xarray needs the package xarray: pip install xarray ({error})") from None
+
+        variables = {name: _variable(f"frames/{name}", array) for name, array in self.frames.items()}
+        at_rest = {f"rest_{name}": field.at_rest for name, field in FRAME_FIELDS.items() if field.at_rest}
+        at_rest["mass"] = "lattice/mass"
+        coordinates = {name: _variable(path, self[path]) for name, path in at_rest.items() if path in self}
+        coordinates |= {"time": variables.pop("time").load(), "axis": ("axis", ["x", "y", "z"])}
+        return xarray.Dataset(variables, coordinates, self.attributes)
+
+
+def _variable(name: str, array: LazyArray) -> Any:
+    """Return the xarray.Variable of a dataset; one that the table does not have gets dimensions of its own."""
+    short, field = name.partition("/")[2], FIELDS.get(name)
+    if field is None:
+        dimensions = ["time", *(f"{short}_{axis}" for axis in range(1, array.ndim))]
+        return xarray_variable(dimensions, array, short.replace("_", " "))
+    return xarray_variable([AXES[size] for size in field.shape], array, field.long_name)
+
+
+def open_result(path: str | Path) -> h5py.File:
+    """Open a result file to read it; InputError if it is none."""
+    path = Path(path)
+    if not path.is_file():
+        kind = "a folder" if path.is_dir() else "a pipe or a device"
+        raise InputError(f"{path} is {kind}, not a file" if path.exists() else f"{path}: no such file")
+    with plain_damage(path):
+        path.open("rb").close()  # is_hdf5 does not tell why it cannot read
+        if not h5py.is_hdf5(path):
+            raise InputError(f"{path} is not an HDF5 file")
+        # No lock, no cache: it may be written just now. What is read is what stands in the file.
+        file = h5py.File(path, "r", locking=False, rdcc_nbytes=0)
+    try:
+        with plain_damage(path):
+            _check_is_result(path, file)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def refuse_deadly(path: Path) -> None:
+    """Raise InputError for a file on which the HDF5 library itself crashes or hangs: a child process reads it first.
+
+    For commands: a process that has threads should not be forked.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            for number in (*CRASHES, signal.SIGALRM):
+                signal.signal(number, signal.SIG_DFL)
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            signal.alarm(PATIENCE)
+            _read_tables(path)
+        except BaseException:
+            pass
+        finally:
+            os._exit(0)
+    status = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(status):
+        does = "hangs" if os.WTERMSIG(status) == signal.SIGALRM else "crashes"
+        raise InputError(f"{path} is damaged: the HDF5 library {does} on it")
+
+
+def _read_tables(path: Path) -> None:
+    """Read every table of the file, and of each dataset a row; of the frames one row of each."""
+    with Result(path) as run:
+        for array in run._datasets.values():
+            _ = array[:, :1] if array.ndim == 3 else array[:1]
+
+
+def finished(file: h5py.File) -> int:
+    """Return the number of finished frames: those whose time is finite."""
+    has_time = np.isfinite(file["frames/time"][:])
+    return int(np.argmin(np.append(has_time, False)))
+
+
+def newest_slot(steps: Indices) -> int | None:
+    """Return the slot of the newest checkpoint from the steps (2,) of both; None if neither has one."""
+    slot = int(np.argmax(steps))
+    return slot if steps[slot] >= 0 else None
+
+
+def _check_is_result(path: Path, file: h5py.File) -> None:
+    name, version = (as_python(file.attrs.get(key)) for key in ("format", "format_version"))
+    if not (isinstance(name, str) and name == FORMAT):
+        raise InputError(f"{path} is not a result of msmpetsc run (format_version {FORMAT_VERSION})")
+    if not (isinstance(version, int) and version == FORMAT_VERSION):
+        version = printable(str(version), 20)
+        raise InputError(f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here")
+    if not isinstance(object_at(path, file, "frames"), h5py.Group):
+        raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
+    checked_dataset(path, file, "frames/time")
+
+
+@contextmanager
+def plain_damage(path: Path) -> Iterator[None]:
+    """Turn what HDF5 and h5py raise on damaged files into an InputError of one line."""
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except KeyError as error:
+        raise InputError(f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}") from error
+    except (OSError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
+
+
+def as_python(value: Any) -> Any:
+    """Return an attribute as Python's own type, if there is one."""
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """Return all that belong to a result, "frames/time" and the like; InputError if one is not what it should be."""
+    path = Path(file.filename)
+    for name in NEEDED:
+        if object_at(path, file, name) is None:
+            raise InputError(f"{path} is damaged: it has no {name}")
+    names = [name for name in FIELDS if object_at(path, file, name) is not None]
+    names += [f"frames/{name}" for name in file["frames"] if name not in FRAME_FIELDS and _is_numbers(file, name)]
+    datasets = {name: checked_dataset(path, file, name) for name in names}
+    _check_sizes(path, datasets, finished(file))
+    return datasets
+
+
+def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
+    """Raise InputError where one letter of the table stands for two numbers, or frames for fewer than `count`."""
+    sizes: dict[str, int] = {}
+    for name, dataset in datasets.items():
+        for axis, (size, symbol) in enumerate(zip(dataset.shape, _expected(name, dataset)[1], strict=True)):
+            if symbol == "T":
+                wrong = f"{count} frames are finished" if size < count else ""
+            else:
+                known = sizes.setdefault(symbol, size) if isinstance(symbol, str) else symbol
+                wrong = f"{known} are expected" if size != known else ""
+            if wrong:
+                raise InputError(f"{path} is damaged: {name} is {size} long along axis {axis}, and {wrong}")
+
+
+def _is_numbers(file: h5py.File, name: str) -> bool:
+    """Tell whether that is a series of numbers; a newer version may keep other things among the frames."""
+    frames = file["frames"]
+    if not name.isprintable() or frames.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+        return False
+    dataset = frames[name]
+    return isinstance(dataset, h5py.Dataset) and not _is_external(dataset) and dataset.dtype.kind in "iuf"
+
+
+def _expected(name: str, dataset: h5py.Dataset) -> tuple[str, tuple[int | str, ...]]:
+    """Return kinds and shape; of what the table does not have, any numbers will do that are as many as the frames."""
+    if name not in FIELDS:
+        return "iuf", ("T", *dataset.shape[1:])
+    field = FIELDS[name]
+    return "f" if field.dtype.startswith("f") else "iu", field.shape
+
+
+def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
+    """Return what the file has under a name, None for nothing; InputError if a link on the way leads elsewhere."""
+    node = file
+    for part in name.split("/"):
+        # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
+        if not isinstance(node, h5py.Group) or not node.id.links.exists(part.encode()):
+            return None
+        if node.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
+            raise InputError(f"{path}: {name} is a link to another place, which is not followed")
+        node = node[part]
+    return node
+
+
+def _is_external(dataset: h5py.Dataset) -> bool:
+    """Tell whether its numbers are in other files. To be asked before its shape, which HDF5 may look up there."""
+    return dataset.is_virtual or bool(dataset.external)
+
+
+def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """Return the dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
+    dataset = object_at(path, file, name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise InputError(f"{path} is damaged: it has no dataset {name}")
+    if _is_external(dataset):
+        raise InputError(f"{path}: {name} is kept in another file, which is not opened")
+    kinds, shape = _expected(name, dataset) if dataset.shape else ("", ())
+    if dataset.dtype.kind not in kinds or len(dataset.shape) != len(shape):
+        kind = printable(str(dataset.dtype), 40)
+        raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
+    rows = " x ".join(map(str, dataset.shape))
+    most = max(dataset.size, math.prod(dataset.chunks or ()))  # a packed chunk is read whole
+    claimed = most * dataset.dtype.itemsize
+    if claimed > file.id.get_filesize() * (DEFLATE_MOST if dataset.compression else 1):
+        raise InputError(f"{path} is damaged: {name} claims {rows} numbers, more than the file holds")
+    return dataset

@@ -1,0 +1,124 @@
+"""Rows on their way between the ranks, each of which has its own, and a file that rank 0 has open.
+
+Rank 0 takes or gives them in pieces. Or each rank writes its own straight to their bytes: a frame's are known from the
+start, for its chunks lie where HDF5 put them when the file was laid out, uncompressed, and stay there (results.layout).
+That needs nothing of h5py, and as nothing is collective no rank waits for another that has failed.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Array
+
+PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
+
+
+def pieces(count: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[slice]:
+    """Return parts of `count` rows of this type and shape, of at most PIECE_BYTES each."""
+    most = max(1, PIECE_BYTES // max(1, dtype.itemsize * math.prod(shape)))
+    return (slice(start, min(start + most, count)) for start in range(0, count, most))
+
+
+def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[int, Array], None]) -> None:
+    """Hand store(start, piece), on rank 0, the rows of all ranks, one after the other (collective).
+
+    rows   : (counts[rank], ...) this rank's, contiguous
+    counts : rows of each rank
+    """
+    if comm.rank > 0:
+        for part in pieces(len(rows), rows.dtype, rows.shape[1:]):
+            comm.Send(rows[part], dest=0)
+        return
+    start, failure = 0, None
+    for rank, count in enumerate(counts):
+        for part in pieces(count, rows.dtype, rows.shape[1:]):
+            piece = rows[part]
+            if rank > 0:
+                piece = np.empty((part.stop - part.start, *rows.shape[1:]), rows.dtype)
+                comm.Recv(piece, source=rank)
+            try:
+                if failure is None and len(piece):
+                    store(start + part.start, piece)
+            except OSError as error:
+                failure = error  # the others still send: hear them out
+        start += count
+    if failure is not None:
+        raise failure
+
+
+def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Callable[[slice], Any]) -> Exception | None:
+    """Fill each rank's rows with what load(part) gives on rank 0; return there what could not be read (collective).
+
+    rows   : (counts[rank], ...) this rank's, to be filled
+    counts : rows of each rank
+    """
+    if comm.rank > 0:
+        for part in pieces(len(rows), rows.dtype, rows.shape[1:]):
+            comm.Recv(rows[part], source=0)
+        return None
+    start, failure = 0, None
+    for rank, count in enumerate(counts):
+        for part in pieces(count, rows.dtype, rows.shape[1:]):
+            piece = np.zeros((part.stop - part.start, *rows.shape[1:]), rows.dtype)
+            try:
+                piece[...] = load(slice(start + part.start, start + part.stop))
+            except (OSError, ValueError) as error:
+                failure = error  # the others still wait
+            if rank > 0:
+                comm.Send(piece, dest=rank)
+            else:
+                rows[part] = piece
+        start += count
+    return failure
+
+
+def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
+    """Return a descriptor of the file on each rank, or None on all if they do not see the same file (collective)."""
+    descriptor, identity = None, None
+    try:
+        descriptor = os.open(path, os.O_WRONLY)
+        status = os.fstat(descriptor)
+        identity = status.st_ino, status.st_size
+    except OSError:
+        pass
+    if len(set(comm.allgather(identity))) == 1 and identity:
+        return descriptor
+    if descriptor is not None:
+        os.close(descriptor)
+    return None
+
+
+def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
+    """Return where in the file [byte] the chunks of dataset[index] begin, in the order of its rows."""
+    starts = range(0, dataset.shape[1], dataset.chunks[1])
+    rest = (0,) * (dataset.ndim - 2)
+    return [dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts]
+
+
+def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:
+    """Write rows (n, ...), contiguous, to their bytes in a file. Raises OSError.
+
+    start   : number of the first of them in its dataset
+    chunk   : rows of a chunk
+    offsets : where the chunks begin [byte]
+    """
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    done = 0
+    while done < len(rows):
+        number, within = divmod(start + done, chunk)
+        count = min(chunk - within, len(rows) - done)
+        _write_all(file, rows[done : done + count].data.cast("B"), offsets[number] + within * row_bytes)
+        done += count
+
+
+def _write_all(file: int, data: memoryview, offset: int) -> None:
+    while data:
+        written = os.pwrite(file, data, offset)
+        data, offset = data[written:], offset + written

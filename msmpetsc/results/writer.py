@@ -1,0 +1,385 @@
+"""The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
+
+Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank writes its own
+where it can reach the file (results.transfer). The file is the same.
+
+All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
+its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
+(`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
+
+``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``, and what else the run goes on from,
+``numbers (2,k)`` with their names as an attribute and rows of nodes (2,n,...). The older slot is written, with its
+step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
+
+A run that goes on writes into the file as it lies there, if all that it needs is laid out in it: so no metadata change
+then either. Else it writes a new one, takes the frames over, and renames it when it holds them (`Begin`).
+"""
+
+import os
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from msmpetsc.backend.arrays import Array
+from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.comm import together
+from msmpetsc.errors import InputError
+from msmpetsc.fields import FRAME_FIELDS, Frame, unit_of
+from msmpetsc.results.disk import (
+    Lock,
+    Storage,
+    bytes_taken,
+    copy_sparse,
+    plain_errors,
+    refuse_no_file,
+    refuse_small_disk,
+)
+from msmpetsc.results.layout import Layout, open_again, open_new
+from msmpetsc.results.reader import (
+    FORMAT,
+    FORMAT_VERSION,
+    checked_dataset,
+    finished,
+    open_result,
+    plain_damage,
+)
+from msmpetsc.results.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
+
+
+class Begin(Enum):
+    """What a result file begins as."""
+
+    NEW = "a new file, of a name that is free"
+    OVERWRITE = "a new file, which may replace another"
+    IN_PLACE = "an earlier file as it lies there, laid out for all frames: only numbers in their places are written"
+    COPY = "a new file with the frames of an earlier one, which it replaces when it has them and a checkpoint"
+
+
+class ResultFile:
+    """The result file of one run. Every rank of `comm` calls every method; errors are raised on all together.
+
+    The file has a temporary name until `start_frames`; closed before that, it is dropped, and an old file of its
+    name stays. What cannot be written (full disk, no permission) raises InputError. A lock beside the file, where the
+    file system has locks, keeps a second run from writing it at the same time.
+
+    finished : number of frames that it holds
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        comm: MPI.Comm,
+        attributes: dict[str, Any],
+        begin: Begin = Begin.NEW,
+        gathers: bool = False,
+    ):
+        """Open the file.
+
+        attributes : who makes it and how; format and format_version are added
+        gathers    : rank 0 writes frames for all ranks, even where each can reach the file
+        """
+        self.path = Path(path)
+        self._planned = self.finished = 0
+        self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
+        self._comm, self._begin, self._gathers = comm, begin, gathers
+        self._file: h5py.File | None = None  # open on rank 0 only
+        self._storage: Storage | None = None  # that it is written to
+        self._numbers: dict[str, h5py.Dataset] = {}  # datasets of one number a frame, once it has frames
+        self._direct: int | None = None  # descriptor of the same file on each rank, once it has its name
+        self._same: int | None = None  # another one on rank 0, to read what it holds when it has no name any more
+        self._lock: Lock | None = None  # held on rank 0 only
+        self._copied: int | None = None  # most frames to take over, all if None
+        self._layout = Layout()
+        self._nodes: tuple[int, ...] = ()  # of each rank
+        self._points: tuple[int, ...] = ()  # surface points of each rank, if they are stored
+        self._failed = False  # to write
+        with self._together():
+            if comm.rank == 0:
+                self._open(attributes)
+
+    def __enter__(self) -> "ResultFile":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:  # no word to the other ranks, which may be elsewhere; the first error is the one to tell
+            with suppress(InputError), plain_errors(self.path):
+                self._finish(trim=not self._failed)  # a full disk is no place to change metadata
+
+    def write(self, name: str, rows: Array) -> None:
+        """Store the ranks' rows, (n_local, ...) on each, one after the other as dataset `name`: "lattice/nodes".
+
+        A file that begins in place has it; raises InputError where its shape is another.
+        """
+        rows = np.asarray(rows)
+        counts, shapes, dtypes = zip(*self._comm.allgather((len(rows), rows.shape[1:], rows.dtype)), strict=True)
+        if len(set(shapes)) > 1:
+            raise ValueError(f"{name}: the ranks' rows differ in shape: {set(shapes)}")
+        dtype, shape = np.result_type(*dtypes), (sum(counts), *shapes[0])
+        with self._together():
+            if self._file is not None and self._begin is Begin.IN_PLACE:
+                stored = checked_dataset(self.path, self._file, name).shape
+                if stored != shape:
+                    raise InputError(f"{self.path} is damaged: {name} has shape {stored}")
+            elif self._file is not None:
+                self._file.create_dataset(name, shape, dtype).attrs["unit"] = unit_of(name)
+        if self._begin is not Begin.IN_PLACE:
+            self._collect(rows, dtype, counts, name)
+
+    def keep(self, frames: int) -> None:
+        """Take no more than so many frames of the earlier file over."""
+        self._copied = frames
+
+    def start_frames(
+        self,
+        count: int,
+        nodes: int,
+        surface_points: int | None = None,
+        surface_dtype: str = FRAME_FIELDS["surface"].dtype,
+        saved: Checkpoint | None = None,
+    ) -> None:
+        """Plan the frames and checkpoints, and give the file its name.
+
+        count          : of frames, frame 0 included
+        nodes          : of this rank
+        surface_points : of this rank; None: not stored
+        saved          : a checkpoint like those to come; None: of q and q_previous alone
+        """
+        self._nodes, points = zip(*self._comm.allgather((nodes, surface_points)), strict=True)
+        self._points = () if points[0] is None else points
+        rows: dict[str, tuple[int, ...]] = {"q": (3,), "q_previous": (3,)}
+        if saved:
+            rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
+        stored = sum(self._points) if self._points else None
+        numbers = tuple(saved.numbers) if saved else ()
+        self._layout = Layout(count, sum(self._nodes), stored, surface_dtype, rows, numbers)
+        with self._together():
+            if self._file is not None:
+                self._lay_out(self._file)
+        self.finished, self._planned = self._comm.bcast(self.finished), count
+        if self._begin is Begin.COPY and saved is not None:
+            self.write_checkpoint(saved)
+        with self._together():
+            if self._file is not None:
+                self._publish(self._file)
+                self._same = os.open(self.path, os.O_RDONLY)
+                names = FRAME_FIELDS.keys() - {"time", "position", "surface"}
+                self._numbers = {name: self._file[f"frames/{name}"] for name in names}
+        if self._comm.size > 1 and not self._gathers:
+            self._direct = open_on_all_ranks(self._comm, self.path)
+
+    def append(self, frame: Frame) -> None:
+        """Store the next frame; once this returns, no kill can lose it."""
+        self._check(frame)
+        index = self.finished
+        self._collect(frame.position, np.dtype("f8"), self._nodes, "frames/position", index)
+        if frame.surface is not None and self._points:
+            dtype = np.dtype(self._layout.surface_dtype)
+            self._collect(frame.surface, dtype, self._points, "frames/surface", index)
+        with self._together():
+            if self._file is not None:
+                for name, numbers in self._numbers.items():
+                    numbers[index] = getattr(frame, name)
+                self._flush(self._file)
+                self._file["frames/time"][index] = frame.time  # from here on the frame is there
+                self._flush(self._file)
+        self.finished += 1
+
+    def write_checkpoint(self, saved: Checkpoint) -> None:
+        """Store what the run can go on from; rows and numbers named as those that were planned."""
+        rows, numbers = self._layout.rows, self._layout.numbers
+        if set(saved.rows) != set(rows) or tuple(saved.numbers) != numbers:
+            raise ValueError(f"planned were checkpoints of {list(rows)} and {list(numbers)}")
+        for name, values in saved.rows.items():
+            self._check_rows(name, values, self._nodes, rows[name])
+        slot = None
+        with self._together():
+            if self._file is not None:
+                slot = int(np.argmin(self._file["checkpoint/step"]))
+                self._file["checkpoint/step"][slot] = -1
+                self._flush(self._file)
+        slot = self._comm.bcast(slot)
+        for name, values in saved.rows.items():
+            self._collect(values, np.dtype("f8"), self._nodes, f"checkpoint/{name}", slot)
+        with self._together():
+            if self._file is not None:
+                if numbers:
+                    self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
+                self._flush(self._file)
+                self._file["checkpoint/step"][slot] = saved.step
+                self._flush(self._file)
+                self._refuse_removed()
+
+    def close(self, trim: bool = True) -> None:
+        """Close the file; a second call does nothing.
+
+        Before, trim the frames to the finished ones, but where the run is to go on: as it lies there the file has room
+        for the rest.
+        """
+        with self._together():
+            self._finish(trim)
+
+    # On rank 0 alone
+
+    def _open(self, attributes: dict[str, Any]) -> None:
+        if self._begin is not Begin.IN_PLACE:
+            self._refuse_to_replace()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        lock = Lock(self.path)
+        try:
+            if self._begin is Begin.IN_PLACE:
+                open_result(self.path).close()
+                self._storage = Storage(self.path, "r+")
+                self._file = open_again(self._storage)
+            else:
+                self._storage = Storage(self._part, "w+")
+                self._file = open_new(self._storage)
+                self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
+        except Exception:
+            self._part.unlink(missing_ok=True)
+            lock.free()
+            raise
+        self._lock = lock
+
+    def _flush(self, file: h5py.File) -> None:
+        """Write what is still in memory. Raises OSError for what could not be written so far."""
+        file.flush()
+        if self._storage is not None and self._storage.failure is not None:
+            raise self._storage.failure
+
+    def _refuse_to_replace(self) -> None:
+        refuse_no_file(self.path)
+        if self.path.exists() and self._begin is Begin.NEW:
+            raise InputError(f"{self.path} exists: --overwrite replaces it")
+
+    def _lay_out(self, file: h5py.File) -> None:
+        if self._begin is Begin.IN_PLACE:
+            if name := self._layout.first_misfit(file):
+                raise InputError(f"{self.path} has no room for {name} as it is now: --force writes the file anew")
+            # what has no room on the disk yet
+            refuse_small_disk(self.path, self.path.stat().st_size - bytes_taken(self.path))
+            self.finished = finished(file)
+            return
+        refuse_small_disk(self.path, self._layout.nbytes - bytes_taken(self.path))
+        self._layout.create(file)
+        if self._begin is Begin.COPY:
+            self._copy_frames(file)
+
+    def _copy_frames(self, file: h5py.File) -> None:
+        """Take the frames of the earlier file over, as far as it has them and `keep` allows."""
+        with open_result(self.path) as earlier:
+            names = sorted(earlier["frames"].keys() & file["frames"].keys())
+            datasets = {name: checked_dataset(self.path, earlier, f"frames/{name}") for name in names}
+            for name, dataset in datasets.items():
+                if dataset.shape[1:] != file["frames"][name].shape[1:]:
+                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {dataset.shape}")
+            count = finished(earlier) if self._copied is None else min(self._copied, finished(earlier))
+            for index in range(count):
+                for name, dataset in datasets.items():
+                    with plain_damage(self.path):
+                        row = dataset[index]
+                    file["frames"][name][index] = row
+        self.finished = count
+
+    def _publish(self, file: h5py.File) -> None:
+        """Give a new file its name."""
+        if self._begin is not Begin.IN_PLACE:
+            self._flush(file)
+            self._refuse_to_replace()
+            os.replace(self._part, self.path)
+
+    def _refuse_removed(self) -> None:
+        """Raise InputError where no name leads to the file any more; what it holds gets one again."""
+        if self._same is None or os.fstat(self._same).st_nlink:
+            return
+        copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy_sparse(self._same, copy)
+        if not self.path.exists():
+            copy = copy.rename(self.path)
+        command = f"msmpetsc run --resume {shlex.quote(str(copy))}"
+        raise InputError(
+            f"{self.path} was removed while it was written; what it held is in {copy}, to go on: {command}"
+        )
+
+    def _finish(self, trim: bool) -> None:
+        for descriptor in (self._direct, self._same):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._direct = self._same = None
+        file, self._file, self._numbers = self._file, None, {}
+        if file is None:
+            return
+        self._part.unlink(missing_ok=True)  # still there only if no frames were started
+        try:
+            with file:
+                if trim and self.finished < self._planned:
+                    for dataset in file["frames"].values():
+                        dataset.resize(self.finished, axis=0)
+        finally:
+            if self._storage is not None:
+                self._storage.close()
+            if self._lock is not None:
+                self._lock.free()
+
+    # What the ranks do together
+
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        """Raise after the block, on all ranks, what one rank could not do in it."""
+        try:
+            telling = self._storage.telling() if self._storage else nullcontext()
+            with together(self._comm), plain_errors(self.path), telling:
+                yield
+        except InputError:
+            self._failed = True
+            raise
+
+    def _check(self, frame: Frame) -> None:
+        if self.finished >= self._planned:
+            raise ValueError(f"frame {self.finished} was not planned: {self._planned} frames were")
+        if not np.isfinite(frame.time):
+            raise ValueError(f"frame {self.finished} has time {frame.time}")
+        self._check_rows("position", frame.position, self._nodes)
+        if self._points:
+            self._check_rows("surface", frame.surface, self._points)
+
+    def _check_rows(self, name: str, rows: Array | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)) -> None:
+        planned, given = (counts[self._comm.rank], *shape), () if rows is None else np.shape(rows)
+        if given != planned:
+            raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
+
+    def _collect(
+        self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
+    ) -> None:
+        """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
+        rows = np.ascontiguousarray(rows, dtype)
+        if self._direct is not None and index is not None:
+            self._write_directly(self._direct, rows, counts, name, index)
+            return
+        file: Any = self._file  # on rank 0, which alone stores
+
+        def store(start: int, piece: Array) -> None:
+            part = slice(start, start + len(piece))
+            file[name][part if index is None else (index, part)] = piece
+
+        with self._together():
+            gather_rows(self._comm, rows, counts, store)
+
+    def _write_directly(self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int) -> None:
+        chunk, offsets = 0, []
+        with self._together():
+            if self._file is not None:
+                dataset = self._file[name]
+                chunk, offsets = dataset.chunks[1], chunk_offsets(dataset, index)
+        chunk, offsets = self._comm.bcast((chunk, offsets))
+        with self._together():
+            write_bytes(descriptor, rows, sum(counts[: self._comm.rank]), chunk, offsets)

@@ -1,0 +1,193 @@
+"""What is written in pictures: captions, labels and the legend, all in one typeface."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msmpetsc.scene.schema import SceneFile
+from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, Colouring, on_scale
+from msmpetsc.view.mesh import KINDS
+from msmpetsc.view.overlays import Overlays
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
+
+
+CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
+LABEL = 11  # [px]
+
+
+@cache
+def typeface(size: int) -> "FreeTypeFont":
+    """Return DejaVu Sans, which comes with matplotlib, in a size [px]."""
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
+
+
+def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> np.ndarray:
+    """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
+    for text, (size, middle) in zip(caption, LINES, strict=True):
+        at = width / 2, letters * middle
+        ImageDraw.Draw(picture).text(at, text, INK, typeface(round(letters * size)), anchor="mm")
+    return np.array(picture)
+
+
+def labelled(picture: np.ndarray, labels: list[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the top left], and the
+    ways (2,) that lead from there out of what is labelled."""
+    from PIL import Image, ImageDraw
+
+    drawn = Image.fromarray(picture)
+    for text, at, way in labels:
+        half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
+        middle = np.clip(at + half * way, half, np.array(drawn.size) - half)
+        ImageDraw.Draw(drawn).text(tuple(middle), text, INK, typeface(LABEL), anchor="mm")
+    return np.array(drawn)
+
+
+def rounded(low: float, high: float) -> tuple[str, str]:
+    """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
+    span = max(high - low, abs(high) * 1e-12, 1e-300)
+    digits = 2 - int(np.floor(np.log10(span)))
+    first, last = (f"{round(end, digits) + 0.0:.{max(digits, 0)}f}" for end in (low, high))
+    return (_bare(first), _bare(last)) if digits > 0 else (first, last)
+
+
+def _bare(number: str) -> str:
+    return number.rstrip("0").rstrip(".")
+
+
+# The legend
+
+
+LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
+FINE = 3  # a legend is drawn so many times larger, and shrunk
+NICE = (1, 2, 5)  # lengths of a scale bar, times powers of ten
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry: a bar of colours, a swatch, an arrow, a line or a length in front of a text.
+
+    kind  : "bar", "swatch", "glass", "arrow", "line" or "length"
+    width : of what stands in front of the text [px]
+    low, high : numbers at the ends of a bar
+    """
+
+    kind: str
+    text: str
+    colour: str = INK
+    width: float = SWATCH
+    low: str = ""
+    high: str = ""
+
+
+def entries_of(
+    scene: SceneFile | None, fixed: bool, overlays: list[Overlays], colouring: Colouring | None, shown: tuple[str, ...]
+) -> list[Entry]:
+    """Return the entries of what is drawn; fixed: whether any of the surface is pinned or led."""
+    entries: list[Entry] = []
+    if colouring is not None and colouring.classes:
+        pairs = enumerate(colouring.classes)
+        entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
+    elif colouring is not None:
+        low, title, high = colouring.ends
+        entries.append(Entry("bar", title, width=BAR, low=low, high=high))
+    if "cells" in shown:
+        entries += [Entry("swatch", text, colour) for colour, text in KINDS.values()]
+    if "springs" in shown:
+        entries.append(Entry("line", "spring", SPRING))
+    if fixed and scene is not None:
+        held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
+        entries.append(Entry("swatch", " or ".join(held), FIXED))
+    if any(view.arrows for view in overlays):
+        entries.append(Entry("arrow", "force", ARROW, 30))
+    if entries and any(view.glass or view.balls or view.shapes for view in overlays):
+        entries.append(Entry("glass", "obstacle", GLASS))
+    return entries
+
+
+def scale_bar(scale: float, most: float) -> Entry:
+    """Return a length that is round and as long as it may be; scale: [px/m]; most: [px]."""
+    longest = most / scale
+    power = 10.0 ** np.floor(np.log10(longest))
+    length = max(step * power for step in NICE if step * power <= longest * (1 + 1e-9))
+    for size, unit in ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm")):
+        if length >= size * (1 - 1e-9):
+            return Entry("length", f"{length / size:.3g} {unit}", width=length * scale)
+    return Entry("length", f"{length:.3g} m", width=length * scale)
+
+
+def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> np.ndarray:
+    """Return the entries side by side, in as many lines as they need: (height, width, 3), no lines for none.
+
+    letters : their size, 1 in a sheet
+    """
+    from PIL import Image, ImageDraw
+
+    room_of_line = round(width / letters)
+    font = typeface(FINE * LETTERS)
+    lines: list[list[Entry]] = []
+    room = 0.0
+    for entry in entries:
+        needed = _length(entry, font) + GAP
+        if not lines or needed > room:
+            lines.append([])
+            room = room_of_line - GAP
+        lines[-1].append(entry)
+        room -= needed
+    picture = Image.new("RGB", (FINE * room_of_line, FINE * LINE * len(lines)), "white")
+    for number, line in enumerate(lines):
+        left = (room_of_line - sum(_length(entry, font) + GAP for entry in line) + GAP) / 2
+        for entry in line:
+            _draw(ImageDraw.Draw(picture), entry, FINE * left, FINE * LINE * (number + 0.5), font)
+            left += _length(entry, font) + GAP
+    if not lines:
+        return np.empty((0, width, 3), np.uint8)
+    return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
+
+
+def _length(entry: Entry, font: "FreeTypeFont") -> float:
+    """Return how long an entry is [px]."""
+    return entry.width + sum(font.getlength(text) / FINE + 8 for text in (entry.text, entry.low, entry.high) if text)
+
+
+def _draw(draw: "ImageDraw", entry: Entry, left: float, middle: float, font: "FreeTypeFont") -> None:
+    """Draw an entry from `left` on, around `middle`, in fine pixels."""
+    gap, half = 8 * FINE, 8 * FINE
+    if entry.low:
+        draw.text((left, middle), entry.low, INK, font, anchor="lm")
+        left += font.getlength(entry.low) + gap
+    right = left + FINE * entry.width
+    box = (left, middle - half, right, middle + half)
+    if entry.kind == "bar":
+        for pixel in range(round(left), round(right)):
+            colour = tuple(on_scale(np.array([(pixel - left) / (right - left)]))[0].astype(int))
+            draw.line((pixel, middle - half, pixel, middle + half), colour)
+    elif entry.kind == "swatch":
+        draw.rectangle(box, entry.colour)
+    elif entry.kind == "glass":
+        draw.rectangle(box, "#e3e9ed", GLASS_EDGE, FINE)
+    else:
+        draw.line((left, middle, right - half * (entry.kind == "arrow"), middle), entry.colour, 2 * FINE)
+    if entry.kind == "arrow":
+        draw.polygon(
+            [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)], entry.colour
+        )
+    if entry.kind == "length":
+        for x in (left, right):
+            draw.line((x, middle - half / 2, x, middle + half / 2), entry.colour, 2 * FINE)
+    for text in filter(None, (entry.high, entry.text)):
+        right += gap
+        draw.text((right, middle), text, INK, font, anchor="lm")
+        right += font.getlength(text)

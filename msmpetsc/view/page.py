@@ -1,0 +1,235 @@
+"""A page for any browser, all in one file: the body turns with the mouse, its frames play under a slider.
+
+page.html is its frame, page.css its look, page*.js draws and steers it; this file says what is drawn. Positions are
+whole numbers of 16 bits over the box around all frames. Frame by frame they are what is left of a prediction that goes
+straight on from the two frames before, deflated and in base64.
+"""
+
+import base64
+import html
+import json
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msmpetsc.comm import log
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.results.disk import write_whole
+from msmpetsc.results.gaps import TINY, unit_vectors
+from msmpetsc.results.progress import counted
+from msmpetsc.results.reader import Result
+from msmpetsc.view import colours
+from msmpetsc.view.annotations import entries_of
+from msmpetsc.view.colours import Colouring
+from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, cut_open, drawn
+from msmpetsc.view.overlays import Overlays
+from msmpetsc.view.playback import Extent, Style, View, extent_of, usual_speed, views_of
+
+MOST = 20e6  # [byte]: a page of more frames takes fewer of them
+LEVELS = 65535  # of a coordinate
+PARTS = files("msmpetsc.view")
+SCRIPTS = ("page.js", "page_drawing.js", "page_lattice.js", "page_steering.js", "page_begin.js")
+
+
+def write_page(
+    subject: Drawable, path: Path, frames: Sequence[int], style: Style, reference: Result | None = None
+) -> None:
+    """Write the page of these frames; of fewer, evenly chosen, where it would be larger than `MOST`.
+
+    Raises InputError where they cannot be drawn or the page not be written.
+    """
+    subject = drawn(subject)
+    seen = extent_of(subject, frames, style, reference)
+    cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
+    chosen, about_lattice = list(frames), None
+    while True:
+        streams = packed_frames(subject, chosen, seen)
+        if cut is not None:
+            of_lattice, about_lattice = packed_lattice(subject, chosen, cut)
+            streams |= of_lattice
+        size = sum(map(len, streams.values())) * 4 / 3
+        if size <= MOST or len(chosen) < 3:
+            break
+        step = max(2, int(np.ceil(size / MOST)))
+        chosen = [*chosen[:-1:step], chosen[-1]]
+    if len(chosen) < len(frames):
+        log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
+    views = views_of(subject, chosen, seen)
+    streams["fixed"], numbers = fixed_states(subject, chosen)
+    facts = page_facts(subject, views, seen, style) | {"fixed": numbers, "lattice": about_lattice}
+    write_whole(path, page_text(subject.title, facts, streams))
+
+
+def packed_frames(subject: Drawable, frames: Sequence[int], seen: Extent) -> dict[str, bytes]:
+    """Return positions, colours and triangles as deflated bytes, for the script to read."""
+    streams = {
+        "positions": deflated(residuals(quantised(subject.surface, frames, seen.box))),
+        "triangles": packed_numbers(subject.triangles, len(subject.rest.points)),
+    }
+    if seen.colouring is not None:
+        streams["colours"] = deflated(changes(levels(seen.colouring, frames)))
+    return streams
+
+
+def packed_lattice(subject: Drawable, frames: Sequence[int], cut: Cut) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return the nodes of what is left of a lattice, its cells and springs as deflated bytes, and what the script must
+    know beside them. Raises InputError where they cannot be drawn."""
+    cells = np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
+    used = np.unique(np.concatenate([cells.ravel(), cut.springs.ravel()]))
+    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[used] for index in frames)]
+    box = np.array([np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)])
+    if not (np.abs(box) < FARTHEST).all():
+        raise InputError(f"--show: {subject.name} has nodes that cannot be drawn")
+    streams = {
+        "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
+        "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
+        "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
+    }
+    about = {
+        "box": box.tolist(),
+        "nodes": len(used),
+        "kinds": [{"cells": len(part), "colour": KINDS[kind][0]} for kind, part in cut.cells.items()],
+        "springColour": colours.SPRING,
+        "shrunk": SHRUNK,
+        "opacity": THROUGH,
+    }
+    return streams, about
+
+
+def packed_numbers(numbers: np.ndarray, count: int) -> bytes:
+    """Return numbers of so many things, deflated: of 16 bits where these do."""
+    return zlib.compress(numbers.astype("<u2" if count <= LEVELS else "<u4").tobytes(), 6)
+
+
+def quantised(points: Callable[[int], np.ndarray], frames: Iterable[int], box: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the points (v, 3) of each frame as whole numbers of 16 bits over a box (2, 3) [m]."""
+    scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
+    for index in counted(list(frames), "frames packed"):
+        yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype(np.int64)
+
+
+def residuals(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+    """Yield each frame less its prediction 2 p - q from the frames p, q before: all low bytes, then all high ones.
+
+    A residual r is stored as 2 r, or -2 r - 1 where it is negative, so that small ones have no high byte.
+    """
+    p = q = None
+    for frame in frames:
+        predicted = np.zeros_like(frame) if p is None else p if q is None else 2 * p - q
+        left = (frame - predicted + 2**15) % 2**16 - 2**15
+        coded = np.where(left < 0, -2 * left - 1, 2 * left).astype(np.uint16)
+        yield (coded & 255).astype(np.uint8).tobytes() + (coded >> 8).astype(np.uint8).tobytes()
+        p, q = frame, p
+
+
+def levels(colouring: Colouring, frames: Iterable[int]) -> Iterator[np.ndarray]:
+    """Yield the colours (v,) of each frame as whole numbers of 8 bits: shares of the scale, or classes."""
+    for index in frames:
+        shown = colouring.values(index) if colouring.classes else 255 * colouring.shares(index)
+        yield np.clip(np.round(np.nan_to_num(shown)), 0, 255).astype(np.uint8)
+
+
+def changes(frames: Iterable[np.ndarray]) -> Iterator[bytes]:
+    """Yield what each frame of numbers (v,) of 8 bits changes of the one before it."""
+    before = None
+    for frame in frames:
+        yield (frame if before is None else frame - before).tobytes()
+        before = frame
+
+
+def fixed_states(subject: Drawable, frames: Iterable[int]) -> tuple[bytes, list[int]]:
+    """Return which points are pinned or led (255, or 0), each state once, deflated, and that of each frame."""
+    states: dict[bytes, int] = {}
+    masks = (np.where(subject.fixed(index) > HELD, 255, 0).astype(np.uint8).tobytes() for index in frames)
+    numbers = [states.setdefault(mask, len(states)) for mask in masks]
+    return zlib.compress(b"".join(states)), numbers
+
+
+def deflated(parts: Iterable[bytes]) -> bytes:
+    """Return the parts, one after the other, deflated."""
+    packer = zlib.compressobj(6)
+    return b"".join([*map(packer.compress, parts), packer.flush()])
+
+
+def page_facts(subject: Drawable, views: Sequence[View], seen: Extent, style: Style) -> dict[str, Any]:
+    """Return what the script must know beside the streams, in types of JSON."""
+    camera, colouring = seen.camera, seen.colouring
+    overlays = [view.overlays for view in views]
+    bar = entries_of(subject.scene, seen.fixed, overlays, colouring, style.shown)
+    return {
+        "title": subject.title,
+        "points": len(subject.rest.points),
+        "box": seen.box.tolist(),
+        "times": [float(subject.times[view.index]) for view in views],
+        "frames": [view.index for view in views],
+        "speed": usual_speed(float(np.ptp(subject.times[[views[0].index, views[-1].index]]))),
+        "camera": {
+            "right": camera.right.tolist(),
+            "away": camera.away.tolist(),
+            "up": camera.up.tolist(),
+            "elevation": float(camera.elevation),
+        },
+        "scale": scale_colours(colouring),
+        "legend": [vars(entry) for entry in bar],
+        "overlays": distinct(overlays),
+        "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
+        "axes": style.axes,
+    }
+
+
+def scale_colours(colouring: Colouring | None) -> list[list[int]]:
+    """Return the 256 colours of the numbers of 8 bits that stand for the colours of points."""
+    numbers = np.arange(256)
+    if colouring is None:
+        table = np.tile(colours.rgb(colours.BODY), (256, 1))
+    else:
+        table = colours.of_classes(numbers) if colouring.classes else colours.on_scale(numbers / 255)
+    return np.round(table).astype(int).tolist()
+
+
+def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
+    """Return what stands beside the body, each different state once, and the number of its state for each frame."""
+    states: dict[str, int] = {}
+    numbers = []
+    for shown in overlays:
+        state = {
+            "grounds": [{"corners": g.corners.tolist(), "normal": g.normal.tolist()} for g in shown.grounds],
+            "glass": [corners.tolist() for corners in shown.glass],
+            "arrows": [arrow.tolist() for arrow in shown.arrows],
+            "shapes": [{"number": s.number, "by": s.by.tolist(), "seen": s.seen.tolist()} for s in shown.shapes],
+            "balls": [{"center": b.center.tolist(), "radius": b.radius, "seen": b.seen.tolist()} for b in shown.balls],
+        }
+        numbers.append(states.setdefault(json.dumps(state), len(states)))
+    return {"states": [json.loads(state) for state in states], "numbers": numbers}
+
+
+def solid_facts(surface: Surface) -> dict[str, list]:
+    """Return an obstacle's surface as the script draws it: each triangle's corners, and its normal at each."""
+    corners = surface.points[surface.triangles]
+    normals = unit_vectors(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=TINY))))
+    return {
+        "corners": np.round(corners, digits).ravel().tolist(),
+        "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel().tolist(),
+    }
+
+
+def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
+    """Return the text of the page, with nothing left to load."""
+    data = facts | {"streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}}
+    parts = {
+        "title": html.escape(title),
+        "css": (PARTS / "page.css").read_text(encoding="utf-8"),
+        "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # which could end the script
+    }
+    text = (PARTS / "page.html").read_text(encoding="utf-8")
+    for name, part in parts.items():
+        text = text.replace(f"{{{{ {name} }}}}", part)
+    return text

@@ -1,0 +1,280 @@
+"""Nodes that a scene leads and lets go, and regions painted on the surface."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from block_scene import CELL, SIDES, G, block_scene, play
+from conftest import run
+from mpi4py import MPI
+from one_process import IN_ONE_PROCESS, errors
+
+from msmpetsc.build import build_model, fill_cages, read_bodies
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.simulate import Simulation
+
+T = 0.01
+LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
+RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
+UP = [{"time": 0.05, "by": [0, 0, 0.02]}, {"time": 0.1, "by": [0, 0.01, 0.03]}]  # 0.4 m/s; then 0.2 m/s aside and up
+
+
+def place(path: list[dict], time: float) -> np.ndarray:
+    """Where a path is."""
+    stops = [{"time": 0, "by": [0, 0, 0]}, *path]
+    return np.array([np.interp(time, [s["time"] for s in stops], [s["by"][c] for s in stops]) for c in range(3)])
+
+
+def led_scene(folder: Path, steps: int, anchors: list[dict], **tables) -> Path:
+    return block_scene(folder, time={"step": T, "duration": steps * T}, anchor=anchors, **tables)
+
+
+def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
+    model, frames = play(led_scene(tmp_path, 14, [{"region": LEFT, "path": UP}]))
+    rest, mass = model.lattice.nodes, model.lattice.mass
+    prescribed = rest[:, 0] == 0
+    assert prescribed.sum() == 15
+    for frame in frames:
+        np.testing.assert_array_equal(frame.position[prescribed], rest[prescribed] + place(UP, frame.time))
+    others = (frames[-1].position - rest)[~prescribed]
+    assert (
+        0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
+    )  # it swings about the end of the path
+    moved = np.linalg.norm(others, axis=1)
+    assert moved.min() > 0
+
+
+def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_both(tmp_path: Path):
+    low = {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}
+    sideways = [{"time": 0.05, "by": [0.01, 0, 0]}]
+    anchors = [{"region": LEFT, "path": UP}, {"region": low, "path": sideways}]
+    pin = [{"region": {"box": [[0, 0, 0], [0.5, 0.01, 0.25]]}}]
+    model, frames = play(led_scene(tmp_path, 5, anchors, pin=pin))
+    rest, moved = model.lattice.nodes, frames[-1].position - model.lattice.nodes
+    pinned = rest[:, 1] == 0
+    first = (rest[:, 0] == 0) & ~pinned
+    second = (rest[:, 2] == 0) & ~pinned & ~first
+    np.testing.assert_array_equal(moved[pinned], 0)
+    np.testing.assert_allclose(moved[first], np.tile([0, 0, 0.02], (first.sum(), 1)), atol=1e-15)
+    np.testing.assert_allclose(moved[second], np.tile([0.01, 0, 0], (second.sum(), 1)), atol=1e-15)
+    np.testing.assert_array_equal(model.lattice.pinned, pinned)
+
+
+def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
+    """Led nodes leave with the path's velocity; without loads nothing changes the momentum from then on."""
+    stop = 0.06 + 0.5 * T
+    model, frames = play(led_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
+    rest, mass = model.lattice.nodes, model.lattice.mass
+    prescribed = rest[:, 0] == 0
+    held, free = frames[6], frames[7]
+    assert held.time < stop < free.time
+    velocity = (held.position - frames[5].position) / T
+    np.testing.assert_allclose(velocity[prescribed], np.tile([0, 0.2, 0.2], (prescribed.sum(), 1)), atol=1e-12)
+    np.testing.assert_allclose(held.momentum, mass @ velocity, atol=1e-12)
+    for frame in frames[7:]:
+        np.testing.assert_allclose(frame.momentum, held.momentum, rtol=1e-6)
+    assert (np.linalg.norm(free.position[prescribed] - rest[prescribed] - place(UP, free.time), axis=1) > 1e-5).all()
+
+
+def test_let_go_at_the_path_s_velocity_an_unstrained_body_flies_on(tmp_path: Path):
+    """All nodes but one led at a constant velocity, the last one pulled along; free fall after that is exact."""
+    most = {"half_space": {"point": [0.3, 0, 0], "normal": [-1, 0, 0]}}
+    rising = [{"time": 1.0, "by": [0, 0, 1.0]}]
+    gravity = {"acceleration": [0, 0, -G]}
+    stop = 0.2 + 0.5 * T
+    model, frames = play(led_scene(tmp_path, 30, [{"region": most, "path": rising, "stop": stop}], gravity=gravity))
+    before = [frame for frame in frames if frame.time < stop][-1]
+    after = frames[-1]
+    n = after.index - before.index
+    fall = before.momentum - [0, 0, model.lattice.mass.sum() * G * T * n]
+    np.testing.assert_allclose(after.momentum, fall, rtol=1e-6, atol=1e-6)
+
+
+def test_anchors_are_let_go_one_after_the_other(tmp_path: Path):
+    stops = (0.03 + 0.5 * T, 0.07 + 0.5 * T)
+    anchors = [{"region": r, "path": UP, "stop": stop} for r, stop in zip((LEFT, RIGHT), stops, strict=True)]
+    model, frames = play(led_scene(tmp_path, 12, anchors))
+    rest = model.lattice.nodes
+    for x, stop in zip((0, 0.5), stops, strict=True):
+        prescribed = rest[:, 0] == x
+        on_path = [np.abs(f.position[prescribed] - rest[prescribed] - place(UP, f.time)).max() < 1e-14 for f in frames]
+        assert on_path == [f.time < stop for f in frames]
+    np.testing.assert_allclose(frames[-1].momentum, frames[8].momentum, rtol=1e-6)
+
+
+def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
+    anchors = [{"region": {"box": [[-1, -1, -1], [1, 1, z]]}, "path": UP} for z in (0.3, 0.2)]
+    with pytest.raises(InputError, match="every node of the lattice is held, nothing is left to move"):
+        play(led_scene(tmp_path, 1, anchors[:1]))
+    low = {"region": {"box": [[-1, -1, -1], [1, 1, 0.05]]}}
+    high = {"region": {"box": [[-1, -1, 0.1], [1, 1, 1]]}, "path": UP}
+    with pytest.raises(InputError, match="pin or anchor: every node"):
+        play(led_scene(tmp_path, 1, [high], pin=[low]))
+    play(led_scene(tmp_path, 1, anchors[1:]))
+
+
+def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path: Path, capsys):
+    """And one of the user's that the first solver used is not called unused, nor taken out with our defaults."""
+    from petsc4py import PETSc
+
+    scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
+    database = PETSc.Options()
+    database.setValue("ksp_rtol", "1e-8")
+    try:
+        with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+            first = simulation.integrator.stepper
+            assert len(list(simulation.frames())) == 4
+            second = simulation.integrator.stepper
+            assert second is not first and second.ksp.getTolerances()[0] == 1e-8
+            simulation.refuse_unused_options(at_end=True)
+            database.setValue("ksp_tpye", "cg")
+            with capsys.disabled(), pytest.raises(InputError, match=r"-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout
+                simulation.refuse_unused_options(at_end=True)
+        assert database.getString("ksp_rtol") == "1e-8"
+    finally:
+        database.delValue("ksp_rtol")
+        database.delValue("ksp_tpye")
+
+
+# ---- painted regions
+
+PAINTED = [3, 17, 3, 101]
+
+
+@pytest.fixture(scope="module")
+def balls(tmp_path_factory) -> Path:
+    """A folder with a ball's scene, its pin painted, and files of numbers."""
+    folder = tmp_path_factory.mktemp("painted")
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
+    ball.export(folder / "ball.ply")
+    (folder / "numbers.txt").write_text("3 17\n3\n\n  101\n")
+    (folder / "words.txt").write_text("3 17 left\n")
+    (folder / "empty.txt").write_text("\n")
+    (folder / "negative.txt").write_text("3 -1\n")
+    (folder / "binary.txt").write_bytes(bytes(range(256)))
+    (folder / "scene.toml").write_text(
+        """
+        mesh.source = "ball.ply"
+        cages.cell_size = 0.3
+        material = { young_modulus = 1e5, density = 1000 }
+        time = { step = 0.01, duration = 0.01 }
+        pin = [{ region.painted = [3, 17, 3, 101] }]
+        """
+    )
+    return folder
+
+
+def corners_of_cells_of(points: np.ndarray, low: np.ndarray, cell_size: float) -> set[tuple[int, ...]]:
+    """Grid index of the corners of the cells that the points lie in, one by one."""
+    found = set()
+    for point in points:
+        cell = [int((p - least) // cell_size) for p, least in zip(point, low, strict=True)]
+        found |= {(cell[0] + i, cell[1] + j, cell[2] + k) for i in (0, 1) for j in (0, 1) for k in (0, 1)}
+    return found
+
+
+def test_painted_points_mean_the_corners_of_their_cells(balls: Path):
+    scene = load_scene(balls / "scene.toml")
+    model = build_model(MPI.COMM_SELF, scene)
+    points = model.surface.points
+    wanted = corners_of_cells_of(points[PAINTED], points.min(axis=0), 0.3)
+    place = np.rint((model.lattice.nodes - points.min(axis=0)) / 0.3).astype(int)
+    found = {tuple(p) for p in place[model.lattice.pinned].tolist()}
+    assert found == wanted and 8 < len(found) <= 24
+    from_file = build_model(MPI.COMM_SELF, load_scene(balls / "scene.toml", ["pin.0.region.painted=numbers.txt"]))
+    np.testing.assert_array_equal(from_file.lattice.pinned, model.lattice.pinned)
+
+
+def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
+    """The corners of an aligned block: its far faces belong to its last cells."""
+    path = block_scene(tmp_path, time={"step": T, "duration": T}, pin=[{"region": {"painted": [0]}}])
+    scene = load_scene(path)
+    points = read_bodies(MPI.COMM_SELF, scene)[0].surface.points
+    far = int(np.argmax(points.sum(axis=1)))
+    lattice = build_model(MPI.COMM_SELF, load_scene(path, [f"pin.0.region.painted=[{far}]"])).lattice
+    last = (lattice.nodes >= SIDES - CELL).all(axis=1)
+    np.testing.assert_array_equal(lattice.pinned, last)
+    assert last.sum() == 8
+
+
+def test_painted_cells_are_cells_of_the_body(balls: Path):
+    """Every point of the surface lies in a valid cell, whose eight corners are nodes."""
+    scene = load_scene(balls / "scene.toml")
+    bodies = read_bodies(MPI.COMM_SELF, scene)
+    cages = fill_cages(bodies, scene)
+    valid = {tuple(cell) for cell in cages.ijk.tolist()}
+    points = cages.grids.grids[0].to_cells(bodies[0].surface.points)
+    assert {tuple(cell) for cell in points.astype(int).tolist()} <= valid
+
+
+WRONG = {
+    "[3, 162]": ["pin.0.region.painted", "there is no point 162", "162"],
+    "gone.txt": ["gone.txt cannot be read"],
+    "words.txt": ["words.txt is no list of whole numbers"],
+    "empty.txt": ["empty.txt must list point numbers"],
+    "negative.txt": ["negative.txt must list point numbers"],
+    "binary.txt": ["binary.txt is no list of whole numbers"],
+    "[3, -1]": ["pin.0.region.painted", "point numbers, from 0"],
+}
+
+
+def test_the_ball_has_the_points_the_cases_think(balls: Path):
+    assert len(trimesh.load(balls / "ball.ply").vertices) == 162
+
+
+# ---- on one rank and on two, by the command line
+
+PRESETS = "newton", "anderson", "fast-msm"
+
+
+@pytest.fixture(scope="module")
+def runs(balls: Path) -> dict[int, tuple[Path, list]]:
+    """On so many ranks: the folder of results, and (status, what was told) of each rank for each of all commands."""
+    half, most_of_it = {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]}, {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]}
+    anchors = [{"region": half, "path": UP, "stop": 0.025}, {"region": most_of_it, "path": UP, "stop": 0.045}]
+    prescribed = led_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
+    found = {}
+    for ranks in (1, 2):
+        out = balls / f"ranks{ranks}"
+        commands = [
+            [prescribed, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"] for preset in PRESETS
+        ]
+        commands += [[balls / "scene.toml", "-o", out / "painted.h5"]]
+        for value in WRONG:
+            commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]
+        commands = [["run", *map(str, command), "-ksp_rtol", "1e-8"] for command in commands]
+        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=100)
+        assert done.returncode == 0, done.stderr
+        found[ranks] = out, [json.loads(line) for line in done.stdout.splitlines()]
+    return found
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_two_ranks_lead_and_let_go_as_one(runs: dict, preset: str):
+    """The solver is built three times; at first six nodes of the last corner are free, which leaves one rank none."""
+    files = {}
+    for ranks, (out, answers) in runs.items():
+        assert [status for status, _ in answers[PRESETS.index(preset)]] == [0] * ranks, answers
+        files[ranks] = h5py.File(out / f"{preset}.h5")["frames/position"][:]
+    assert np.linalg.norm(files[2] - files[1]) < 1e-8 * np.linalg.norm(files[1] - files[1][0])
+
+
+def test_two_ranks_find_the_same_painted_nodes(runs: dict):
+    one, two = (h5py.File(out / "painted.h5")["lattice/pinned"][:] for out, _ in runs.values())
+    assert len(one) > 8
+    np.testing.assert_array_equal(two, one)
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_what_cannot_be_painted_is_told_in_one_line(runs: dict, ranks: int):
+    out, found = runs[ranks]
+    for words, answers in zip(WRONG.values(), found[-len(WRONG) :], strict=True):
+        assert [status for status, _ in answers] == [2] * ranks, answers
+        lines = [line for _, told in answers for line in told.splitlines() if "note:" not in line]
+        assert len(lines) == 1 and lines == errors(answers[0][1]), answers
+        assert all(word in lines[0] for word in words), lines
+    assert not list(out.glob("wrong*"))

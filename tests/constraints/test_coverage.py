@@ -1,0 +1,294 @@
+"""What a run says at its start: what takes which nodes, what has no effect, and a body of an odd size."""
+
+import json
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+from block_scene import CELL, G, block_scene
+from conftest import ENVIRONMENT, run
+from mpi4py import MPI
+from one_process import IN_ONE_PROCESS
+
+from msmpetsc.app.summary import log_model, taken
+from msmpetsc.build import Model, build_model, read_bodies
+from msmpetsc.cli.main import main
+from msmpetsc.constraints.coverage import Reach
+from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.integrators.implicit import ImplicitEuler
+
+TIME = {"step": 0.01, "duration": 0.1}
+LEFT, LEFT_HALF = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}, {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]}  # 15, 45 of 75 nodes
+RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}  # 15
+LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}  # 8 cells, whose nodes are in two layers
+TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}  # 30 nodes: all of those cells
+UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0, 0]}]
+
+
+def build(folder: Path, **tables) -> Model:
+    scene = load_scene(block_scene(folder, **{"time": TIME} | tables))
+    return build_model(MPI.COMM_SELF, scene)
+
+
+@pytest.fixture
+def heard(caplog):
+    """heard() -> the lines since the last call, by level."""
+    caplog.set_level(logging.INFO, "msmpetsc")
+
+    def since() -> list[tuple[str, str]]:
+        names = {logging.WARNING: "WARNING", logging.INFO: "INFO"}  # the command line has words of its own for them
+        lines = [(names[record.levelno], record.getMessage()) for record in caplog.records]
+        caplog.clear()
+        return lines
+
+    return since
+
+
+def force(region: dict, **more) -> dict:
+    return {"region": region, "total": [0, 0, -1.0]} | more
+
+
+NOT_FREE = "force.0 moves nothing: of the 15 nodes in its region none is free while it acts, pins and anchors hold all"
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"pin": [{"region": LEFT_HALF}], "force": [force(LEFT)]},
+        {"anchor": [{"region": LEFT_HALF, "path": UP}], "force": [force(LEFT)]},
+        {"anchor": [{"region": LEFT_HALF, "path": UP, "stop": 0.05}], "force": [force(LEFT, stop=0.05)]},
+    ],
+    ids=["pinned", "led", "led for as long as it acts"],
+)
+def test_a_force_on_no_free_node_is_refused(tmp_path, tables):
+    with pytest.raises(InputError, match=NOT_FREE):
+        build(tmp_path, **tables)
+
+
+@pytest.mark.parametrize(
+    ("tables", "held"),
+    [
+        ({"pin": [{"region": LEFT}], "force": [force(LEFT_HALF)]}, 15),
+        ({"anchor": [{"region": LEFT, "path": UP, "stop": 0.05}], "force": [force(LEFT)]}, 0),
+        ({"pin": [{"region": LEFT}], "force": [force(LEFT, total=[0, 0, 0])]}, 15),
+    ],
+    ids=["partly pinned", "let go before it ends", "switched off"],
+)
+def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
+    reach = build(tmp_path, **tables).reaches[-1]
+    assert (reach.key, reach.held) == ("force.0", held) and heard() == []
+
+
+def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path, heard):
+    twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
+    with pytest.raises(
+        InputError, match=r"anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"
+    ):
+        build(tmp_path, anchor=twice)
+    with pytest.raises(InputError, match=r"anchor.0: of the 15 nodes in its region 15 are pinned: it leads none"):
+        build(tmp_path, anchor=twice[:1], pin=[{"region": LEFT_HALF}])
+    build(tmp_path, anchor=[twice[0], twice[0]])
+    assert heard() == []  # both say the same of every node
+
+
+def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):
+    low, low_edge = {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}, {"box": [[0, 0, 0], [0.5, 0.01, 0.01]]}  # 25 and 5 nodes
+    build(tmp_path, anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}], pin=[{"region": low_edge}])
+    assert heard() == [
+        ("WARNING", "anchor.0: of the 15 nodes in its region 1 is pinned, which it does not lead"),
+        ("WARNING", "anchor.1: of the 25 nodes in its region 5 are pinned and 4 are led by an anchor before it, "
+                    "which it does not lead"),
+    ]  # fmt: skip
+
+
+def test_pins_may_overlap(tmp_path, heard):
+    model = build(tmp_path, pin=[{"region": LEFT_HALF}, {"region": LEFT}])
+    assert heard() == [] and [(r.nodes, r.held) for r in model.reaches] == [(45, 0), (15, 15)]
+
+
+def test_a_part_that_changes_nothing_is_warned_of(tmp_path, heard):
+    part = {"region": LEFT_CELLS, "density": 500.0}
+    build(tmp_path, part=[part], pin=[{"region": LEFT}])
+    assert heard() == []
+    build(tmp_path, part=[part], pin=[{"region": TWO_LAYERS}])
+    assert heard() == [("WARNING", "part.0 has no effect: pins and anchors hold all nodes of its 8 cells")]
+    stiffer = part | {"young_modulus": 1e6}
+    build(tmp_path, part=[part, {"region": LEFT_HALF, "density": 700.0}])
+    assert heard() == [("WARNING", "part.0 has no effect: later parts give all that it gives, on all its 8 cells")]
+    build(tmp_path, part=[stiffer, {"region": LEFT_HALF, "density": 700.0}])
+    assert heard() == []  # its stiffness counts
+    with pytest.raises(InputError, match=r"part.0.region holds the centre of no cell"):
+        build(tmp_path, part=[part | {"region": {"box": [[5, 5, 5], [6, 6, 6]]}}])
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "integrator", "line"),
+    [
+        (0.0, 0.005, "implicit-euler", ("WARNING", "from 0 s to 0.005 s, between the ends of steps of 0.01 s")),
+        (0.012, 0.018, "bdf2", ("WARNING", "from 0.012 s to 0.018 s, between the ends of steps of 0.01 s")),
+        (0.2, None, "implicit-euler", ("INFO", "from 0.2 s on, and the run ends at 0.1 s")),
+        (0.0, 0.005, "verlet", None),
+        (0.1, None, "implicit-euler", None),
+        (0.03, 0.035, "implicit-euler", None),
+    ],
+)
+def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator, line):
+    times = {"start": start} | ({"stop": stop} if stop else {})
+    ground = {"shape": "plane", "point": [0, 0, -1], "normal": [0, 0, 1]}
+    build(tmp_path, force=[force(RIGHT, **times)], obstacle=[ground | times], time=TIME | {"integrator": integrator})
+    wanted = (
+        [(line[0], f"{key} acts in no step: it is there {line[1]}") for key in ("force.0", "obstacle.0")]
+        if line
+        else []
+    )
+    assert heard() == wanted
+
+
+@pytest.mark.parametrize(
+    ("side", "mesh", "words"),
+    [
+        (300.0, {}, "the body is 300 m long, and the scene gives no mesh.size: is the mesh in millimetres?"),
+        (
+            0.0005,
+            {},
+            "the body is 0.0005 m long, and the scene gives no mesh.size: is the mesh in another unit than metres?",
+        ),
+        (20.0, {}, None),
+        (0.001, {}, None),
+        (300.0, {"size": 30.0}, None),
+    ],
+)
+def test_a_body_of_an_odd_size_is_warned_of_before_it_is_filled(tmp_path, heard, side, mesh, words):
+    path = block_scene(tmp_path, [side, side / 2, side / 2], mesh={"source": "scene.ply"} | mesh, time=TIME)
+    read_bodies(MPI.COMM_SELF, load_scene(path))
+    assert heard() == ([("WARNING", f"scene.ply: {words}")] if words else [])
+
+
+# The first and the last lines
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path, ranks):
+    scene = block_scene(
+        tmp_path, time={"step": 0.01, "duration": 0.02}, pin=[{"region": LEFT}],
+        anchor=[{"region": RIGHT, "path": UP, "stop": 0.01}], force=[force(LEFT_HALF)],
+    )  # fmt: skip
+    out = tmp_path / "out" / "x.h5"
+    done = run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", out, "--measure", tmp_path / "cost.json")
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if "compiling" not in line]
+    said = [line.removeprefix("msmpetsc: note: ") for line in lines if line.startswith("msmpetsc:")]
+    assert said[:3] == [
+        "body of 0.5 x 0.5 x 0.25 m; closed mesh of 0.0625 m^3, 62.5 kg; lattice of 0.0625 m^3, 62.5 kg",
+        f"32 cells of 0.125 m, 75 nodes (15 pinned), 554 springs on {ranks} rank{'s' * (ranks > 1)}",
+        "anchor.0 leads 15 nodes, force.0 pulls 45 nodes (15 of them held)",
+    ]
+    assert lines[:3] == [f"msmpetsc: note: {line}" for line in said[:3]] and lines[3].startswith("frame 0/2")
+    assert len(said) == 5 and said[3].startswith("took ") and said[3].endswith(" s of it before the first step")
+    assert said[4].startswith(f"left 3 frames in {out} (") and f"{out.with_suffix('.xdmf')} (" in said[4]
+    assert f"{tmp_path / 'cost.json'} (" in said[4] and ".png" not in said[4]
+
+
+def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
+    """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half the density."""
+    half = {"region": {"box": [[0, 0, 0], [0.25, 1, 1]]}, "density": 500.0}
+    path = block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half])
+    for boundary, told in {
+        "whole": "closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg",
+        "fill": "closed mesh of 0.0405 m^3, 29.25 kg; lattice of 0.0405 m^3, 29.25 kg",  # 0.25 m of 0.45 m are light
+    }.items():
+        scene = load_scene(path, [f'cages.boundary="{boundary}"'])
+        log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
+        assert heard()[0] == ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}")
+
+
+def test_of_many_tables_the_first_are_named():
+    reaches = [Reach(f"force.{number}", 5, 0, "force") for number in range(20)]
+    assert taken(reaches)[-2:] == ["force.11 pulls 5 nodes", "and 8 more"] and len(taken(reaches)) == 13
+    assert len(taken(reaches[:13])) == 13
+
+
+def test_an_open_mesh_has_no_volume_to_say(tmp_path):
+    scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.01})
+    box = trimesh.load(tmp_path / "scene.ply")
+    trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "scene.ply")
+    done = run(1, "-m", "msmpetsc.cli.main", "run", scene, "-o", tmp_path / "x.h5")
+    mesh = "open mesh (3 boundary edges), its volume unknown"
+    assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
+
+
+def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):
+    scene = block_scene(
+        tmp_path, time={"step": 0.01, "duration": 0.04}, gravity={"acceleration": [0, 0, -G]}, pin=[{"region": LEFT}]
+    )
+    path = tmp_path / "x.h5"
+    advance = ImplicitEuler.advance
+
+    def failing(integrator, state, time):
+        if time > 0.025:
+            raise StepFailed("planted")
+        return advance(integrator, state, time)
+
+    monkeypatch.setattr(ImplicitEuler, "advance", failing)
+    assert main(["run", str(scene), "-o", str(path)]) == 3
+    *_, took, left, error = capsys.readouterr().err.splitlines()
+    assert "took " in took and f"left 3 frames in {path} (" in left
+    assert error == "msmpetsc: error: frame 3 (t = 0.03 s) planted"
+
+
+COMPILES = """
+import logging, sys
+import numpy as np
+from msmpetsc.backend.compiling import cache_is_empty, compilation_logged
+empty = cache_is_empty()
+from msmpetsc.contact.obstacles.faces import depth
+from msmpetsc.comm import log
+log.addHandler(logging.StreamHandler(sys.stdout))
+log.setLevel(logging.INFO)
+with compilation_logged(empty):
+    for kind in sys.argv[1:]:
+        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0)
+"""
+
+
+def test_a_wait_for_the_compiler_is_told_once_and_only_where_there_is_one(tmp_path):
+    def said(*kinds: str) -> str:
+        environment = {**ENVIRONMENT, "NUMBA_CACHE_DIR": str(tmp_path)}
+        command = [sys.executable, "-c", COMPILES, *kinds]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=True).stdout
+
+    assert said("f8") == "compiling kernels, once, about a minute\n"
+    assert said("f8") == ""
+    assert said("f8", "f4", "i4") == "compiling kernels, once\n"  # for other types
+
+
+def test_ranks_refuse_and_warn_as_one(tmp_path):
+    """Nodes of a region may all lie on one of the ranks."""
+    block_scene(tmp_path, time=TIME)
+    tables = {
+        "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
+        "it leads none": {"anchor.0": {"region": LEFT_HALF, "path": UP}, "anchor.1": {"region": LEFT, "path": ASIDE}},
+        "part.0 has no effect": {"part.0": {"region": LEFT_CELLS, "density": 500.0}, "pin.0.region": TWO_LAYERS},
+    }
+    commands = [
+        ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]
+        + [word for key, value in given.items() for word in ("--set", f"{key}={toml(value)}")]
+        for number, given in enumerate(tables.values())
+    ]
+    done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands))
+    assert done.returncode == 0, done.stderr
+    for words, status, line in zip(tables, (2, 2, 0), done.stdout.splitlines(), strict=True):
+        answers = json.loads(line)
+        assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
+        assert answers[0][1].count(words) == 1
+
+
+def toml(value) -> str:
+    """Inline."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + "}"
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list) else str(value)

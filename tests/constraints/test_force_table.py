@@ -1,0 +1,116 @@
+"""Forces that change with time: `total = { times, values }`, straight lines between the values."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from block_scene import DENSITY, SIDES, block_scene, play
+
+from msmpetsc.app.resume import flat
+from msmpetsc.environment import Environment
+from msmpetsc.errors import InputError
+from msmpetsc.scene.keys import keys
+from msmpetsc.scene.reading import load_scene
+
+STEP = 1 / 64  # [s]: a binary fraction, so that steps end just at the table's times
+MASS = DENSITY * SIDES.prod()
+ALL = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, 1]}}
+FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
+TABLE = {"times": [2 * STEP, 4 * STEP, 7 * STEP], "values": [[0, 0, 0], [8, 0, -40], [8, 4, 0]]}
+
+
+def total(time: float) -> np.ndarray:
+    return np.array([np.interp(time, TABLE["times"], along) for along in np.transpose(TABLE["values"])])
+
+
+def pulled(folder: Path, table=TABLE, steps: int = 10, **tables) -> Path:
+    """A block that a force pulls at all its nodes; ``time`` adds to its times."""
+    time = {"step": STEP, "duration": steps * STEP} | tables.pop("time", {})
+    return block_scene(folder, time=time, force=[{"region": ALL, "total": table}], **tables)
+
+
+def test_implicit_euler_gives_a_free_body_the_force_of_each_steps_end(tmp_path: Path):
+    _, frames = play(pulled(tmp_path))
+    impulse = np.cumsum([STEP * total(k * STEP) for k in range(1, 11)], axis=0)  # v_(n+1) = v_n + t f(t_(n+1)) / m
+    momentum = np.array([frame.momentum for frame in frames[1:]])
+    np.testing.assert_allclose(momentum, impulse, atol=1e-8 * np.abs(impulse).max())
+
+
+def test_verlet_gives_it_the_integral_and_gains_nothing_from_nowhere(tmp_path: Path, caplog):
+    _, frames = play(pulled(tmp_path, time={"integrator": "verlet"}))
+    fine = np.linspace(0, 10 * STEP, 10 * 64 + 1)
+    integral = np.trapezoid if hasattr(np, "trapezoid") else np.trapz
+    impulse = integral([total(time) for time in fine], fine, axis=0)
+    np.testing.assert_allclose(frames[-1].momentum, impulse, atol=1e-8)
+    assert frames[-1].kinetic == pytest.approx(0.5 * impulse @ impulse / MASS, rel=1e-6), "it moves as a whole"
+    assert "nowhere" not in caplog.text
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
+def test_a_table_that_never_changes_is_the_plain_vector_bit_for_bit(tmp_path: Path, integrator: str):
+    held = {"pin": [{"region": FOOT}], "time": {"integrator": integrator}}
+    force = [3.0, 0.0, -5.0]
+    _, plain = play(pulled(tmp_path, force, 3, **held))
+    _, table = play(pulled(tmp_path, {"times": [0, 1], "values": [force, force]}, 3, **held))
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(plain, table, strict=True))
+
+
+def test_statics_find_the_state_of_each_time_and_the_same_load_once(tmp_path: Path):
+    held = {"pin": [{"region": FOOT}], "time": {"integrator": "static"}}
+    _, frames = play(pulled(tmp_path, steps=9, **held))
+    _, (_, plain) = play(pulled(tmp_path, list(total(3 * STEP)), 1, **held))
+    moved = np.abs(plain.position - frames[0].position).max()
+    np.testing.assert_allclose(frames[3].position, plain.position, atol=1e-6 * moved)
+    assert [frame.iterations > 0 for frame in frames[3:]] == [True] * 5 + [False] * 2, "the last value is held"
+
+
+def test_its_times_are_events_for_adaptive_steps_rest_and_statics(tmp_path: Path):
+    model, _ = play(pulled(tmp_path, steps=1))
+    environment = Environment(model)
+    assert set(TABLE["times"]) <= set(environment.events())
+    assert environment.last_change(1.0) == 7 * STEP and environment.last_change(5 * STEP) == 4 * STEP
+    assert environment.is_same(0, STEP) and environment.is_same(8 * STEP, 9 * STEP)
+    assert not environment.is_same(3 * STEP, 4 * STEP)
+
+
+def test_adaptive_steps_end_where_the_force_turns(tmp_path: Path):
+    scene = pulled(tmp_path, pin=[{"region": FOOT}], time={"error": 1e-2})
+    _, frames = play(scene)
+    _, fine = play(pulled(tmp_path, pin=[{"region": FOOT}], time={"error": 1e-4}))
+    a, b = frames[-1].position, fine[-1].position
+    farthest = max(np.abs(frame.position - fine[0].position).max() for frame in fine)
+    assert np.abs(a - b).max() < 0.05 * farthest
+
+
+WRONG = {
+    "must have ascending times": {"times": [0, 0], "values": [[0, 0, 0], [0, 0, 1]]},
+    "2 times and 1 values": {"times": [0, 1], "values": [[0, 0, 0]]},
+    "force.0.total.values.0: must have 3 items": {"times": [0], "values": [[0, 0]]},
+    "force.0.total.times.0: must be >= 0": {"times": [-1], "values": [[0, 0, 1]]},
+    "force.0.total.time: unknown key, did you mean 'times'?": {"time": [0], "values": [[0, 0, 1]]},
+    "force.0.total: must have 3 items": [1, 2],
+    "force.0.total: must be a list": "down",
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_a_mistake_in_it_is_one_line(words: str, tmp_path: Path):
+    with pytest.raises(InputError) as error:
+        load_scene(pulled(tmp_path, WRONG[words]))
+    assert words in str(error.value) and len(str(error.value).splitlines()) == 1, error.value
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_table_is_among_the_keys_and_a_resumed_run_compares_it(tmp_path: Path):
+    assert "times" in next(key.about for key in keys("force.total"))
+    stored = flat(load_scene(pulled(tmp_path)))
+    assert stored["force.0.total.times"] == tuple(TABLE["times"])
+
+
+def test_a_table_of_nothing_on_held_nodes_is_no_mistake_and_one_of_something_is(tmp_path: Path):
+    held = {"pin": [{"region": FOOT}]}
+    force = {"region": FOOT, "total": {"times": [0, 1], "values": [[0, 0, 0], [0, 0, 0]]}}
+    path = block_scene(tmp_path, time={"step": STEP, "duration": STEP}, force=[force], **held)
+    play(path)
+    with pytest.raises(InputError, match="moves nothing"):
+        play(path, "force.0.total.values=[[0, 0, 0], [1, 0, 0]]")

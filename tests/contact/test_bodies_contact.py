@@ -1,0 +1,107 @@
+"""Bodies that touch: they do not cross, keep their momentum, come to rest on each other; on three ranks, too."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+import trimesh
+from block_scene import play
+from conftest import run
+from crossings import count_crossings
+
+import msmpetsc as package
+from msmpetsc.build import Model
+from msmpetsc.fields import Frame
+
+CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
+GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.5}
+pytestmark = pytest.mark.timeout(200)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("touching")
+    trimesh.creation.box([SIDE, SIDE, SIDE]).subdivide().subdivide().export(folder / "block.ply")
+    trimesh.creation.icosphere(subdivisions=2, radius=SIDE / 2).export(folder / "ball.ply")
+    return folder
+
+
+def body(mesh: str, base: list[float], **tables: Any) -> dict[str, Any]:
+    return {"mesh": {"source": f"{mesh}.ply", "base": base}, **tables}
+
+
+def write(folder: Path, name: str, **tables: Any) -> Path:
+    """A scene file of bodies that touch; ``tables`` are added to it, or take a table's place."""
+    scene = {
+        "cages": {"cell_size": CELL},
+        "material": {"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
+        "self_contact": {"distance": DISTANCE, "friction": 0.5},
+        "solver": {"preset": "newton", "error": 1e-4},
+    }
+    path = folder / f"{name}.toml"
+    path.write_text(tomli_w.dumps(scene | tables))
+    return path
+
+
+def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
+    """Scene of a ball that falls from such a height [m] on a block that lies on the ground."""
+    bodies = [body("block", [0, 0, 0]), body("ball", [0.02, 0.01, SIDE + height])]
+    return write(folder, name, body=bodies, obstacle=[GROUND], gravity={"acceleration": [0, 0, -G]}, **tables)
+
+
+def crossings(model: Model, frames: list[Frame]) -> int:
+    """Return how many edges cross triangles, over all frames."""
+    assert model.surface is not None
+    return sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames)
+
+
+def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
+    model, frames = play(fall(folder, "fall", 0.02, time={"step": 0.01, "duration": 0.4}))
+    assert crossings(model, frames) == 0
+    contacts = np.array([frame.self_contacts for frame in frames])
+    first = int(np.argmax(contacts > 0))
+    assert 5 <= first <= 7 and (contacts[-20:] > 0).all()  # free fall by 2 cm takes 64 ms
+    assert 0 < min(frame.self_distance for frame in frames[first:] if frame.self_contacts) < DISTANCE
+    assert frames[-1].kinetic < 0.02 * max(frame.kinetic for frame in frames)
+    ball, mass = model.lattice.body == 1, model.lattice.mass
+    height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
+    assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2  # it stays above, and is hardly dented
+
+
+def test_without_self_contact_they_pass_through_each_other(folder: Path):
+    path = fall(folder, "through", 0.02, time={"step": 0.01, "duration": 0.15})
+    text = path.read_text()
+    path.write_text(text.replace("[self_contact]\ndistance = 0.001\nfriction = 0.5\n", ""))
+    assert crossings(*play(path)) > 0
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_blocks_that_collide_in_space_keep_their_momentum(folder: Path, friction: float):
+    bodies = [body("block", [0, 0, 0], start={"velocity": [0, 0, 1.0]})]
+    bodies += [body("block", [0.05, 0.08, SIDE + 0.012], start={"velocity": [0.2, 0, -0.5]})]
+    contact = {"distance": DISTANCE, "friction": friction}
+    path = write(folder, f"space{friction}", body=bodies, self_contact=contact, time={"step": 0.005, "duration": 0.1})
+    model, frames = play(path, "solver.error=1e-9")
+    assert max(frame.self_contacts for frame in frames) > 10 and crossings(model, frames) == 0
+    momentum = np.array([frame.momentum for frame in frames])
+    mass = model.lattice.mass
+    scale = 1.0 * mass[model.lattice.body == 0].sum()
+    assert np.abs(momentum - momentum[0]).max() < 1e-7 * scale
+    lower = model.lattice.body == 0
+    speed = mass[lower] @ (frames[-1].position - frames[-2].position)[lower, 2] / 0.005 / scale
+    assert speed < 0.7  # much of its 1 m/s went to the other
+
+
+def test_on_three_ranks_they_end_as_on_one(folder: Path):
+    tight = {"preset": "newton", "error": 1e-9}
+    path = fall(folder, "ranks", 0.002, time={"step": 0.01, "duration": 0.04}, solver=tight)
+    _, frames = play(path)
+    done = run(3, "-m", "msmpetsc", "run", path, "-o", folder / "three.h5", timeout=150)
+    assert done.returncode == 0, done.stderr
+    with package.open(folder / "three.h5") as result:
+        positions, rest = result.frames.position[:], result.lattice.nodes[:]
+        assert result.frames.self_contacts[:][-1] > 0
+    expected = np.array([frame.position for frame in frames])
+    assert np.abs(positions - expected).max() < 1e-6 * np.abs(expected - rest).max()

@@ -1,0 +1,137 @@
+"""A surface that meets itself in a crease, where its parts are nearer at rest than its distance: they do not push at
+rest, they do not cross, and what is told of them is true."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from block_scene import block_scene, play
+from crossings import count_crossings
+
+from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
+from msmpetsc.geometry.surface import Surface
+
+LONG, HIGH, BOTTOM, HALF = 0.5, 0.25, 0.0625, 0.07  # [m]: of a block, of the groove's bottom, and its half width
+DISTANCE = 0.15  # [m]: more than the groove is wide
+LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
+
+
+def grooved(half: float = HALF) -> trimesh.Trimesh:
+    """A block with a groove across its upper side; all its points are within three rings of each other."""
+    middle = LONG / 2
+    profile = [
+        [middle, BOTTOM],
+        [middle - half, HIGH],
+        [0, HIGH],
+        [0, 0],
+        [LONG, 0],
+        [LONG, HIGH],
+        [middle + half, HIGH],
+    ]
+    near, far = (np.insert(profile, 1, y, axis=1) for y in (0.0, 0.25))
+    fan = np.array([[0, i, i + 1] for i in range(1, 6)])
+    i, j = np.arange(7), np.roll(np.arange(7), -1)
+    sides = np.concatenate([np.stack([i, i + 7, j], 1), np.stack([j, i + 7, j + 7], 1)])
+    mesh = trimesh.Trimesh(np.concatenate([near, far]), np.concatenate([fan, 7 + fan[:, ::-1], sides]), process=False)
+    mesh.fix_normals()
+    return mesh
+
+
+def barrier_of(half: float = HALF) -> tuple[Barrier, np.ndarray, tuple[int, int]]:
+    """The barrier of a grooved block, its points (14, 3), and how many pairs are in creases and how many push never."""
+    mesh = grooved(half)
+    points = np.array(mesh.vertices)
+    barrier = Barrier(Surface(points, np.array(mesh.faces)), LAW)
+    return barrier, points, barrier.leave_out_neighbours(points)
+
+
+def closed(points: np.ndarray, gap: float) -> np.ndarray:
+    """The points with the groove's upper edges so far apart [m]."""
+    moved = points.copy()
+    upper = np.isclose(np.abs(points[:, 0] - LONG / 2), HALF)
+    moved[upper, 0] = LONG / 2 + np.sign(points[upper, 0] - LONG / 2) * gap / 2
+    return moved
+
+
+def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
+    barrier, points, (folded, dropped) = barrier_of()
+    assert folded > 0 and dropped == 0
+    candidates = barrier.candidates(points, 0.0)
+    assert not barrier.pushing(barrier.contacts(candidates, points))
+    tight = DISTANCE / 4  # the upper edges are 0.14 m apart: no more than half of that, of 0.15 m over powers of 4
+    level = barrier.distances.index(tight)
+    assert barrier.contacts(None, closed(points, 1.1 * tight))[level].empty()  # to walls it is less
+    assert not barrier.contacts(None, closed(points, 0.99 * tight))[level].empty()
+    through = closed(points, -2 * HALF) - points
+    assert 0.3 < barrier.free_share(points, through, candidates) < 0.5  # they meet halfway
+    assert 0.3 < barrier.sweep(points, through, 0.0)[0] < 0.5
+    assert 0.3 < barrier.free_share_in_creases(points, through) < 0.5
+    assert barrier.free_share(points, closed(points, 0.05) - points, candidates) == 1
+
+
+def test_the_derivatives_in_a_crease_are_those_of_its_energy():
+    barrier, points, _ = barrier_of()
+    points = closed(points, DISTANCE / 10)
+    points[:7] += 1e-3 * np.random.default_rng(1).normal(size=(7, 3))  # no edges that are parallel
+    direction = np.random.default_rng(0).normal(size=points.shape)
+    candidates, step = barrier.candidates(points, 0.01), 1e-7
+
+    def at(share: float) -> tuple[ContactSets, np.ndarray]:
+        moved = points + share * step * direction
+        return barrier.contacts(candidates, moved), moved
+
+    slope = (barrier.energy(*at(1)) - barrier.energy(*at(-1))) / (2 * step)
+    gradient = barrier.gradient(*at(0))
+    assert slope == pytest.approx(np.vdot(gradient, direction), rel=1e-5) and np.abs(gradient).max() > 0
+    bend = (barrier.gradient(*at(1)) - barrier.gradient(*at(-1))) / (2 * step)
+    product = sum(barrier.hessian(*at(0), False)) @ direction.ravel()
+    np.testing.assert_allclose(product, bend.ravel(), atol=1e-5 * np.abs(product).max())
+    assert 0 < barrier.least(*at(0)) < DISTANCE / 4
+
+
+def test_walls_are_clear_as_long_as_they_cannot_come_near():
+    barrier, points, _ = barrier_of()
+    candidates, reach = barrier.candidates(points, 0.0), 0.2
+    clear, anywhere = barrier.clear_reach(candidates, points, reach)
+    assert 0 < anywhere <= clear < reach
+    for seed in range(10):
+        way = np.random.default_rng(seed).normal(size=points.shape)
+        moved = points + 0.999 * anywhere * way / np.linalg.norm(way, axis=1)[:, None]
+        assert not barrier.pushing(barrier.contacts(candidates, moved))
+
+
+def test_walls_that_all_but_touch_are_left_out_and_counted():
+    _, _, (folded, dropped) = barrier_of(half=0.4e-3 * DISTANCE)  # less than a thousandth apart
+    assert folded > 0 and dropped > 0
+
+
+def scene(folder: Path, **tables) -> Path:
+    """Scene of the block: forces close its groove."""
+    half = {"relative": True}
+    sides = [[[0, 0, 0.6], [0.2, 1, 1]], [[0.8, 0, 0.6], [1, 1, 1]]]
+    path = block_scene(
+        folder,
+        cages={"cell_size": 1 / 32},
+        material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
+        time={"step": 0.02, "duration": 0.4},
+        pin=[{"region": {"box": [[0.3, 0, 0], [0.7, 1, 0.2]]} | half}],
+        force=[
+            {"region": {"box": box} | half, "total": [sign * 250.0, 0, 0]}
+            for box, sign in zip(sides, (1, -1), strict=True)
+        ],
+        solver={"preset": "newton", "error": 1e-4},
+        **tables,
+    )
+    grooved().export(folder / "scene.ply")
+    return path
+
+
+def test_a_groove_that_is_pressed_shut_does_not_cross(tmp_path):
+    model, frames = play(scene(tmp_path, self_contact={"distance": DISTANCE, "friction": 0.3}))
+    triangles = model.collision.surface.triangles
+    assert sum(count_crossings(model.collision.points(frame.position), triangles) for frame in frames) == 0
+    assert frames[0].self_contacts == 0 and max(frame.self_contacts for frame in frames) > 0
+    assert 0 < min(frame.self_distance for frame in frames if frame.self_contacts) < DISTANCE / 4
+    _, without = play(scene(tmp_path))
+    assert count_crossings(model.collision.points(without[-1].position), triangles) > 0

@@ -1,0 +1,354 @@
+"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three, resumed runs, meshes that cut
+themselves, what is refused."""
+
+import copy
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from block_scene import block_scene, play
+from crossings import count_crossings
+from mpi4py import MPI
+from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
+
+from msmpetsc.build import Model, build_model
+from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.contact.surface.barrier import Barrier
+from msmpetsc.contact.surface.pairs import NearPairs
+from msmpetsc.contact.surface.term import SMALL, SurfaceContact
+from msmpetsc.errors import InputError
+from msmpetsc.fields import Frame
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve import simulate
+from msmpetsc.solve.instrumentation import Probes
+from msmpetsc.solve.linear.explicit import explicit
+from msmpetsc.solve.nonlinear.step import Stepper
+from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.simulate import Simulation, refuse_bad_options
+
+COMM = MPI.COMM_SELF
+GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
+T = 0.01
+pytestmark = pytest.mark.timeout(200)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Model:
+    tables = {"self_contact": {"distance": 1e-3, "friction": 0.5}}
+    return build_model(COMM, load_scene(pinch_scene(tmp_path_factory.mktemp("pinch"), **tables)))
+
+
+def closed(model: Model) -> np.ndarray:
+    """Nodes (n, 3) of the tube with its arms bent together, so that their ends are GAP apart."""
+    q = model.lattice.nodes.copy()
+    end = np.clip(q[:, 2] / ARM, 0, None) ** 2
+    q[:, 0] -= np.sign(q[:, 0]) * (HALF - RADIUS - GAP / 2) * end
+    return q
+
+
+def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray]:
+    """The term of a step in which the left arm slides along the right one by so much [m], and where it ends."""
+    q = closed(model)
+    assert model.collision is not None
+    end = q.copy()
+    end[q[:, 0] < 0, 1] += slid
+    return SurfaceContact(NearPairs(COMM, model.collision).step(q, q), q, T), end
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-7, 1e-4])  # without friction, below the kink of friction, beyond it
+def test_gradient_is_that_of_the_energy(model, slid: float):
+    term, q = contact(model, slid)
+    gradient = np.zeros_like(q)
+    term.add_gradient(q, gradient)
+    direction = np.random.default_rng(0).normal(size=q.shape)
+    for step in (1e-6, 1e-7):  # which move points by more than a change of energy is told from the forces for
+        difference = term.change(q + step * direction, q - step * direction) / (2 * step)
+        assert difference == pytest.approx(np.vdot(gradient, direction), rel=1e-3)
+    assert np.abs(gradient).max() > 0
+
+
+@pytest.mark.parametrize("slid", [1e-7, 1e-4])
+def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
+    """By differences of energies it had none: line searches of blocks at rest then cut steps that lead down."""
+    term, q = contact(model, slid)
+    forward = np.zeros_like(q)
+    forward[q[:, 0] < 0, 0] = 1.0  # one arm nearer to the other
+    product, hessian, step = np.zeros_like(q), term.hessian(q, False), 1e-13
+    assert hessian is not None
+    hessian.add_product(forward, product)
+    bend = term.change(q + step * forward, q) + term.change(q - step * forward, q)  # the linear parts cancel
+    assert bend / (step**2 * np.vdot(product, forward)) == pytest.approx(1, rel=1e-3)
+    longest = np.abs(model.collision.points(forward)).max()
+    below, above = (term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share for share in (0.999, 1.001))
+    assert below / above == pytest.approx(1, rel=0.01)  # where one formula takes over from the other
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-4])
+def test_forces_keep_momentum(model, slid: float):
+    term, q = contact(model, slid)
+    gradient = np.zeros_like(q)
+    term.add_gradient(q, gradient)
+    moments = np.cross(q, gradient).sum(axis=0)
+    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
+    if slid == 0:  # lagged friction acts along where it was
+        assert np.abs(moments).max() < 1e-10 * np.abs(gradient).sum() * HALF
+
+
+@pytest.mark.parametrize("slid", [0.0, 1e-7])
+def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: float):
+    term, q = contact(model, slid)
+    hessian, step = term.hessian(q, False), 1e-8
+    assert hessian is not None
+    # the arms come nearer as a whole: where pairs neither turn nor slide nothing is left out
+    direction = np.zeros_like(q)
+    direction[q[:, 0] < 0, 0] = 1.0
+    product, after, before = (np.zeros_like(q) for _ in range(3))
+    hessian.add_product(direction, product)
+    term.add_gradient(q + step * direction, after)
+    term.add_gradient(q - step * direction, before)
+    difference = (after - before) / (2 * step)
+    assert np.linalg.norm(product - difference) < 0.02 * np.linalg.norm(difference)
+    for seed in range(3):
+        v, product = np.random.default_rng(seed).normal(size=q.shape), np.zeros_like(q)
+        hessian.add_product(v, product)
+        assert np.vdot(v, product) > 0
+
+
+def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
+    term, q = contact(model)
+    hessian = term.hessian(q, False)
+    assert hessian is not None
+    node = int(np.abs(hessian.blocks).max(axis=1).argmax())
+    columns = np.empty((3, 3))
+    for c in range(3):
+        unit, product = np.zeros_like(q), np.zeros_like(q)
+        unit[node, c] = 1.0
+        hessian.add_product(unit, product)
+        columns[:, c] = product[node]
+    np.testing.assert_allclose(hessian.blocks[node].reshape(3, 3), columns, rtol=1e-10, atol=1e-12 * columns.max())
+    bound = term.bound(q)
+    assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
+    assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
+
+
+def test_the_written_hessian_has_the_contacts_entries(model):
+    """Which couple nodes that no spring joins: `-ksp_view_mat` writes it."""
+    term, q = contact(model)
+    stepper = Stepper(COMM, model.lattice, T, find_preset("newton"), 1e-3, touches=True)
+    hessian, operator = stepper.jacobian.hessian, stepper.jacobian.operator
+    hessian.linearise(q, Contact([], model.lattice.owned, term))
+    x, y = operator.createVecs()
+    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
+    operator.mult(x, y)
+    found = y.duplicate()
+    matrix = explicit(operator, stepper.unknowns, hessian.coupled())
+    matrix.mult(x, found)
+    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
+    for owned in (matrix, x, y, found):
+        owned.destroy()
+    stepper.destroy()
+
+
+def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
+    term, q = contact(model)
+    through, apart, carried = q.copy(), q.copy(), q + np.array([5.0, 0, 0])
+    through[q[:, 0] < 0, 0] += 2 * GAP
+    apart[q[:, 0] < 0, 0] -= 2 * GAP
+    assert 0.3 < term.free_share(q, through) < 0.5  # they meet halfway
+    assert term.free_share(q, apart) == term.free_share(q, carried) == 1.0
+    far = q.copy()
+    far[q[:, 0] < 0, 0] += 500 * GAP  # many edges, and the ends are apart again
+    assert 0 < term.free_share(q, far) < 1 / 500
+
+
+def test_on_a_way_that_was_swept_contacts_are_those_looked_for_anew(model, monkeypatch):
+    """So that line searches need no pairs of their own: the arms close by many edges, and meet."""
+    assert model.collision is not None
+    start, end = model.lattice.nodes.copy(), closed(model)
+    known, looked = NearPairs(COMM, model.collision).step(start, start), []
+    assert known.free_share(start, end) == 1.0
+    monkeypatch.setattr(known.near, "look", looked.append)
+    for share in (0.0, 0.31, 0.9, 0.99, 0.999, 1.0):
+        q = start + share * (end - start)
+        moment, anew = known.find(q), NearPairs(COMM, model.collision).step(q, q).find(q)
+        assert moment.count == anew.count
+        if moment.count:
+            energies = [known.barrier.energy(each.contacts, each.points) for each in (moment, anew)]
+            assert energies[0] == pytest.approx(energies[1], rel=1e-12)
+    assert moment.count > 0 and not looked
+    monkeypatch.undo()
+    assert known.near.step(start, start).find(end).count == moment.count  # in another step
+
+
+STIFFENING = {"young_modulus": 1e5, "density": 1000, "law": "stiffening"}  # or the arms' ends turn inside out
+
+
+def test_arms_that_close_do_not_cross(tmp_path):
+    path = pinch_scene(tmp_path, material=STIFFENING, time={"step": 0.01, "duration": 0.11})
+    model, frames = play(path)
+    triangles = model.surface.triangles
+    assert sum(count_crossings(frame.surface, triangles) for frame in frames) == 0
+    assert 0 < np.nanmin([frame.self_distance for frame in frames]) < 1e-3
+    text = path.read_text()
+    path.write_text(text[: text.index("[self_contact]")])
+    without = play(path)[1]
+    assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(without[-1].self_distance)
+
+
+def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulate, "REMEMBERED", 8)
+    friction = {"friction": 0.3, "distance": 1e-3}
+    scene = load_scene(pinch_scene(tmp_path, material=STIFFENING, self_contact=friction), ("time.duration=0.1",))
+    model = build_model(COMM, scene)
+    with Simulation(COMM, scene, model) as simulation:
+        frames = [copy.deepcopy(simulation.saved()) if frame.index == 8 else frame for frame in simulation.frames()]
+    saved, whole = frames[8], frames[9:]
+    with Simulation(COMM, scene, model) as simulation:
+        simulation.restore(saved)
+        resumed = list(simulation.frames())
+    assert whole[0].self_contacts > 0 and len(resumed) == 2
+    for one, other in zip(whole, resumed, strict=True):
+        for name, value in vars(one).items():
+            assert name == "wall_time" or value is None or np.array_equal(value, getattr(other, name), equal_nan=True)
+
+
+def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
+    """Scene of two bars, one of which dips so deep [m] into the other."""
+    first = trimesh.creation.box([0.5, 0.25, 0.25])
+    second = trimesh.creation.box([0.125, 0.125, 0.5])
+    second.apply_translation([0.03, 0.02, 0.125 + 0.25 - deep])
+    for _ in range(subdivisions):
+        first, second = first.subdivide(), second.subdivide()
+    path = block_scene(folder, self_contact={}, time={"step": 0.01, "duration": 0.01})
+    trimesh.util.concatenate([first, second]).export(folder / "scene.ply")
+    return path
+
+
+def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, caplog):
+    path = crossing_boxes(tmp_path, 0.01, 4)
+    model = build_model(COMM, load_scene(path))
+    assert "triangles cut others at rest, the first at (" in caplog.text
+    surface = model.collision.surface
+    assert 0 < len(surface.triangles) < len(model.surface.triangles)
+    assert count_crossings(surface.points, surface.triangles) == 0
+    assert count_crossings(model.surface.points, model.surface.triangles) > 0
+
+
+def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
+    path = pinch_scene(tmp_path)
+    trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")
+    with pytest.raises(InputError, match=r"self_contact: .* cut others at rest.*union.*repair"):
+        build_model(COMM, load_scene(path))
+
+
+def test_a_coarser_surface_lies_on_the_body(tmp_path):
+    path = pinch_scene(tmp_path, self_contact={"surface": 400})
+    model = build_model(COMM, load_scene(path))
+    surface = model.collision.surface
+    assert 300 < len(surface.triangles) <= 400
+    squares = igl.point_mesh_squared_distance(surface.points, model.surface.points, model.surface.triangles)[0]
+    assert squares.max() < 1e-18
+    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
+
+
+def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
+    model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
+    surface, whole = model.collision.surface, model.surface.points
+    off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
+    assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
+    diagonal = np.linalg.norm(np.ptp(whole, axis=0))
+    assert model.collision.law.distance == pytest.approx(np.median(off)) and np.median(off) > 3e-4 * diagonal
+    caplog.clear()
+    far = {"surface": 400, "distance": 1.01 * off.max()}
+    assert build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact=far))).collision.law.distance > off.max()
+    assert "the surface drawn" not in caplog.text
+
+
+def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
+    q, collision, reach = closed(model), model.collision, 8e-4
+    touching = collision.points(q)
+    end = np.clip(model.lattice.nodes[:, 2] / ARM, 0, None) ** 2
+    q[:, 0] -= (2e-3 - GAP) * end * (q[:, 0] < 0)  # the arms are 2 mm apart, of a distance of 1 mm
+    barrier, points = Barrier(collision.surface, collision.law), collision.points(q)
+    barrier.leave_out_neighbours(collision.surface.points)
+    candidates = barrier.candidates(points, reach)
+    clear, anywhere = barrier.clear_reach(candidates, points, reach)
+    assert 1e-4 < clear < reach and anywhere == clear  # the tube has no creases
+    least = barrier._least(barrier._pairs(candidates, points, 4e-3), points)
+    assert least == pytest.approx(collision.law.distance + 2 * clear)  # both parts come nearer
+    for seed in range(10):
+        way = np.random.default_rng(seed).normal(size=points.shape)
+        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
+        assert not barrier.pushing(barrier.contacts(candidates, moved))
+    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == (1e-4, 1e-4)
+    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ('time.integrator="verlet"', "is for time.integrator"),
+        ('time.integrator="static"', "is for time.integrator"),
+        ('obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1], response="exchange"}]', "past each other"),
+        ("self_contact.distance=0", "self_contact.distance"),
+        ("self_contact.friction=-1", "self_contact.friction"),
+    ],
+)
+def test_what_would_move_the_surface_past_itself_is_refused(tmp_path, override: str, message: str):
+    path = pinch_scene(tmp_path)
+    with pytest.raises(InputError, match=message):
+        load_scene(path, (override,))
+
+
+def test_presets_of_a_are_refused(tmp_path):
+    scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
+    with pytest.raises(InputError, match="self_contact is for newton's presets, not anderson"):
+        refuse_bad_options(COMM, scene, Probes())
+
+
+def sliding(folder: Path, angle: float) -> Path:
+    """Scene of a block that falls onto a plate of the same mesh, all seen as tilted by an angle [degrees]."""
+    cell, g, tilt = 1 / 16, 9.81, np.radians(angle)
+    plate = trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]]).subdivide().subdivide().subdivide()
+    block = trimesh.creation.box(bounds=[[0.125, 0.09375, 3 * cell], [0.375, 0.28125, 6 * cell]])
+    path = block_scene(
+        folder,
+        cages={"cell_size": cell},
+        material={"young_modulus": 1e6, "density": 1000.0, "law": "stiffening"},
+        time={"step": 0.01, "duration": 0.7},
+        gravity={"acceleration": [g * np.sin(tilt), 0.0, -g * np.cos(tilt)]},
+        pin=[{"region": {"box": [[-1, -1, -1], [2, 1, 1.5 * cell]]}}],
+        solver={"preset": "newton", "error": 1e-4},
+        self_contact={"distance": 0.003, "friction": 0.5},
+    )
+    trimesh.util.concatenate([plate, block.subdivide().subdivide()]).export(folder / "scene.ply")
+    return path
+
+
+def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
+    """Speed [m/s] of the block down the plate in each step from the 51st on, at rest on it, and these frames."""
+    model, frames = play(path)
+    free = model.lattice.nodes[:, 2] > 2 / 16
+    mass = model.lattice.mass * free
+    along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
+    return np.diff(along)[50:] / 0.01, frames[51:]
+
+
+@pytest.mark.slow
+def test_a_block_slides_down_another_as_coulomb_has_it(tmp_path):
+    speed, _ = along_and_frames(sliding(tmp_path, 35.0))
+    tilt = np.radians(35.0)
+    acceleration = np.polyfit(0.01 * np.arange(len(speed)), speed, 1)[0]
+    friction = np.tan(tilt) - acceleration / (9.81 * np.cos(tilt))
+    assert friction == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_block_sticks_to_a_tilted_one_but_for_the_creep_of_its_friction(tmp_path):
+    """Friction below the stick speed v_s is mu N (2 v / v_s - (v / v_s)^2): what holds mu N tan(tilt) / mu creeps."""
+    speed, frames = along_and_frames(sliding(tmp_path, 20.0))
+    stick = 1e-2 * 1.5  # of the plate's longest side [m/s]
+    creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
+    np.testing.assert_allclose(speed, creep, rtol=0.02)
+    assert max(frame.iterations for frame in frames) <= 6  # a step starts where the last one ended, not in mid-air

@@ -1,0 +1,227 @@
+"""Obstacles that are meshes or functions of the user's own: as the boxes and spheres that they describe."""
+
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from block_scene import G, block_scene, play
+from conftest import run
+from mpi4py import MPI
+
+import msmpetsc as msm
+from msmpetsc.build import build_model
+from msmpetsc.contact.obstacles.distance import FunctionSolid
+from msmpetsc.contact.obstacles.mesh_solid import MeshSolid
+from msmpetsc.contact.obstacles.solids import Faces, Solid
+from msmpetsc.errors import InputError
+from msmpetsc.extensions import OBSTACLES
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.scene.reading import load_scene
+
+TORUS = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
+STAR = trimesh.creation.box((1, 2, 3)) + trimesh.creation.icosphere(2).apply_translation([3, 0, 0])
+CUT = trimesh.boolean.difference([trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1, 1, 3))], engine="manifold")
+CENTER, RADIUS = np.array([0.21, 0.25, -0.3]), 0.3
+BALL = {"shape": "sphere", "center": CENTER.tolist(), "radius": RADIUS}
+OWN = {"shape": "function", "function": "ball"}
+FALLING = {"time": {"step": 0.01, "duration": 0.25}, "gravity": {"acceleration": [0, 0, -G]}}
+
+
+def ball(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The signed distance to BALL's surface, and its gradient."""
+    out = x - CENTER
+    far = np.linalg.norm(out, axis=1)
+    return far - RADIUS, out / far[:, None]
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    """The function, for the time of a test."""
+    msm.register_obstacle("ball", ball)
+    yield
+    OBSTACLES._registered.clear()
+
+
+def solid_of(mesh: trimesh.Trimesh) -> MeshSolid:
+    return MeshSolid(Surface(np.array(mesh.vertices), np.array(mesh.faces)))
+
+
+# ---- depths and normals
+
+
+@pytest.mark.parametrize("mesh", [TORUS, STAR, CUT, trimesh.creation.icosphere(3)])
+def test_depths_are_igls_signed_distances(mesh: trimesh.Trimesh):
+    """Whose sign is that of the winding number, found in quite another way; of edges inwards and outwards, of parts."""
+    low, high = mesh.bounds
+    x = np.random.default_rng(1).uniform(low - 0.3, high + 0.3, (3000, 3))
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
+    distance = igl.signed_distance(x, np.array(mesh.vertices), np.array(mesh.faces, np.int64), sign_type=kind)[0]
+    depths, _ = solid_of(mesh).depths(x)
+    near = ((x >= low) & (x <= high)).all(axis=1)
+    np.testing.assert_allclose(depths[near], -distance[near], atol=1e-12)
+    assert (depths[~near] < 0).all() and (depths[~near] >= -distance[~near] - 1e-12).all()
+    assert 100 < (depths > 0).sum() < near.sum()
+
+
+@pytest.mark.parametrize("solid", [solid_of(TORUS), FunctionSolid(ball, "obstacle.0")], ids=["mesh", "function"])
+def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(solid: Solid):
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-1.4, 1.4, (4000, 3)) * 0.4 + (0 if isinstance(solid, FunctionSolid) else 0.8 * np.array([1, 0, 0]))
+    depths, face = solid.depths(x)
+    x, face, depths = x[depths > 1e-3], face[depths > 1e-3], depths[depths > 1e-3]
+    normals, step = solid.normals(x, face), 1e-6
+    slope = [(solid.depths(x + step * e)[0] - solid.depths(x - step * e)[0]) / (2 * step) for e in np.eye(3)]
+    off = np.abs(normals + np.array(slope).T).max(axis=1)
+    assert (
+        len(x) > 30 and np.median(off) < 1e-8 and (off < 1e-4).mean() > 0.95
+    )  # but where the nearest triangle changes
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    moved = 1e-9 * rng.normal(size=x.shape)  # of which a difference of depths would keep seven digits
+    np.testing.assert_allclose(
+        solid.deeper(x + moved, moved, face), -(moved * normals).sum(axis=1), rtol=1e-5, atol=1e-15
+    )
+    far = x + 0.3 * depths[:, None] * rng.normal(size=x.shape)
+    still = solid.depths(far)
+    same = (still[0] > 0) & (still[1] == face)
+    np.testing.assert_allclose(
+        solid.deeper(far[same], (far - x)[same], face[same]), (still[0] - depths)[same], atol=1e-12
+    )
+
+
+def test_a_node_on_the_surface_has_its_triangles_normal_and_one_far_off_no_depth():
+    cube = solid_of(trimesh.creation.box((1, 1, 1)))
+    on_top, far = np.array([[0.1, 0.2, 0.5]]), np.array([[9.0, 0, 0]])
+    depths, face = cube.depths(on_top)
+    assert abs(depths[0]) < 1e-15 and cube.normals(on_top, face).tolist() == [[0, 0, 1]]
+    assert cube.depths(far)[0][0] == -8.5
+    assert cube.depths(np.empty((0, 3)))[0].shape == (0,)
+
+
+def test_a_surface_wound_inwards_is_the_same_solid():
+    inward = TORUS.copy()
+    inward.invert()
+    x = np.random.default_rng(3).uniform(-1.4, 1.4, (500, 3))
+    np.testing.assert_array_equal(solid_of(inward).depths(x)[0], solid_of(TORUS).depths(x)[0])
+
+
+# ---- runs
+
+
+RESPONSES = [
+    {"response": "penalty", "friction": 0.3, "path": [{"time": 0.2, "by": [0.02, 0, 0.01]}]},
+    {"response": "reflect", "restitution": 0.5},
+]
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
+@pytest.mark.parametrize("response", RESPONSES, ids=lambda response: response["response"])
+def test_a_function_is_the_sphere_that_it_describes(tmp_path: Path, response: dict, integrator: str):
+    """The block meets it off its top and slips to one side."""
+    positions = []
+    time = {"time": {**FALLING["time"], "integrator": integrator}}
+    for obstacle in (BALL, OWN):
+        _, frames = play(block_scene(tmp_path, obstacle=[obstacle | response], **FALLING | time))
+        positions.append(frames[-1].position)
+    assert np.ptp(positions[0][:, 0]) > 0.5 + 1e-3  # and is bent
+    np.testing.assert_allclose(positions[1], positions[0], atol=2e-6)
+
+
+def test_a_mesh_is_the_box_that_it_describes(tmp_path: Path):
+    """The block falls aslant on a plate with friction; the faces by which it came in make no difference here."""
+    corners = np.array([[-0.2, -0.2, -0.5], [0.7, 0.7, -0.02]])
+    trimesh.creation.box(bounds=corners).export(tmp_path / "plate.ply")
+    shapes = [{"shape": "box", "box": corners.tolist()}, {"shape": "mesh", "mesh": {"source": "plate.ply"}}]
+    positions = []
+    for shape in shapes:
+        obstacle = shape | {"response": "penalty", "friction": 0.4}
+        path = block_scene(tmp_path, obstacle=[obstacle], start={"velocity": [0.5, 0, -1]}, **FALLING)
+        positions.append(play(path)[1][-1].position)
+    assert positions[0][:, 2].min() < -0.02
+    np.testing.assert_allclose(positions[1], positions[0], atol=1e-7)
+
+
+def test_a_mesh_is_prepared_as_a_bodys_and_ranks_agree(tmp_path: Path):
+    trimesh.creation.icosphere(3, radius=50).export(tmp_path / "statue.ply")
+    mesh = {"source": "statue.ply", "size": 0.6, "base": [0.21, 0.25, -0.6]}
+    obstacle = [{"shape": "mesh", "mesh": mesh, "response": "penalty"}]
+    scene = block_scene(tmp_path, obstacle=obstacle, **FALLING)
+    solid = build_model(MPI.COMM_SELF, load_scene(scene)).penalties[0].obstacle.solid
+    np.testing.assert_allclose(solid.surface(None, None).points.mean(axis=0), CENTER, atol=1e-6)
+    done = run(3, "-m", "msmpetsc", "run", scene, "-o", tmp_path / "3.h5", timeout=60)
+    assert done.returncode == 0, done.stderr
+    with msm.open(msm.run(scene, tmp_path / "1.h5", quiet=True)) as one, msm.open(tmp_path / "3.h5") as three:
+        np.testing.assert_allclose(three.frames.position[-1], one.frames.position[-1], atol=1e-7)
+        assert one.frames.contact[-1] > 0
+        assert len(one["obstacle/triangles"]) == len(three["obstacle/triangles"]) == 1280
+
+
+def test_the_surface_of_a_function_is_in_the_file(tmp_path: Path):
+    """By marching cubes, within a cell of its grid, cut below; under its number among the obstacles."""
+    plane = {"shape": "plane", "point": [0, 0, -9], "normal": [0, 0, 1]}
+    scene = block_scene(tmp_path, obstacle=[plane, OWN], **FALLING)
+    with msm.open(msm.run(scene, tmp_path / "x.h5", quiet=True)) as result:
+        points, numbers = result["obstacle/points"][:], result["obstacle/number"][:]
+    assert set(numbers) == {1}
+    far = np.linalg.norm(points - CENTER, axis=1)
+    assert abs(far - RADIUS).max() < 0.02 and np.ptp(points, axis=0)[:2].min() > 0.59
+
+
+def test_a_static_state_on_a_mesh(tmp_path: Path):
+    """The block is let down on a plate and carried: the push is its weight."""
+    trimesh.creation.box(bounds=[[-1, -1, -1], [2, 2, 0.0]]).export(tmp_path / "plate.ply")
+    obstacle = [{"shape": "mesh", "mesh": {"source": "plate.ply"}, "response": "penalty"}]
+    time = {"step": 0.1, "duration": 0.1, "integrator": "static"}
+    held = [{"region": {"box": [[-1, -1, -1], [0.01, 2, 1]]}}]
+    _, frames = play(block_scene(tmp_path, obstacle=obstacle, pin=held, **FALLING | {"time": time}))
+    assert frames[-1].contact > 0 and frames[-1].position[:, 2].min() > -1e-3
+
+
+# ---- mistakes
+
+
+def wrong(scale: float = 1.0, shape: int = 3, value: float = 0.0):
+    return lambda x: (np.full(len(x), value), np.full((len(x), shape), scale / np.sqrt(3)))
+
+
+MISTAKES = [
+    ({"shape": "mesh"}, None, 'obstacle.0: needs mesh for shape = "mesh"'),
+    ({"shape": "function"}, None, 'obstacle.0: needs function for shape = "function"'),
+    ({**BALL, "function": "ball"}, None, "obstacle.0: has function, which is for 'function' only"),
+    ({"shape": "mesh", "mesh": {"source": "gone.ply"}}, None, "gone.ply"),
+    (
+        {"shape": "mesh", "mesh": {"source": "open.ply"}},
+        None,
+        "obstacle.0.mesh: must be closed: the mesh is open",
+    ),
+    ({"shape": "mesh", "mesh": {"source": "open.ply", "prepare": ["mend"]}}, None, "obstacle.0.mesh.prepare.0: "),
+    (
+        {"shape": "function", "function": "bell"},
+        None,
+        "no obstacle 'bell' is registered, or installed",
+    ),
+    (OWN, wrong(2.0), "obstacle.0.function: no signed distance: its gradient is 2 long at most nodes, not 1"),
+    (OWN, wrong(shape=2), "obstacle.0.function: returned no distances of shape"),
+    (OWN, wrong(value=np.nan), "obstacle.0.function: returned numbers that are not finite"),
+    (OWN, lambda x: x[:, 0], "obstacle.0.function: returned no distances of shape"),
+]
+
+
+@pytest.mark.parametrize(("obstacle", "function", "said"), MISTAKES)
+def test_mistakes_are_one_line(tmp_path: Path, obstacle: dict, function, said: str):
+    ball = trimesh.creation.icosphere(1)
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    ball.export(tmp_path / "open.ply")
+    if function is not None:
+        msm.register_obstacle("ball", function)
+    with pytest.raises(InputError) as refused:
+        build_model(MPI.COMM_SELF, load_scene(block_scene(tmp_path, obstacle=[obstacle], **FALLING)))
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_planes_need_neither_package(tmp_path: Path):
+    """Where no obstacle is a mesh, igl's tree is not built: the solid is of faces."""
+    box = {"shape": "box", "box": [[-1, -1, -2], [1, 1, -1]]}
+    model = build_model(MPI.COMM_SELF, load_scene(block_scene(tmp_path, obstacle=[box], **FALLING)))
+    assert isinstance(model.penalties[0].obstacle.solid, Faces) and model.solids == {}

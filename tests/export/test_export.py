@@ -1,0 +1,224 @@
+"""Exported files are read back by libraries that no one here wrote, and hold the frames of the result."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+import pyvista
+import small_result
+import trimesh
+import vtk
+from conftest import ENVIRONMENT
+from small_result import DT, FRAMES, NODES, POINTS, H, position
+from vtk.util.numpy_support import vtk_to_numpy
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.export.formats import FORMATS, export
+from msmpetsc.export.gltf import normals
+from msmpetsc.export.moments import green_strain
+from msmpetsc.results.xdmf import write_xdmf
+
+PINNED = [0, 3]
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    return small_result.write(tmp_path / "x.h5")
+
+
+def surface(index: int) -> np.ndarray:
+    return POINTS + 0.01 * index * small_result.X
+
+
+def complaints(reader: vtk.vtkAlgorithm) -> list[str]:
+    """Return a list that gets every error and warning of a VTK reader."""
+    heard: list[str] = []
+
+    def hear(_, event: str, text: str) -> None:
+        heard.append(f"{event}: {text}")
+
+    hear.CallDataType = vtk.VTK_STRING  # type: ignore[attr-defined]
+    for event in (vtk.vtkCommand.ErrorEvent, vtk.vtkCommand.WarningEvent):
+        reader.AddObserver(event, hear)
+    return heard
+
+
+def test_gltf_moves_in_vtk_and_stands_in_trimesh(result: Path, tmp_path: Path):
+    path = export(result, tmp_path / "x.glb")
+    (mesh,) = trimesh.load(path).dump()  # as the scene's node turns it: y is up there
+    turned = surface(0)[:, [0, 2, 1]] * [1, 1, -1]
+    assert {tuple(np.round(p, 5)) for p in mesh.vertices} == {tuple(np.round(p, 5)) for p in turned}
+    reader = vtk.vtkGLTFReader()
+    reader.SetFileName(str(path))
+    heard = complaints(reader)
+    reader.ApplyDeformationsToGeometryOn()
+    reader.SetFrameRate(round(2 / DT))
+    reader.UpdateInformation()
+    assert reader.GetNumberOfAnimations() == 1
+    assert reader.GetAnimationDuration(0) == pytest.approx(DT * (FRAMES - 1))
+    reader.EnableAnimation(0)
+    reader.UpdateInformation()
+    for index in (0, 1, 3, 2.5):  # between frames it goes straight
+        reader.UpdateTimeStep(DT * index)
+        (block,) = pyvista.wrap(reader.GetOutput()).recursive_iterator()
+        moved = (POINTS + 0.01 * index * small_result.X)[:, [0, 2, 1]] * [1, 1, -1]
+        assert np.allclose(block.points, moved, atol=1e-6), index
+    assert heard == []
+
+
+def test_gltf_keeps_to_its_rules(result: Path, tmp_path: Path):
+    data = export(result, tmp_path / "x.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    assert int.from_bytes(data[8:12], "little") == len(data) and length % 4 == 0
+    assert document["buffers"][0]["byteLength"] == len(data) - 28 - length
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        values = np.frombuffer(data, "<f4", view["byteLength"] // 4, 28 + length + view["byteOffset"])
+        if "min" in accessor:
+            rows = values.reshape(accessor["count"], -1)
+            assert np.array_equal(rows.min(axis=0), np.float32(accessor["min"]))
+            assert np.array_equal(rows.max(axis=0), np.float32(accessor["max"]))
+    one = json.loads(export(result, tmp_path / "one.glb", frames=[2]).read_bytes()[20:].split(b"BIN\0")[0][:-4])
+    assert "animations" not in one and "targets" not in one["meshes"][0]["primitives"][0]
+
+
+def test_normals_are_those_of_a_ball():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    assert np.allclose(normals(ball.vertices, ball.faces), ball.vertices, atol=0.03)
+    alone = normals(np.zeros((4, 3)), np.array([[0, 1, 2]]))
+    assert np.allclose(np.linalg.norm(alone, axis=1), 1)  # of a collapsed body any direction, of length 1
+
+
+@pytest.mark.parametrize("ending", [".obj", ".ply", ".stl"])
+def test_one_frame_of_the_surface(result: Path, tmp_path: Path, ending: str):
+    mesh = trimesh.load(export(result, tmp_path / f"x{ending}"), process=False)
+    assert np.allclose(mesh.triangles, surface(FRAMES - 1)[[[0, 1, 2], [1, 2, 3]]], atol=1e-6)
+
+
+def test_one_frame_of_the_lattice(result: Path, tmp_path: Path):
+    path = export(result, tmp_path / "x.vtu", frames=[2])
+    mesh = pyvista.read(path)
+    assert np.allclose(mesh.points, position(2)) and mesh.volume == pytest.approx(2 * H**3)
+    assert np.allclose(mesh["displacement"], position(2) - NODES)
+    assert np.allclose(mesh["strain"], [0, 0, 0.02, 0, 0, 0.1])  # F = 1 + gamma e_x e_z^T, gamma = 0.2
+    assert np.allclose(mesh["velocity"], (position(2) - position(1)) / DT)
+    assert list(mesh.celltypes) == [pyvista.CellType.HEXAHEDRON] * 2 and mesh["cell_kind"].tolist() == [1, 1]
+    assert np.flatnonzero(mesh["pinned"]).tolist() == PINNED and np.allclose(mesh["mass"], 0.25)
+    of_surface = meshio.read(export(result, path, "surface", [-1]))
+    assert np.allclose(of_surface.points, surface(FRAMES - 1), atol=1e-6)
+    assert np.allclose(of_surface.point_data["velocity"], [1.0, 0, 0], atol=1e-4)
+
+
+def test_a_turn_is_no_strain():
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    assert np.allclose(green_strain(NODES, small_result.cells(), NODES @ turn.T), 0)
+    stretch = green_strain(NODES, small_result.cells(), NODES * [2, 1, 1])
+    assert np.allclose(stretch, [1.5, 0, 0, 0, 0, 0])  # (2^2 - 1) / 2
+
+
+def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tmp_path: Path):
+    with h5py.File(result, "r+") as file:
+        del file["frames/surface"]
+    mesh = meshio.read(export(result, tmp_path / "x.ply", frames=[3]))
+    rows = small_result.cells()[[0, 1, 1, 0]]  # W has 1/8 for each corner of a point's cell
+    assert np.allclose(mesh.points, position(3)[rows].mean(axis=1))
+
+
+WRONG = {
+    "what is exported is named *.glb, *.usd": ("x.vtkhdf", {}),  # on a full disk HDF5 crashed in it
+    "a *.glb holds no lattice, but the surface": ("x.glb", {"mesh": "lattice"}),
+    "has frames 0 to 4, not 5": ("x.glb", {"frames": [0, 5]}),
+    "a *.obj holds one frame, not 2": ("x.obj", {"frames": [0, 1]}),
+    "must follow each other in time": ("x.glb", {"frames": [3, 1]}),
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_cannot_be_exported_is_said_in_one_line(result: Path, tmp_path: Path, words: str):
+    name, options = WRONG[words]
+    with pytest.raises(InputError) as raised:
+        export(result, tmp_path / name, **options)
+    assert words in str(raised.value) and "\n" not in str(raised.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.h5"]
+
+
+def test_a_result_without_a_surface(tmp_path: Path):
+    result = small_result.write(tmp_path / "x.h5", surface=False)
+    assert isinstance(pyvista.read(export(result, tmp_path / "x.vtu")), pyvista.UnstructuredGrid)
+    with pytest.raises(InputError, match=r"has no surface: it was run with output.surface = false"):
+        export(result, tmp_path / "x.obj")
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]):
+    if ending.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
+    path = tmp_path / "new" / f"y{ending}"
+    assert main(["export", str(result), "-o", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}\n" and path.is_file()
+    assert main(["export", str(result), "-o", str(path), "--frames", "9"]) == 2
+    assert "not 9" in capsys.readouterr().err
+
+
+def test_slices_choose_frames_as_for_render(result: Path, tmp_path: Path):
+    for name, frames in (("slice.glb", "0:5:2"), ("list.glb", "0,2,-1")):
+        assert main(["export", str(result), "-o", str(tmp_path / name), "--frames", frames]) == 0
+    whole = export(result, tmp_path / "whole.glb", frames=[0, 2, 4])
+    assert (tmp_path / "slice.glb").read_bytes() == whole.read_bytes() == (tmp_path / "list.glb").read_bytes()
+
+
+LIMITED = """
+import resource, sys
+from msmpetsc.export.formats import FORMATS, export
+FORMATS[".glb"].load()
+import numpy as np
+now = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (now + 64 * 2**20,) * 2)
+export(sys.argv[1], sys.argv[2] + ".glb")
+"""
+
+
+def test_one_frame_is_in_memory_at_a_time(tmp_path: Path):
+    """100 frames of 40,000 points are 96 MB of doubles for the points alone; 64 MiB must do for all."""
+    count = 40_000
+    points = np.random.default_rng(1).random((count, 3))
+    frames = [small_result.frame(index, surface=points + index) for index in range(100)]
+    result = tmp_path / "x.h5"
+    small_result.write(result, points=POINTS)
+    with h5py.File(result, "r+") as file:
+        for name in ("surface/points", "frames/surface", "frames/time", "frames/position", "embedding"):
+            del file[name]
+        file["surface/points"] = points
+        file["frames/time"] = [frame.index * DT for frame in frames]
+        file["frames/position"] = np.array([NODES] * 100)
+        file["frames/surface"] = np.float32([frame.surface for frame in frames])
+        for name in file["frames"]:
+            if len(file["frames"][name]) != 100:
+                del file["frames"][name]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, result, tmp_path / "y"], env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "y.glb").stat().st_size > 99 * 24 * count
+
+
+def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
+    reader = vtk.vtkXdmfReader()
+    reader.SetFileName(str(write_xdmf(result)))
+    heard = complaints(reader)
+    for index in (0, 3, 1):
+        reader.UpdateTimeStep(DT * index)
+        blocks = reader.GetOutputDataObject(0)
+        named = {
+            blocks.GetMetaData(k).Get(blocks.NAME()): blocks.GetBlock(k) for k in range(blocks.GetNumberOfBlocks())
+        }
+        for name, expected in {"surface": surface(index), "lattice": position(index)}.items():
+            assert np.allclose(vtk_to_numpy(named[name].GetPoints().GetData()), expected, atol=1e-6)
+    assert heard == []

@@ -1,0 +1,127 @@
+"""USD files, read back by USD's own library: the frames of the result, in time, one mesh a body."""
+
+import resource
+import signal
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import small_result
+from small_result import DT, FRAMES, POINTS
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.export.formats import export
+
+pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
+from pxr import Usd, UsdGeom
+
+from msmpetsc.export.usd import frames_a_second, up_axis
+
+TRIANGLES = np.array([[0, 1, 2], [1, 2, 3]])
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    return small_result.write(tmp_path / "x.h5")
+
+
+def surface(index: float) -> np.ndarray:
+    return POINTS + 0.01 * index * small_result.X
+
+
+def opened(path: Path) -> tuple[Usd.Stage, list[UsdGeom.Mesh]]:
+    """Stage and meshes, which live as long as the stage."""
+    stage = Usd.Stage.Open(str(path))
+    return stage, [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+
+
+@pytest.mark.parametrize("ending", [".usd", ".usda", ".usdc"])
+def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Path, ending: str):
+    path = export(result, tmp_path / f"y{ending}")
+    assert path.read_bytes().startswith(b"#usda" if ending == ".usda" else b"PXR-USDC")
+    stage, (mesh,) = opened(path)
+    rate = stage.GetTimeCodesPerSecond()
+    assert rate == pytest.approx(1 / DT) and stage.GetEndTimeCode() - stage.GetStartTimeCode() == FRAMES - 1
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert stage.GetDefaultPrim().GetPath() == mesh.GetPath().GetParentPath()
+    assert mesh.GetPointsAttr().GetTimeSamples() == list(range(FRAMES))
+    for index in (0, 1, 2.5, 4):  # between frames it goes straight
+        code = Usd.TimeCode(index * DT * rate)
+        points = np.array(mesh.GetPointsAttr().Get(code))
+        assert points == pytest.approx(surface(index), abs=1e-6)
+        assert np.array(mesh.GetExtentAttr().Get(code)) == pytest.approx(
+            np.array([points.min(axis=0), points.max(axis=0)]), abs=1e-6
+        )
+        displacement = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
+        assert np.array(displacement.Get(code)) == pytest.approx(np.full(len(POINTS), 0.01 * index), abs=1e-6)
+        assert np.linalg.norm(np.array(mesh.GetNormalsAttr().Get(0)), axis=1) == pytest.approx(1, abs=1e-6)
+
+
+def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
+    _stage, (mesh,) = opened(export(result, tmp_path / "y.usdc"))
+    counts, corners = mesh.GetFaceVertexCountsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
+    assert list(counts) == [3, 3] and np.array(corners).reshape(-1, 3).tolist() == TRIANGLES.tolist()
+    assert UsdGeom.Mesh.ValidateTopology(corners, counts, len(POINTS)) == (True, "")
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none" and len(mesh.GetDisplayColorAttr().Get()) == 1
+    displacement = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
+    assert displacement.GetInterpolation() == mesh.GetNormalsInterpolation() == "vertex"
+
+
+def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
+    """The small result twice, the second body moving the other way."""
+    with h5py.File(result, "r+") as file:
+        moved = file["frames/surface"][:]
+        for name in ("surface/points", "surface/triangles", "frames/surface"):
+            del file[name]
+        file["surface/points"] = np.concatenate([POINTS, POINTS + 5])
+        file["surface/triangles"] = np.concatenate([TRIANGLES, TRIANGLES[:1] + 4])
+        file["surface/body"] = np.repeat([0, 1], 4).astype("i4")
+        file["frames/surface"] = np.concatenate([moved, 5 + 2 * POINTS - moved], axis=1)
+    _stage, (first, second) = opened(export(result, tmp_path / "y.usda"))
+    assert (first.GetPrim().GetName(), second.GetPrim().GetName()) == ("body_0", "body_1")
+    assert np.array(first.GetPointsAttr().Get(3)) == pytest.approx(surface(3), abs=1e-6)
+    assert np.array(second.GetPointsAttr().Get(3)) == pytest.approx(5 + surface(-3), abs=1e-6)
+    assert list(second.GetFaceVertexIndicesAttr().Get()) == [0, 1, 2]  # of its own points
+
+
+def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
+    stage, (mesh,) = opened(export(result, tmp_path / "y.usda", frames=[1, 3, 4]))
+    rate = stage.GetTimeCodesPerSecond()
+    assert np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate == pytest.approx([0.01, 0.03, 0.04])
+    assert np.array(mesh.GetPointsAttr().Get(0.03 * rate)) == pytest.approx(surface(3), abs=1e-6)
+    assert frames_a_second(np.array([0.5])) == 1  # of one frame
+
+
+@pytest.mark.parametrize(
+    ("gravity", "axis"), [((0, 0, -9.81), "Z"), ((0, -9.81, 0), "Y"), ((-9.81, 0, 0), "Z"), ((0, 0, 0), "Z")]
+)
+def test_upward_is_against_gravity(gravity: tuple[float, ...], axis: str):
+    assert up_axis({"gravity": {"acceleration": list(gravity)}}) == axis
+    assert up_axis({}) == "Z"
+
+
+def test_a_name_that_usd_would_not_take(result: Path, tmp_path: Path):
+    result = result.rename(tmp_path / "2 bars-é.h5")
+    stage, found = opened(export(result, tmp_path / "2 bars-é.usda"))
+    assert stage.GetDefaultPrim().IsValid() and len(found) == 1
+
+
+def test_what_the_library_cannot_save_ends_in_one_line(result: Path, tmp_path: Path):
+    """As on a full disk: no more than some bytes may be written to a file."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (512, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"y\.usdc cannot be written") as caught:
+            export(result, tmp_path / "y.usdc")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert "\n" not in str(caught.value) and not list(tmp_path.glob("*.usdc"))
+
+
+def test_what_cannot_be_written_ends_in_one_line(result: Path, capfd: pytest.CaptureFixture[str]):
+    assert main(["export", str(result), "-o", "/proc/y.usdc"]) == 2
+    assert "/proc/y.usdc cannot be written" in capfd.readouterr().err

@@ -1,0 +1,121 @@
+"""Shares of cells and of their corners: volumes, first moments, planes, open surfaces, surfaces wound both ways."""
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+from mpi4py import MPI
+
+from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, Body, Cages, fill
+from msmpetsc.geometry.fill_fractions import Columns
+from msmpetsc.geometry.surface import Surface, examine
+
+TURN = trimesh.transformations.rotation_matrix(1.1, [3, 2, 1])
+BODIES = {
+    "ball": trimesh.creation.icosphere(3),
+    "tilted box": trimesh.creation.box((1.0, 0.7, 0.4)).apply_transform(TURN),
+    "torus": trimesh.creation.torus(1.0, 0.3).apply_transform(TURN),
+    "pipe": trimesh.creation.annulus(0.4, 0.5, 1.5).apply_transform(TURN),
+    "hollow": trimesh.util.concatenate([trimesh.creation.icosphere(2), trimesh.creation.icosphere(2, 0.5)]),
+}
+BODIES["hollow"].faces[320:] = BODIES["hollow"].faces[320:, ::-1]
+
+
+def columns_of(mesh: trimesh.Trimesh, h: float, offset: float = 0.0) -> tuple[Columns, np.ndarray, np.ndarray]:
+    """Of a mesh in cells of h from ``offset`` cells before it; all cells of its box, and where they begin."""
+    origin = mesh.bounds[0] - offset * h
+    corners = (mesh.vertices - origin)[mesh.faces] / h
+    shape = np.ceil(corners.max(axis=(0, 1))).astype(np.int64) + 1
+    cells = np.indices(shape).reshape(3, -1).T
+    return Columns.crossed(corners, np.zeros(3, np.int64), shape), cells, origin
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+@pytest.mark.parametrize("name", BODIES)
+def test_shares_have_the_bodys_volume_and_its_centre(name: str, offset: float):
+    """Both exactly: the corners' functions sum to 1, and to the position when each is taken times its corner's."""
+    mesh, h = BODIES[name], 0.17
+    columns, cells, origin = columns_of(mesh, h, offset)
+    share = columns.corner_shares(cells)
+    assert share.min() > -1e-12 and share.max() < 1 + 1e-12 and columns.leak < 1e-12
+    assert share.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(mesh.volume, rel=1e-13)
+    corners = cells[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
+    centre = np.einsum("cv,cvx->x", share.reshape(-1, 8), corners) * h**4 / 8 / mesh.volume + origin
+    np.testing.assert_allclose(centre, mesh.center_mass, atol=1e-13)
+
+
+def test_a_plane_through_a_cell_gives_its_corners_what_lies_near_them():
+    """Below z: 2 z - z^2 at the lower corners, z^2 at the upper ones, the integrals of 2 (1 - z) and 2 z."""
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [3, 2, 1.3]])
+    columns, _, _ = columns_of(box, 1.0)
+    share = columns.corner_shares(np.array([[1, 1, 1], [1, 1, 0]]))
+    np.testing.assert_allclose(share[0], np.broadcast_to([2 * 0.3 - 0.3**2, 0.3**2], (2, 2, 2)), atol=1e-14)
+    np.testing.assert_allclose(share[1], 1, atol=1e-14)
+
+
+def test_corners_of_an_oblique_cell_are_those_of_many_samples():
+    mesh, h = BODIES["tilted box"], 0.2
+    columns, cells, origin = columns_of(mesh, h)
+    share = columns.corner_shares(cells)
+    cut = np.flatnonzero(np.ptp(share.reshape(-1, 8), axis=1) > 0.3)[:5]
+    assert len(cut) == 5
+    points = np.random.default_rng(0).random((40_000, 3))
+    functions = np.prod(
+        np.where(np.indices((2, 2, 2)).reshape(3, 8, 1) == 1, points.T[:, None], 1 - points.T[:, None]), 0
+    )
+    to_box = np.linalg.inv(TURN[:3, :3])
+    for cell in cut:
+        inside = (np.abs((origin + h * (cells[cell] + points)) @ to_box.T) <= [0.5, 0.35, 0.2]).all(axis=1)
+        found = 8 * functions[:, inside].sum(axis=1) / len(points)
+        np.testing.assert_allclose(share[cell].ravel(), found, atol=0.02)  # 4 standard deviations of a sample
+
+
+# ---- cages
+
+
+def body_of(mesh: trimesh.Trimesh) -> Body:
+    surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    return Body(MPI.COMM_SELF, surface, examine(surface), np.array(mesh.bounds))
+
+
+def volume(cages: Cages) -> float:
+    return cages.share.mean(axis=(1, 2, 3)).sum() * cages.grids.cell_size**3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
+    """Cages cycle the axes, so that the longest side is the first."""
+    mesh = trimesh.creation.box(bounds=[[0, 0, 0], np.roll([1.0, 0.53, 0.38], axis)])
+    expected = fill([body_of(mesh)], 0.1)
+    top = expected.ijk[:, (axis + 2) % 3] == 3
+    assert volume(expected) == pytest.approx(mesh.volume, rel=1e-3)  # the least share of corners that are out of it
+    along = np.moveaxis(expected.share[top], 1 + (axis + 2) % 3, -1)[:, :, :, 1]
+    assert along.max() < 0.8**2 + 1e-12
+    mesh.invert()
+    np.testing.assert_allclose(fill([body_of(mesh)], 0.1).share, expected.share, atol=1e-12)
+
+
+def test_no_share_is_less_than_the_least_and_rounding_leaves_whole_cells_whole():
+    cages = fill([body_of(BODIES["ball"])], 0.1)
+    assert cages.share.min() == LEAST_SHARE and (cages.share[cages.kind != BOUNDARY] == 1).all()
+    aligned = trimesh.creation.box(bounds=[[0.1, 0.2, 0.3], [1.0, 0.9, 0.8]])
+    assert (fill([body_of(aligned)], 0.1).share == 1).all()
+
+
+def test_an_open_surface_is_sampled_to_about_a_hundredth():
+    ball = trimesh.creation.icosphere(4)
+    closed = fill([body_of(ball)], 0.2)
+    ball.update_faces(np.arange(len(ball.faces)) > 3)
+    sampled = fill([body_of(ball)], 0.2)
+    assert np.array_equal(sampled.ijk, closed.ijk)
+    error = (sampled.share - closed.share).mean(axis=(1, 2, 3))
+    assert np.sqrt((error**2).mean()) < 0.02 and volume(sampled) == pytest.approx(volume(closed), rel=0.01)
+
+
+def test_triangles_wound_against_each_other_are_told_and_cells_count_whole(caplog: pytest.LogCaptureFixture):
+    ball = trimesh.creation.icosphere(3)
+    ball.faces[:7] = ball.faces[:7, ::-1]
+    with caplog.at_level(logging.WARNING, "msmpetsc"):
+        assert fill([body_of(ball)], 0.2).share is None
+    assert 'wound against each other, so boundary cells count whole: prepare = ["orient"]' in caplog.text

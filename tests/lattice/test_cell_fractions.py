@@ -1,0 +1,110 @@
+"""Mass and stiffness of cells that the surface cuts, and bodies that do not lie along the grid against elasticity."""
+
+import runpy
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import ROOT
+from mpi4py import MPI
+
+from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
+from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
+from msmpetsc.lattice.lattice import Lattice, build_lattice
+
+STUDY = runpy.run_path(str(ROOT / "scripts" / "material_study.py"))
+E, DENSITY = STUDY["E"], STUDY["DENSITY"]
+bar_errors = cache(lambda name, size: STUDY["bar_errors"](*BARS[name], size * STUDY["RADIUS"], "fill")[1])
+BARS = {
+    "round": (STUDY["round_bar"](), STUDY["ROUND_SAG"]),
+    "turned": (STUDY["turned_bar"](), STUDY["SQUARE_SAG"]),
+}
+
+
+def tilted_box() -> trimesh.Trimesh:
+    box = trimesh.creation.box((0.5, 0.35, 0.2))
+    return box.apply_transform(trimesh.transformations.rotation_matrix(1.1, [3, 2, 1]))
+
+
+def test_springs_have_the_mean_share_of_the_corners_that_agree_with_both_ends():
+    share = np.random.default_rng(0).random((5, 8))
+    of_pairs = shares_of_pairs(share)
+    a, b = 0, int(np.flatnonzero((CORNERS == [1, 0, 0]).all(axis=1))[0])
+    np.testing.assert_allclose(of_pairs[:, a, b], share[:, [a, b]].mean(axis=1))
+    diagonal = int(np.flatnonzero((CORNERS == [1, 0, 1]).all(axis=1))[0])
+    np.testing.assert_allclose(of_pairs[:, a, diagonal], share[:, CORNERS[:, 1] == 0].mean(axis=1))
+    opposite = int(np.flatnonzero((CORNERS == [1, 1, 1]).all(axis=1))[0])
+    np.testing.assert_allclose(of_pairs[:, a, opposite], share.mean(axis=1))
+    np.testing.assert_allclose(shares_of_mass(of_pairs).sum(axis=1), share.sum(axis=1))
+
+
+def test_uniform_strain_costs_the_energy_of_the_volume_inside():
+    """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least share of corners."""
+    box = tilted_box()
+    lattice = STUDY["lattice_of"](box, 0.06, "fill")
+    assert lattice.mass.sum() == pytest.approx(DENSITY * box.volume, rel=1e-3)
+    for _, G, other, exact in STUDY["uniform_strains"]():
+        u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
+        found = u @ (STUDY["hessian"](lattice) @ v) * DENSITY / lattice.mass.sum()
+        assert found == pytest.approx(exact, rel=1e-10)
+
+
+def test_every_node_has_the_mass_that_its_springs_diagonal_says():
+    """So no light corner is stiff: the limit of explicit steps is a whole cell's, and CG brings in no net force."""
+    lattice = STUDY["lattice_of"](tilted_box(), 0.06, "fill")
+    assert lattice.mass.min() < 0.01 * lattice.mass.max()
+    diagonal = np.bincount(lattice.springs.ravel(), np.repeat(lattice.stiffness, 2))
+    np.testing.assert_allclose(diagonal / lattice.mass, diagonal[0] / lattice.mass[0], rtol=1e-12)
+
+
+# ---- against elasticity
+
+
+@pytest.mark.parametrize("name", BARS)
+def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
+    """A fifth of what whole cells are off, whose mass is a third too large; nearly as beams along the grid."""
+    errors = np.array([bar_errors(name, size) for size in (0.4, 0.25)])
+    assert (errors < 0).all() and errors[0].mean() > -0.105 and errors[1].mean() > -0.055
+    assert np.ptp(errors, axis=1).max() < 0.015  # wherever the grid lies
+    assert STUDY["slope"]([0.4, 0.25], errors.mean(axis=1)) > 1.4
+    whole = STUDY["bar_errors"](*BARS[name], 0.4 * STUDY["RADIUS"], "whole")
+    assert whole[1].mean() < 3 * errors[0].mean() and whole[2].mean() > 0.3
+
+
+def test_a_ball_rings_as_lambs():
+    coarse, fine = (STUDY["ball_error"](size * STUDY["RADIUS"], "fill") for size in (1 / 4, 1 / 6))
+    assert -0.07 < coarse[1] < fine[1] < 0 and fine[1] > -0.03
+    assert STUDY["slope"]([1 / 4, 1 / 6], [coarse[1], fine[1]]) > 1.8
+    assert abs(fine[2]) < 2e-4
+
+
+# ---- how far nodes stick out
+
+
+def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():
+    surface = Surface(*(np.array(part) for part in (BALL.vertices, BALL.faces)))
+    body = Body(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
+    cages = fill([body], 0.2)
+    lattice = build_lattice(cages, DENSITY, E)
+    outside = distance_outside(lattice, nearest_of_body([body], cages, lattice))
+    np.testing.assert_allclose(outside, np.maximum(np.linalg.norm(lattice.nodes, axis=1) - 1, 0), atol=2e-3)
+    for normal in np.random.default_rng(0).standard_normal((50, 3)):
+        normal /= np.linalg.norm(normal)
+        first = (lattice.nodes @ normal + outside).min()  # of any plane that comes this way
+        assert -1 - 1e-12 < first < -1 + 0.15 * 0.2
+
+
+BALL = trimesh.creation.icosphere(4)
+
+
+def whole(lattice: Lattice) -> bool:
+    return bool((lattice.cell_share == 1).all())
+
+
+def test_whole_cells_are_those_of_the_paper():
+    lattice = STUDY["lattice_of"](BALL, 0.2, "whole")
+    assert whole(lattice) and lattice.mass.sum() == pytest.approx(DENSITY * len(lattice.cells) * 0.2**3)
+    assert not whole(STUDY["lattice_of"](BALL, 0.2, "fill"))

@@ -1,0 +1,215 @@
+"""Bodies of several materials: shares of cells in springs and masses, bars against closed forms, extreme ratios."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, play
+from conftest import Run
+from mpi4py import MPI
+
+from msmpetsc.build import Model, build_model
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.errors import InputError
+from msmpetsc.scene.reading import load_scene
+
+T = 1 / 64
+FAR = {"half_space": {"point": [0.25, 0, 0], "normal": [1, 0, 0]}}  # cells beyond the middle of the length
+BACK = {"half_space": {"point": [0, 0.25, 0], "normal": [0, 1, 0]}}
+ALL = {"box": [[-1, -1, -1], [1, 1, 1]]}
+ONCE = {"step": T, "duration": T}
+
+
+def of_parts(folder: Path, *parts: dict, **tables) -> Model:
+    return build_model(MPI.COMM_SELF, load_scene(block_scene(folder, time=ONCE, part=list(parts), **tables)))
+
+
+# ---- what a node and a spring get
+
+
+def test_each_cell_gives_its_own_mass_to_its_corners(tmp_path: Path):
+    lattice = of_parts(tmp_path, {"region": FAR, "density": 3 * DENSITY}).lattice
+    assert lattice.mass.sum() == pytest.approx(2 * DENSITY * SIDES.prod(), rel=1e-14)
+    section = DENSITY * CELL * SIDES[1] * SIDES[2]  # a layer of cells across
+    for place, layers in {0: 1 / 2, 1: 1, 2: 1 / 2 + 3 / 2, 3: 3, 4: 3 / 2}.items():
+        at = lattice.nodes[:, 0] == place * CELL
+        assert lattice.mass[at].sum() == pytest.approx(layers * section, rel=1e-14)
+
+
+def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
+    """A spring inside a part is as of a body of that alone; in the plane between two it has half of each."""
+    stiffer = {"young_modulus": 5 * YOUNG}
+    lattice, soft, stiff = (
+        of_parts(tmp_path, *parts).lattice for parts in ([{"region": FAR} | stiffer], [], [{"region": ALL} | stiffer])
+    )
+    x = lattice.nodes[lattice.springs][:, :, 0]
+    between, beyond = (x == 0.25).all(axis=1), (x >= 0.25).all(axis=1)
+    assert between.sum() > 20 and beyond.sum() > 100
+    expected = np.where(beyond, stiff.stiffness, soft.stiffness)
+    expected[between] = (soft.stiffness + stiff.stiffness)[between] / 2
+    np.testing.assert_allclose(lattice.stiffness, expected, rtol=1e-14)
+
+
+def test_each_cell_resists_as_its_own_material(tmp_path: Path):
+    """Springs of a mirrored body have their lengths; its cells have 8 K (1 - (-1) / J_0)^3 = 216 K, K of E of each."""
+    law = {"material": {"young_modulus": YOUNG, "density": DENSITY, "law": "stiffening"}}
+    soft = of_parts(tmp_path, **law).lattice
+    lattice = of_parts(tmp_path, {"region": FAR, "young_modulus": 5 * YOUNG}, **law).lattice
+    energies = [Elasticity(MPI.COMM_SELF, one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]
+    assert energies[1] == pytest.approx((1 + 5) / 2 * energies[0], rel=1e-12)
+
+
+def test_with_one_stiffness_for_all_springs_a_part_s_counts_by_the_mean_of_the_cells(tmp_path: Path):
+    material = {"stiffness": 10.0, "density": DENSITY}
+    lattice = of_parts(tmp_path, {"region": FAR, "stiffness": 30.0}, material=material).lattice
+    x = lattice.nodes[lattice.springs][:, :, 0]
+    expected = np.select([(x == 0.25).all(axis=1), (x >= 0.25).all(axis=1)], [20.0, 30.0], 10.0)
+    np.testing.assert_allclose(lattice.stiffness, expected, rtol=1e-14)
+
+
+def test_the_last_part_of_a_cell_wins_key_by_key(tmp_path: Path):
+    one = {"region": ALL, "density": 500.0, "young_modulus": 7e5}
+    lattice = of_parts(tmp_path, one, {"region": BACK, "density": 2000.0}).lattice
+    assert lattice.mass.sum() == pytest.approx(1250 * SIDES.prod(), rel=1e-14)
+    whole = of_parts(tmp_path, one | {"density": 1.0}).lattice
+    np.testing.assert_array_equal(lattice.stiffness, whole.stiffness)
+
+
+def test_parts_that_change_nothing_change_nothing(tmp_path: Path):
+    alone = of_parts(tmp_path).lattice
+    same = of_parts(tmp_path, {"region": FAR, "density": DENSITY, "young_modulus": YOUNG}).lattice
+    np.testing.assert_allclose(same.mass, alone.mass, rtol=1e-15)
+    np.testing.assert_allclose(same.stiffness, alone.stiffness, rtol=1e-15)
+
+
+def test_painted_cells_are_a_part(tmp_path: Path):
+    """Each of the eight corners of the surface lies in a cell of its own."""
+    lattice = of_parts(tmp_path, {"region": {"painted": [0, 1, 2, 3, 4, 5, 6, 7]}, "density": 9 * DENSITY}).lattice
+    assert lattice.mass.sum() == pytest.approx(DENSITY * (SIDES.prod() + 8 * 8 * CELL**3), rel=1e-14)
+    corner = (np.isin(lattice.nodes, [0, *SIDES])).all(axis=1) & (lattice.nodes != 0.25)[:, :2].all(axis=1)
+    corner &= np.isin(lattice.nodes[:, 2], [0, SIDES[2]])
+    assert corner.sum() == 8
+    np.testing.assert_allclose(lattice.mass[corner], 9 * DENSITY * CELL**3 / 8, rtol=1e-14)
+
+
+# ---- bars against their closed form
+
+
+def forces(model: Model, displacement: np.ndarray) -> np.ndarray:
+    """Of the springs, (n, 3) [N]."""
+    force = np.zeros_like(displacement)
+    Elasticity(MPI.COMM_SELF, model.lattice).add_gradient(model.lattice.nodes + displacement, force)
+    return force
+
+
+@pytest.mark.parametrize("ratio", [0.1, 4.0, 1e3])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio: float, sign: int):
+    """Sides held, so that C11 = 6/5 E counts: the same stress in both, strains as 1 / E; no net force between."""
+    model = of_parts(tmp_path, {"region": FAR, "young_modulus": ratio * YOUNG})
+    x, strain = model.lattice.nodes[:, 0], sign * 1e-6
+    moved = np.zeros_like(model.lattice.nodes)
+    moved[:, 0] = strain * np.where(x <= 0.25, x, 0.25 + (x - 0.25) / ratio)
+    along, stress = forces(model, moved)[:, 0], 6 / 5 * YOUNG * strain
+    area = SIDES[1] * SIDES[2]
+    assert along[x == SIDES[0]].sum() == pytest.approx(stress * area, rel=1e-5)
+    assert along[x == 0].sum() == pytest.approx(-stress * area, rel=1e-5)
+    for inner in (1, 2, 3):
+        assert np.abs(along[x == inner * CELL]).max() < 1e-5 * abs(stress) * CELL**2
+    energy = Elasticity(MPI.COMM_SELF, model.lattice).energy(model.lattice.nodes + moved)
+    assert energy == pytest.approx(stress * strain / 2 * area * 0.25 * (1 + 1 / ratio), rel=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1e6])
+def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: float):
+    """Both narrow by 1/4 of the strain: nothing pulls across, at the surface or between, and E is the mean."""
+    model = of_parts(tmp_path, {"region": BACK, "young_modulus": ratio * YOUNG})
+    nodes, strain = model.lattice.nodes, 1e-7
+    force = forces(model, strain * nodes * [1, -1 / 4, -1 / 4])
+    pull, most = YOUNG * strain * (1 + ratio) / 2 * SIDES[1] * SIDES[2], YOUNG * strain * max(ratio, 1) * CELL**2
+    far, near = nodes[:, 0] == SIDES[0], nodes[:, 0] == 0
+    assert force[far, 0].sum() == pytest.approx(pull, rel=1e-5)
+    assert np.abs(force[~far & ~near]).max() < 1e-5 * most and np.abs(force[:, 1:]).max() < 1e-5 * most
+
+
+# ---- in motion
+
+
+def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp_path: Path):
+    """Momentum is that of the heavy half, thrown; steps long enough that the light one has no swing left."""
+    path = block_scene(
+        tmp_path,
+        part=[{"region": FAR, "density": 1e6 * DENSITY}],
+        time={"step": 0.1, "duration": 2.0},
+        start={"velocity": [0, 0, 1.0]},
+        gravity={"acceleration": [0, 0, -1.0]},
+    )
+    model, frames = play(path)
+    mass, last = model.lattice.mass, frames[-1]
+    np.testing.assert_allclose(frames[0].momentum, [0, 0, mass.sum()], rtol=1e-12, atol=1e-3)
+    fallen = 2.0 - 0.5 * 2.0 * (2.0 + 0.1)  # implicit Euler's: n (n + 1) / 2 steps
+    np.testing.assert_allclose(last.position - model.lattice.nodes, np.tile([0, 0, fallen], (len(mass), 1)), atol=1e-6)
+
+
+def test_a_part_stiffer_by_a_million_stays_as_it_is_where_the_soft_one_hangs_from_it(tmp_path: Path):
+    pin = [{"region": {"half_space": {"point": [0.375, 0, 0], "normal": [1, 0, 0]}}}]
+    gravity = {"acceleration": [0, 0, -1.0]}
+    parts = [{"region": FAR, "young_modulus": 1e6 * YOUNG}]
+    time = {"step": 0.1, "duration": 1.0}
+    model, frames = play(block_scene(tmp_path, part=parts, time=time, pin=pin, gravity=gravity))
+    moved, x = frames[-1].position - model.lattice.nodes, model.lattice.nodes[:, 0]
+    assert moved[x == 0, 2].max() < -1e-4
+    assert np.abs(moved[x >= 0.25]).max() < 1e-5 * np.abs(moved).max()
+
+
+def test_any_number_of_ranks_has_the_same_parts(tmp_path: Path, msmpetsc: Run):
+    """Masses and springs to the last bit, ghosts' included; two parts, one of them painted."""
+    parts = [
+        {"region": FAR, "density": 777.7, "young_modulus": 1 / 3 * YOUNG},
+        {"region": {"painted": [3]}, "density": 9e3},
+    ]
+    pin = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
+    gravity = {"acceleration": [0, 0, -9.81]}
+    scene = block_scene(tmp_path, part=parts, time={"step": T, "duration": 3 * T}, pin=pin, gravity=gravity)
+    model, frames = play(scene)
+    done = msmpetsc(2, "run", scene, "-o", tmp_path / "two.h5")
+    assert done.returncode == 0, done.stderr
+    with h5py.File(tmp_path / "two.h5") as file:
+        springs, stiffness = file["lattice/springs"][:], file["lattice/stiffness"][:]
+        mass, position = file["lattice/mass"][:], file["frames/position"][-1]
+    np.testing.assert_array_equal(mass, model.lattice.mass)
+    one, two = (np.lexsort(ends.T) for ends in (model.lattice.springs, springs))
+    np.testing.assert_array_equal(springs[two], model.lattice.springs[one])
+    np.testing.assert_array_equal(stiffness[two], model.lattice.stiffness[one])
+    np.testing.assert_allclose(position, frames[-1].position, atol=1e-8)
+
+
+# ---- mistakes
+
+
+REGION = "region = { box = [[0, 0, 0], [1, 1, 1]] }"
+MISTAKES = [
+    (f"part=[{{ {REGION} }}]", "part.0: needs density, young_modulus or stiffness, got "),
+    ("part=[{ density = 1.0 }]", "part.0.region: required, but missing"),
+    (f"part=[{{ {REGION}, density = 0 }}]", "part.0.density: must be > 0, got 0"),
+    (f"part=[{{ {REGION}, desity = 1.0 }}]", "part.0.desity: unknown key, did you mean 'density'?"),
+    (
+        f"part=[{{ {REGION}, stiffness = 5.0 }}]",
+        "part: may give stiffness only where material does, as part.0 does, got",
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "line"), MISTAKES, ids=[line for _, line in MISTAKES])
+def test_a_mistake_is_one_line(tmp_path: Path, change: str, line: str):
+    path = block_scene(tmp_path, time=ONCE)
+    with pytest.raises(InputError) as caught:
+        load_scene(path, [change])
+    assert str(caught.value).startswith(f"{path}: {line}") and "\n" not in str(caught.value)
+
+
+def test_a_part_of_no_cell_is_refused(tmp_path: Path):
+    corner = {"box": [[0, 0, 0], [0.05, 0.05, 0.05]]}  # holds a node, but the middle of no cell
+    with pytest.raises(InputError, match=r"^part\.0\.region holds the centre of no cell: the body is from .* m$"):
+        of_parts(tmp_path, {"region": corner, "density": 1.0})

@@ -1,0 +1,130 @@
+"""Which nodes a region means: by the material that they carry, not by where they stick out to."""
+
+import logging
+import runpy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from block_scene import CELL, block_scene
+from conftest import ROOT
+from mpi4py import MPI
+
+from msmpetsc import open as open_result
+from msmpetsc.build import Model, build_model
+from msmpetsc.constraints.clamp import LEAST
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.readers import read_surface
+from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.simulate import Simulation
+
+CASES = ROOT / "tests" / "cases"
+TIME = {"step": 0.01, "duration": 0.1}
+STUDY = runpy.run_path(str(ROOT / "scripts" / "clamp_study.py"))
+limit = cache(lambda: STUDY["limit"](6, 8))
+
+
+def build(path: Path, *changes: str) -> Model:
+    return build_model(MPI.COMM_SELF, load_scene(path, changes))
+
+
+def pinned(model: Model) -> np.ndarray:
+    return model.lattice.nodes[model.lattice.pinned]
+
+
+@pytest.mark.parametrize("cells", [160, 882])
+def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
+    """README's own pin: it left out the outermost nodes, with 160 cells all that there are."""
+    sides = np.array([0.5, 0.1, 0.1])
+    upper = {"region": {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}}
+    path = block_scene(tmp_path, sides, time=TIME, cages={"count": cells}, pin=[upper])
+    model = build(path)
+    nodes = model.lattice.nodes
+    assert nodes[:, 2].max() > sides[2]  # they do stick out
+    np.testing.assert_array_equal(model.lattice.pinned, nodes[:, 2] >= 0.8 * sides[2] - 1e-9)
+
+
+def test_the_example_of_tables_runs_as_written(tmp_path, monkeypatch):
+    text = (ROOT / "msmpetsc" / "README.md").read_text()
+    (code,) = (block.split("```")[0] for block in text.split("```python\n")[1:] if "tables = {" in block)
+    trimesh.creation.box((1, 0.2, 0.2)).export(tmp_path / "body.obj")
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})
+    assert (tmp_path / "out" / "of_tables.h5").exists()
+
+
+def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
+    """Nodes below parts that are only near the plane were pinned, too: 67 of 91, and the body 10 times too stiff."""
+    path = CASES / "bunny_grazing_pin.toml"
+    model = build(path)
+    surface = read_surface(CASES / "bunny_cut.ply")
+    touching = surface.points[surface.points[:, 2] <= 1e-6]
+    far = np.linalg.norm(pinned(model)[:, None] - touching, axis=2).min(axis=1)
+    assert len(far) > 0 and far.max() <= np.sqrt(3) * model.lattice.cell_size
+    (told,) = (record.getMessage() for record in caplog.records if record.levelno == logging.WARNING)
+    assert told.startswith("pin.0.region only grazes the body") and "the region beyond (0, 0, 1e-06) m" in told
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"), [("anchor", "path = [{ time = 1, by = [0, 0, 1] }]"), ("force", "total = [0, 0, 1]")]
+)
+def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
+    region = "region = { half_space = { point = [0, 0, 1e-6], normal = [0, 0, -1] } }"
+    path = CASES / "bunny_grazing_pin.toml"
+    (pin,), (other,) = build(path).reaches, build(path, "pin=[]", f"{kind}=[{{ {region}, {more} }}]").reaches
+    assert pin.nodes == other.nodes < 30
+
+
+def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is():
+    """Work of the weight: of 4,000 to 30,000 cells 1.23e-4 to 1.31e-4 J. It was 2.4e-5 J, and 3.7e-5 J of 8,000."""
+    scene = load_scene(CASES / "bunny_grazing_pin.toml")
+    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        first, *_, last = simulation.frames()
+    assert 0.9 < (first.potential - last.potential) / 1.25e-4 < 1.6
+
+
+@pytest.mark.parametrize("kind", ["pin", "anchor", "force", "part"])
+def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind):
+    table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}  # of the nodes that stick out alone
+    own = {"anchor": {"path": [{"time": 1, "by": [0, 0, 1]}]}, "force": {"total": [0, 0, 1]}, "part": {"density": 1}}
+    table |= own.get(kind, {})
+    path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, **{kind: [table]})
+    where = r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m, the region from \(0, 0, 0.251\) to \(1, 1, 2\) m"
+    with pytest.raises(InputError, match=rf"^{kind}\.0\.region holds .*no.*{where}$"):
+        build(path)
+
+
+@pytest.mark.parametrize("held", [1.0, 0.0], ids=["plane through cells", "end face"])
+def test_a_tilted_clamp_converges_in_second_order(held):
+    """A round bar tilted about two axes. By nodes' positions it was +7% to +20% too soft at R/4, of first order."""
+    sizes = (4, 8)
+    errors = STUDY["errors"](sizes, limit(), held)
+    assert np.abs(errors).max() < 0.03
+    assert np.abs(errors[1]) < 0.01
+
+
+@pytest.mark.parametrize("edge", [0.125, 0.15, 0.24])
+def test_a_spring_that_a_clamp_cuts_is_as_stiff_as_what_of_it_is_free(tmp_path, edge):
+    pin = {"region": {"box": [[-1, -1, -1], [edge, 1, 1]]}}
+    path = block_scene(tmp_path, time=TIME, pin=[pin])
+    lattice, uncut = build(path).lattice, build(path, "pin=[]").lattice
+    x, held = lattice.nodes[lattice.springs][..., 0], lattice.pinned[lattice.springs]
+    free = np.where(held.any(axis=1) & ~held.all(axis=1), (x.max(axis=1) - edge) / CELL, 1.0)
+    assert free.min() == pytest.approx(2 - edge / CELL)
+    np.testing.assert_allclose(lattice.stiffness / uncut.stiffness, 1 / np.maximum(free, LEAST), rtol=1e-4)
+
+
+def test_any_number_of_ranks_has_the_same_clamp(tmp_path, msmpetsc):
+    """Of a tilted half space through a block that sticks out of its cells."""
+    region = {"half_space": {"point": [0.1, 0, 0], "normal": [-1, 0.3, 0.2]}}
+    path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, pin=[{"region": region}])
+    for ranks in (1, 3):
+        done = msmpetsc(ranks, "run", path, "--frames", "1", "-o", tmp_path / f"{ranks}.h5")
+        assert done.returncode == 0, done.stderr
+    one, three = (open_result(tmp_path / f"{ranks}.h5") for ranks in (1, 3))
+    np.testing.assert_array_equal(one.lattice.pinned[:], three.lattice.pinned[:])
+    by_ends = [np.lexsort(np.sort(run["lattice/springs"][:], axis=1).T) for run in (one, three)]
+    stiffness = [run["lattice/stiffness"][:][order] for run, order in zip((one, three), by_ends, strict=True)]
+    np.testing.assert_allclose(*stiffness, rtol=1e-12)

@@ -1,0 +1,255 @@
+"""msmpetsc compare: errors are those of the formulas it states; it names the first frame and node that differ."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import small_result
+from conftest import ENVIRONMENT
+from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+from msmpetsc.results.compare import DEFAULT, compare, difference
+from msmpetsc.results.reader import Result
+from msmpetsc.results.surfaces import point_areas, surface_distance
+from msmpetsc.study.distances import surface_error
+
+DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the last frame
+
+
+@pytest.fixture
+def a(tmp_path: Path) -> Path:
+    return small_result.write(tmp_path / "a.h5")
+
+
+def changed(tmp_path: Path, index: int, **values) -> Path:
+    """A result whose frame `index` has other values."""
+    frames = [frame(i, **(values if i == index else {})) for i in range(FRAMES)]
+    return small_result.write(tmp_path / "b.h5", frames)
+
+
+def moved(index: int, node: int, by: float) -> np.ndarray:
+    q = position(index)
+    q[node, 1] += by
+    return q
+
+
+def told(capsys, *arguments: object) -> tuple[int, str, str]:
+    """Exit status, and what the command says."""
+    status = main(["compare", *map(str, arguments)])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def error_of(a: Path, b: Path, name: str) -> np.ndarray:
+    with Result(a) as one, Result(b) as other:
+        return next(field for field in compare(one, other, [name]).fields).errors
+
+
+def test_a_file_agrees_with_itself(a: Path, capsys):
+    status, out, _ = told(capsys, a, a, "--rtol", 0)
+    assert status == 0 and "they agree to 0 at these 5 frames" in out
+    assert [line.split()[0] for line in out.splitlines()[1:-1]] == list(DEFAULT)
+
+
+def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path, capsys):
+    node = number(np.array([0.5, 0.5, 0]))
+    b = changed(tmp_path, 2, position=moved(2, node, 1e-3 * DISPLACED))
+    status, out, _ = told(capsys, a, b)
+    assert status == 1 and "they differ from frame 2 on, t = 0.02 s: position\n" in out
+    assert f"node {node}, at rest at (0.5, 0.5, 0) m, is 0.0002 m off at frame 2" in out
+    assert "position                  0.001        2           2       0.2 m" in out
+    assert told(capsys, a, b, "--rtol", 1.001e-3)[0] == 0
+    assert told(capsys, a, b, "--fields", "kinetic,momentum")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("kinetic", 3.008, 0.008 / 8),  # of the largest energy in the run, the elastic one's 2 * 4 J
+        ("elastic", 6.0 + 8e-4, 1e-4),
+        ("potential", -1.8, 0.1),
+        ("momentum", np.array([1, 0.03, 3]), 0.03 / np.sqrt(2 * 12 * 0.25 * 4)),  # m = 12 * 0.25 kg, K = 4 J
+        (
+            "surface",
+            POINTS + np.array([0.03, 0.004, 0]),
+            0.004 / 0.04,
+        ),  # moved by 0.01 m a frame; frame 4 is the farthest
+        ("iterations", 4, 1 / 4),
+    ],
+)
+def test_errors_are_relative_to_what_is_stated(a: Path, tmp_path: Path, name: str, value, error: float):
+    errors = error_of(a, changed(tmp_path, 3, **{name: value}), name)
+    # the surface has six digits or so
+    assert errors == pytest.approx([0, 0, 0, error, 0], rel=1e-4 if name == "surface" else 1e-9)
+
+
+def test_what_costs_are_measured_does_not_count(a: Path, tmp_path: Path, capsys):
+    assert told(capsys, a, changed(tmp_path, 3, wall_time=9.0, iterations=99, ksp_its=99, step_error=0.5))[0] == 0
+
+
+def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
+    nan = changed(tmp_path, 1, elastic=np.nan)
+    assert told(capsys, nan, nan)[0] == 0
+    status, out, _ = told(capsys, a, nan)
+    assert status == 1 and "from frame 1 on, t = 0.01 s: elastic" in out and " inf " in out
+    a, b = np.array([np.nan, np.nan, np.inf, np.inf, 1]), np.array([np.nan, 1, np.inf, -np.inf, np.inf])
+    assert difference(a, b, 0.0).tolist() == [0, np.inf, 0, np.inf, np.inf]
+
+
+def test_rounding_is_no_difference(tmp_path: Path):
+    """A body at rest: its displacements and energies are rounding, and the surface has single precision."""
+    still = dict(kinetic=0.0, elastic=1e-30, potential=0.0, momentum=np.zeros(3))
+
+    def written(sign: int, **other) -> Path:
+        places = dict(position=NODES * (1 + sign * 1e-15), surface=POINTS * (1 + sign * 2e-8))
+        return small_result.write(tmp_path / f"{sign}.h5", [frame(i, **places | still | other) for i in (0, 1)])
+
+    with Result(written(1, elastic=2e-30, momentum=np.full(3, 1e-20))) as a, Result(written(-1)) as b:
+        assert all(field.first_above(1e-6) is None for field in compare(a, b).fields)
+
+
+def test_other_times_are_compared_where_shared_and_count_unless_told(a: Path, tmp_path: Path, capsys):
+    b = small_result.write(tmp_path / "b.h5", [frame(index) for index in (0, 2, 4)])
+    status, out, _ = told(capsys, a, b)
+    assert status == 1 and "5 and 3 frames, of which 3 have the same time, from 0 s to 0.04 s" in out
+    assert "they agree" in out and "not the same times" in out
+    status, out, _ = told(capsys, a, b, "--shared")
+    assert status == 0 and "not the same times" not in out
+    late = small_result.write(tmp_path / "c.h5", [frame(0, time=0.5)])
+    status, _, said = told(capsys, a, late)
+    assert status == 2 and "no finished frame of the same time" in said
+
+
+def test_frames_are_numbered_as_in_the_first_file(a: Path, tmp_path: Path, capsys):
+    b = small_result.write(tmp_path / "b.h5", [frame(2), frame(3, kinetic=5.0), frame(4)])
+    assert f"they differ from frame 3 on, t = {3 * DT:g} s: kinetic" in told(capsys, a, b)[1]
+    assert f"they differ from frame 1 on, t = {3 * DT:g} s: kinetic" in told(capsys, b, a)[1]
+
+
+def test_fields_that_one_alone_has_are_told_and_refused_if_asked_for(a: Path, tmp_path: Path, capsys):
+    b = small_result.write(tmp_path / "b.h5", [frame(i, surface=None) for i in range(FRAMES)], surface=False)
+    status, out, _ = told(capsys, b, a)
+    assert status == 0 and f"surface is in {a} only: not compared" in out
+    assert "do not both have frames/surface" in told(capsys, a, b, "--fields", "surface")[2]
+    assert "did you mean 'kinetic'?" in told(capsys, a, b, "--fields", "kinetik")[2]
+
+
+OTHER_SPRINGS = small_result.springs().copy()
+OTHER_SPRINGS[4] = [0, 11]
+
+
+@pytest.mark.parametrize(
+    ("lattice", "reason"),
+    [
+        (dict(nodes=np.vstack([NODES, [[9, 9, 9]]]), mass=np.ones(13)), "12 and 13 nodes"),
+        (dict(nodes=2 * NODES), "cells of 0.5 m and 1 m"),
+        (
+            dict(nodes=NODES + np.array([1e-3, 0, 0])),
+            r"node 0 rests at \(0, 0, 0\) m in one, at \(0.001, 0, 0\) m in the other",
+        ),
+        (dict(springs=OTHER_SPRINGS), "their springs join other nodes"),
+        (dict(springs=OTHER_SPRINGS[:-1], rest_length=np.ones(19), stiffness=np.ones(19)), "20 and 19 springs"),
+        (dict(cells=np.full((2, 8), 99)), "first cell has corner 99 of 12 nodes"),
+    ],
+)
+def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, capsys, lattice: dict, reason: str):
+    n = len(lattice.get("nodes", NODES))
+    frames = [frame(i, position=np.zeros((n, 3)), surface=None) for i in range(2)]
+    b = small_result.write(tmp_path / "b.h5", frames, surface=False, **lattice)
+    status, _, said = told(capsys, a, b)
+    assert status == 2 and re.search(reason, said) and said.count("\n") == 1, said
+
+
+def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> Path:
+    """A run of the same mesh on a lattice twice as coarse; from frame 2 on its surface point 3 is off by so much."""
+    frames = [frame(i, surface=points + 0.01 * i * small_result.X) for i in range(FRAMES)]
+    for one in frames[2:]:
+        one.surface[3, 1] += by
+    return small_result.write(path, frames, points=points, nodes=2 * NODES)
+
+
+def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(a: Path, tmp_path: Path, capsys):
+    b = other_lattice(tmp_path / "b.h5", by=0.02)
+    status, out, _ = told(capsys, a, b)
+    largest = np.hypot(0.04, 0.02)  # of a displacement in b
+    assert status == 1 and "different lattices: cells of 0.5 m and 1 m: their surfaces alone are compared" in out
+    assert "they differ from frame 2 on, t = 0.02 s: surface, surface, rms" in out and "surface point 3, at rest" in out
+    with Result(a) as one, Result(b) as other:
+        distance = surface_distance(one, other)
+        assert distance.moved == pytest.approx(largest, rel=1e-6)
+        areas = point_areas(one)
+    rms = 0.02 * np.sqrt(areas[3] / areas.sum())
+    assert distance.rms == pytest.approx([0, 0, rms, rms, rms], rel=1e-4, abs=1e-8)
+    assert surface_error(a, b) == pytest.approx(rms * np.sqrt(3 / 5) / largest, rel=1e-4)
+    until = rms * np.sqrt(1 / 3) / np.hypot(0.02, 0.02)  # of the frames until 0.02 s, and how far they come
+    assert surface_error(a, b, 0.02) == pytest.approx(until, rel=1e-4)
+    assert f"surface error {surface_error(a, b):.3g}: " in out
+    assert told(capsys, a, b, "--rtol", "1")[0] == 0
+    assert "only their surfaces can be compared" in told(capsys, a, b, "--fields", "kinetic")[2]
+
+
+def test_points_count_by_the_area_around_them(a: Path):
+    with Result(a) as run:
+        p, areas = POINTS, point_areas(run)
+    first, second = (np.linalg.norm(np.cross(p[b] - p[a], p[c] - p[a])) / 6 for a, b, c in ((0, 1, 2), (1, 2, 3)))
+    assert areas == pytest.approx([first, first + second, first + second, second])
+
+
+def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path, capsys):
+    b = other_lattice(tmp_path / "b.h5", points=POINTS + np.outer([0, 0, 1, 0], [0, 0.01, 0]))
+    status, _, said = told(capsys, a, b)
+    assert status == 2 and said.count("\n") == 1 and "different meshes: point 2 rests at (0.9, 0.4, 0.4) m" in said
+    with pytest.raises(InputError, match="nothing moves"):
+        still = small_result.write(tmp_path / "still.h5", [frame(0)])
+        surface_error(a, still)
+
+
+def test_the_order_of_springs_does_not_matter(a: Path, tmp_path: Path, capsys):
+    b = small_result.write(tmp_path / "b.h5", springs=small_result.springs()[::-1, ::-1])
+    assert told(capsys, a, b)[0] == 0
+
+
+@pytest.mark.parametrize(
+    "options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--fields", ""], ["--field"]]
+)
+def test_odd_options_are_refused(a: Path, capsys, options: list[str]):
+    status, _, said = told(capsys, a, a, *options)
+    assert status == 2 and said.startswith("msmpetsc: error: ") and said.count("\n") == 1
+
+
+def test_what_is_no_result_is_refused(a: Path, tmp_path: Path, capsys):
+    with h5py.File(tmp_path / "b.h5", "w"):
+        pass
+    assert told(capsys, a, tmp_path / "b.h5")[0] == 2 and told(capsys, tmp_path / "c.h5", a)[0] == 2
+
+
+def test_frames_are_read_one_at_a_time(a: Path, monkeypatch):
+    sizes, getitem = [], h5py.Dataset.__getitem__
+
+    def seen(dataset, key):
+        found = getitem(dataset, key)
+        if dataset.name in ("/frames/position", "/frames/surface"):
+            sizes.append(np.size(found))
+        return found
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", seen)
+    with Result(a) as one, Result(a) as other:
+        compare(one, other)
+    assert len(sizes) == 4 * FRAMES and max(sizes) == NODES.size
+
+
+def test_petsc_is_not_imported(a: Path):
+    code = (
+        "import json, sys\nfrom msmpetsc.cli.main import main\n"
+        "status = main(['compare', sys.argv[1], sys.argv[1]])\nprint(json.dumps([status, *sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, a], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    status, *loaded = json.loads(done.stdout.splitlines()[-1])
+    assert status == 0 and "h5py" in loaded and "petsc4py.PETSc" not in loaded

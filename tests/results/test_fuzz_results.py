@@ -1,0 +1,170 @@
+"""Result files that are damaged or hostile: they are read, or one line says why not; no other file is opened."""
+
+import argparse
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import small_result
+from bad_input import TRIALS, refusal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import msmpetsc
+from msmpetsc.cli.commands import compare
+from msmpetsc.errors import InputError
+from msmpetsc.results.reader import refuse_deadly
+from msmpetsc.results.restart import Earlier
+
+SECRET = 7.25
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_result.write(tmp_path_factory.mktemp("fuzz") / "good.h5")
+
+
+def read_all(path: Path) -> None:
+    with msmpetsc.open(path) as run:
+        for arrays in (run.lattice, run.surface, run.frames):
+            for name in arrays:
+                arrays[name][:]
+        _ = run.embedding, run.checkpoint
+
+
+def compared(one: Path, other: Path) -> None:
+    compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, fields=None, shared=False, json=False))
+
+
+NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]
+NAMES += [
+    "embedding/indptr",
+    "embedding/indices",
+    "embedding/weights",
+    "frames/time",
+    "frames/position",
+    "frames/kinetic",
+]
+NAMES += ["frames/iterations", "checkpoint/step", "checkpoint/q", "checkpoint/q_previous", "frames/new\nline"]
+SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 5, 12, 10**12]), max_size=4).map(tuple)
+TYPES = st.sampled_from(
+    ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]
+)
+VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
+
+
+@settings(TRIALS, max_examples=25)
+@given(
+    edits=st.lists(
+        st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2
+    )
+)
+def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
+    path = tmp_path / "x.h5"
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "r+") as file:
+        for name, shape, kind, value, one_value, packed in edits:
+            if one_value and name in file and file[name].size and file[name].dtype.kind in "iuf":
+                with np.errstate(all="ignore"):
+                    rows = file[name][...]
+                    rows.flat[0] = np.array(value).astype(rows.dtype)
+                    file[name][...] = rows
+                continue
+            file.pop(name, None)
+            packed = packed and all(shape) and shape
+            file.create_dataset(
+                name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None
+            )
+    for call in (lambda: read_all(path), lambda: compared(whole, path), lambda: Earlier.read(path)):
+        refusal(call)
+
+
+def replaced(file: h5py.File, name: str, by) -> None:
+    del file[name]
+    file[name] = by
+
+
+def external(file: h5py.File, name: str, folder: Path) -> None:
+    shape = file[name].shape
+    del file[name]
+    file.create_dataset(name, shape, "f8", external=[(str(folder / "secret.bin"), 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file: h5py.File, name: str, folder: Path) -> None:
+    layout = h5py.VirtualLayout(file[name].shape, "f8")
+    layout[...] = h5py.VirtualSource(str(folder / "secret.h5"), "rows", file[name].shape)
+    del file[name]
+    file.create_virtual_dataset(name, layout)
+
+
+ELSEWHERE = {
+    "a link to another file": lambda file, name, folder: replaced(
+        file, name, h5py.ExternalLink(str(folder / "secret.h5"), "/rows")
+    ),
+    "a link by way of a link": lambda file, name, folder: (
+        file.__setitem__("way", h5py.ExternalLink(str(folder / "secret.h5"), "/rows")),
+        replaced(file, name, h5py.SoftLink("/way")),
+    ),
+    "its group in another file": lambda file, name, folder: replaced(
+        file, name.partition("/")[0], h5py.ExternalLink(str(folder / "secret.h5"), "/")
+    ),
+    "raw numbers of another file": external,
+    "a view of another file": virtual,
+}
+
+
+@pytest.mark.parametrize("name", ["frames/position", "lattice/nodes", "checkpoint/q"])
+@pytest.mark.parametrize("how", ELSEWHERE)
+def test_no_other_file_is_followed(whole, tmp_path, name, how):
+    path = tmp_path / "x.h5"
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "r+") as file:
+        shape = file[name].shape
+        ELSEWHERE[how](file, name, tmp_path)
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file["rows"] = np.full(shape, SECRET)
+    (tmp_path / "secret.bin").write_bytes(np.full(shape, SECRET).tobytes())
+    for call in (
+        msmpetsc.open,
+        lambda path: compared(whole, path),
+        *([Earlier.read] if name == "checkpoint/q" else []),
+    ):
+        said = refusal(lambda call=call: call(path))
+        assert "not followed" in said or "not opened" in said
+
+
+def test_a_packed_chunk_is_no_larger_than_the_file_can_hold(whole, tmp_path):
+    path = tmp_path / "x.h5"
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "r+") as file:
+        del file["frames/kinetic"]
+        file.create_dataset("frames/kinetic", (5,), "f8", maxshape=(None,), chunks=(10**8,), compression="gzip")
+    assert "more than the file holds" in refusal(lambda: msmpetsc.open(path))
+
+
+def test_names_and_versions_act_on_no_terminal(whole, tmp_path):
+    path = tmp_path / "x.h5"
+    path.write_bytes(whole.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file["frames/\x1b[31m"] = np.ones(2)  # too short, and left alone
+    assert not refusal(lambda: read_all(path))
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = "\x1b[31m" + "x" * 5000
+    assert "format_version ?[31mx" in refusal(lambda: msmpetsc.open(path))
+
+
+@pytest.mark.parametrize("ending", ["crashes", "hangs"])
+def test_where_hdf5_itself_fails_a_child_fails(whole, monkeypatch, ending):
+    """The child is made to do what HDF5 does on damaged tables, where no exception comes."""
+    from msmpetsc.results import reader
+
+    code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]
+    monkeypatch.setattr(reader, "PATIENCE", 1)
+    monkeypatch.setattr(reader, "_read_tables", lambda path: exec(code, {"os": __import__("os")}))
+    with pytest.raises(InputError, match=f"good.h5 is damaged: the HDF5 library {ending} on it"):
+        refuse_deadly(whole)
+
+
+def test_a_good_file_passes_the_child(whole):
+    refuse_deadly(whole)

@@ -1,0 +1,335 @@
+"""msmpetsc.open: what is in the file comes out, of running and of old files too; a bad file ends in one line."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import small_result
+from conftest import ENVIRONMENT, WORKERS
+from mpi4py import MPI
+from small_result import DT, FRAMES, NODES, POINTS, frame, position
+
+import msmpetsc
+from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.errors import InputError
+from msmpetsc.results.writer import ResultFile
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_result.write(tmp_path_factory.mktemp("open") / "x.h5")
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "x.h5"
+    path.write_bytes(whole.read_bytes())
+    return path
+
+
+def test_what_was_written_is_read(whole: Path):
+    with msmpetsc.open(whole) as run:
+        assert run.frames.time[:] == pytest.approx(DT * np.arange(FRAMES))
+        assert np.array_equal(run.frames.position[-1], position(FRAMES - 1)) and run.frames.position.unit == "m"
+        assert np.array_equal(run.lattice["nodes"], NODES) and run.lattice.cells.shape == (2, 8)
+        assert run.scene["material"]["density"] == 1000 and run.attributes["ranks"] == 1
+        assert run.surface.triangles[1, 2] == 3
+        assert np.allclose(run.embedding @ np.ones(len(NODES)), 1) and run.embedding.shape == (len(POINTS), len(NODES))
+        assert run.checkpoint.step == FRAMES - 1
+        assert np.array_equal(run.checkpoint.q_previous, position(FRAMES - 1) - 1)
+        assert "5 frames of 12 nodes" in repr(run) and "elastic" in dir(run.frames)
+    with pytest.raises(InputError, match=r"x\.h5 is closed"):
+        run.frames.kinetic[0]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        3, -1, np.int64(2), slice(None), slice(None, None, -2), slice(4, 1), (slice(1, 3), 7), (slice(None), 7, 2), ...,
+        (..., 1), ([0, 2], 5), (slice(None), [3, 5]), (2, [1, 4]), [], np.array([[0, 1], [2, 3]]), [4, 0, 0],
+        np.arange(FRAMES) > 2,
+        (slice(None), slice(None, None, -3)), ([True, False, True, False, False], slice(2)), (slice(0), [1, 2]),
+    ],
+)  # fmt: skip
+def test_lazy_arrays_are_indexed_as_numpys(whole: Path, key):
+    with msmpetsc.open(whole) as run:
+        expected = np.array([position(index) for index in range(FRAMES)])[key]
+        found = run.frames.position[key]
+        assert found.shape == expected.shape and found.dtype == expected.dtype
+        assert np.array_equal(found, expected)
+
+
+@pytest.mark.parametrize("key", [5, -6, (0, 12), (0, 0, 0, 0), None, ([0, 1], [0, 1]), (..., 0, ...)])
+def test_what_is_not_there_is_an_index_error(whole: Path, key):
+    with msmpetsc.open(whole) as run, pytest.raises(IndexError):
+        run.frames.position[key]
+
+
+def test_one_node_is_followed_without_reading_the_others(whole: Path, monkeypatch):
+    read = []
+    getitem = h5py.Dataset.__getitem__
+
+    def seen(dataset, key):
+        found = getitem(dataset, key)
+        read.append(np.size(found))
+        return found
+
+    with msmpetsc.open(whole) as run:
+        monkeypatch.setattr(h5py.Dataset, "__getitem__", seen)
+        run.frames.position[:, 7]
+        run.frames.position[[1, 3], 7]
+    assert read and max(read) <= 3 * FRAMES and sum(read) <= 3 * (FRAMES + 3)
+
+
+def test_nothing_heavy_is_imported(whole: Path):
+    code = (
+        "import json, sys, msmpetsc\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    run.frames.position[0], run.embedding, run.scene, run.checkpoint\n"
+        "print(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    )
+    command = [sys.executable, "-c", code, whole]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    loaded = set(json.loads(done.stdout))
+    assert "h5py" in loaded and loaded.isdisjoint({"petsc4py", "mpi4py", "numba", "pyvista", "matplotlib", "trimesh"})
+
+
+def test_reading_needs_numpy_and_h5py_alone(whole: Path):
+    """Scipy is needed by the embedding alone, xarray by to_xarray."""
+    code = (
+        "import sys\n"
+        "for name in 'petsc4py mpi4py numba pydantic scipy xarray tqdm pyvista matplotlib tomli_w'.split():\n"
+        "    sys.modules[name] = None\n"
+        "import msmpetsc\n"
+        "from msmpetsc.results.compare import compare\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    run.frames.position[-1], run.lattice.nodes[:], run.surface.points[:]\n"
+        "    run.scene, run.checkpoint, repr(run)\n"
+        "    assert compare(run, run).left_out == []"
+    )
+    done = subprocess.run([sys.executable, "-c", code, whole], env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_itself_is_quick_to_import():
+    code = "import json, sys, msmpetsc\nprint(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout)).isdisjoint({"numpy", "h5py", "petsc4py", "mpi4py", "numba"})
+
+
+def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", NODES)
+        file.start_frames(1000, len(NODES), len(POINTS))
+        with msmpetsc.open(tmp_path / "x.h5") as run:
+            assert run.frames.position[:].shape == (0, *NODES.shape) and run.checkpoint is None
+        for index in range(3):
+            file.append(frame(index))
+            file.write_checkpoint(Checkpoint(index, {"q": position(index), "q_previous": position(index)}))
+        with msmpetsc.open(tmp_path / "x.h5") as run:
+            file.append(frame(3))
+            file.write_checkpoint(Checkpoint(3, {"q": position(3), "q_previous": position(3)}))
+            assert len(run.frames.time) == len(run.frames.kinetic) == len(list(run.frames.position)) == 3
+            assert np.array_equal(run.frames.position[-1], position(2)) and np.isfinite(run.frames.time).all()
+            assert run.checkpoint.step == 3 and np.array_equal(run.checkpoint.q, position(3))
+
+
+def test_another_process_sees_the_newest_checkpoint(tmp_path: Path):
+    """Another: HDF5 would lend a reader in this one the writer's own view of the file."""
+    code = (
+        "import sys, msmpetsc\n"
+        "with msmpetsc.open(sys.argv[1]) as run:\n"
+        "    for line in sys.stdin:\n"
+        "        found = run.checkpoint\n"
+        "        print(found.step, found.q[0, 0], len(run.frames.time), flush=True)"
+    )
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", NODES)
+        file.start_frames(1000, len(NODES))
+        reader = None
+        for index in range(4):
+            file.append(frame(index, surface=None))
+            file.write_checkpoint(Checkpoint(index, {"q": np.full(NODES.shape, index), "q_previous": NODES}))
+            reader = reader or subprocess.Popen(
+                [sys.executable, "-c", code, tmp_path / "x.h5"],
+                env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            print(file=reader.stdin, flush=True)
+            assert reader.stdout.readline() == f"{index} {index:.1f} 1\n"
+        reader.communicate(timeout=20)
+
+
+def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
+    with h5py.File(copy, "r+") as file:
+        for name in ("contact", "true_error", "surface"):
+            del file["frames"][name]
+        for name in ("lattice/pinned", "embedding", "surface", "checkpoint"):
+            del file[name]
+    with msmpetsc.open(copy) as run:
+        assert "contact" not in run.frames and "points" not in run.surface
+        assert run.embedding is None and run.checkpoint is None
+        with pytest.raises(AttributeError, match="no frames/contact in this file, but time, position"):
+            _ = run.frames.contact
+
+
+def test_what_a_newer_version_adds_is_read_too(copy: Path):
+    with h5py.File(copy, "r+") as file:
+        file["frames/twist"] = np.ones((FRAMES, 2))
+        file["frames/words"] = ["a"] * FRAMES
+        file["frames/more/of_it"] = 1.0
+    with msmpetsc.open(copy) as run:
+        assert run.frames.twist[1].tolist() == [1, 1] and "words" not in run.frames and "more" not in run.frames
+
+
+def test_a_repacked_file_is_read(copy: Path):
+    with h5py.File(copy, "r+") as file:
+        for name in ("lattice/nodes", "frames/position"):
+            rows = file[name][:]
+            del file[name]
+            file.create_dataset(name, data=rows, compression="gzip")
+    with msmpetsc.open(copy) as run:
+        assert np.array_equal(run.frames.position[2], position(2))
+
+
+# ---- Files that no run leaves
+
+
+def damage(change: Callable[[h5py.File], None]) -> Callable[[Path], None]:
+    def apply(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            change(file)
+
+    return apply
+
+
+def replaced(name: str, rows=None, **options) -> Callable[[Path], None]:
+    def change(file: h5py.File) -> None:
+        del file[name]
+        if rows is not None or options:
+            file.create_dataset(name, data=rows, **options)
+
+    return damage(change)
+
+
+def attribute(name: str, value) -> Callable[[Path], None]:
+    return damage(lambda file: file.attrs.pop(name) if value is None else file.attrs.__setitem__(name, value))
+
+
+def cut(part: float) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+
+
+def linked_away(file: h5py.File) -> None:
+    del file["frames/position"]
+    file["frames/position"] = h5py.ExternalLink("not_there.h5", "/x")
+
+
+def group_for_time(file: h5py.File) -> None:
+    del file["frames/time"]
+    file.create_group("frames/time")
+
+
+HUGE = dict(shape=(10**12,), dtype="f8", chunks=(1000,))
+BAD = {
+    "cut in half": (cut(0.5), "is damaged or cut short: .*truncated"),
+    "cut to its head": (cut(0.01), "is damaged or cut short"),
+    "empty": (cut(0), "is not an HDF5 file"),
+    "text": (lambda path: path.write_text("position"), "is not an HDF5 file"),
+    "gone": (lambda path: path.unlink(), "no such file"),
+    "folder": (lambda path: (path.unlink(), path.mkdir()), "is a folder"),
+    "foreign": (lambda path: h5py.File(path, "w").close(), "is not a result of msmpetsc run"),
+    "no format": (attribute("format", None), "is not a result of msmpetsc run"),
+    "array for format": (attribute("format", [1.0, 2.0]), "is not a result of msmpetsc run"),
+    "newer": (attribute("format_version", 2), "format_version 2; 1 is read here"),
+    "strange version": (attribute("format_version", "1"), "format_version 1"),
+    "no frames": (damage(lambda file: file.__delitem__("frames")), "it has no frames"),
+    "frames are data": (replaced("frames", [1.0]), "it has no frames"),
+    "no time": (replaced("frames/time"), "no dataset frames/time"),
+    "time is a group": (damage(group_for_time), "no dataset frames/time"),
+    "no position": (replaced("frames/position"), "it has no frames/position"),
+    "no nodes": (replaced("lattice/nodes"), "it has no lattice/nodes"),
+    "10^12 times": (replaced("frames/time", **HUGE), "claims 1000000000000 numbers"),
+    "10^12 energies": (replaced("frames/kinetic", **HUGE), "frames/kinetic claims"),
+    "10^12 packed": (replaced("frames/kinetic", **HUGE, compression="gzip"), "frames/kinetic claims"),
+    "10^12 nodes": (
+        replaced("lattice/nodes", **HUGE | dict(shape=(10**12, 3), chunks=(99, 3))), "claims 1000000000000 x 3"
+    ),
+    "text for positions": (replaced("frames/position", ["a", "b"]), "frames/position has type"),
+    "whole numbers for nodes": (replaced("lattice/nodes", np.ones((12, 3), int)), "lattice/nodes has type int64"),
+    "one number for all": (replaced("frames/time", 1.0), "frames/time has type float64 and shape ()"),
+    "nothing for times": (replaced("frames/time", h5py.Empty("f8")), "frames/time has type"),
+    "other nodes": (replaced("lattice/nodes", np.ones((11, 3))), "12 long along axis 0, and 11 are expected"),
+    "flat": (replaced("frames/position", np.ones((5, 12, 2))), "2 long along axis 2, and 3 are expected"),
+    "too few energies": (replaced("frames/kinetic", np.ones(3)), "3 long along axis 0, and 5 frames are finished"),
+    "linked away": (damage(linked_away), "position"),
+    "records": (replaced("frames/time", np.zeros(5, [("a", "f8")])), "frames/time has type"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_ends_in_one_line(copy: Path, name: str):
+    spoil, words = BAD[name]
+    spoil(copy)
+    with pytest.raises(InputError, match=words) as told:
+        msmpetsc.open(copy)
+    assert str(told.value).startswith(str(copy)) and "\n" not in str(told.value)
+
+
+def indices_out_of_range(file: h5py.File) -> None:
+    file["embedding/indices"][3] = 10**6
+
+
+@pytest.mark.parametrize(
+    ("spoil", "ask", "words"),
+    [
+        (attribute("scene", None), "scene", "does not say its scene"),
+        (attribute("scene", "a = [[["), "scene", "its scene is not TOML"),
+        (damage(indices_out_of_range), "embedding", "embedding is no matrix"),
+        (replaced("embedding/weights"), "embedding", "a part of embedding is missing"),
+        (replaced("embedding/indptr", np.array([0, 32])), "embedding", "has 1 rows for 4 points"),
+    ],
+)
+def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(copy: Path, spoil, ask: str, words: str):
+    spoil(copy)
+    with msmpetsc.open(copy) as run, pytest.raises(InputError, match=words):
+        getattr(run, ask)
+
+
+def test_flipped_bytes_end_in_one_line_or_in_hdf5_itself(whole: Path, tmp_path: Path):
+    """The HDF5 library falls over some damaged metadata: that no reader can mend, and such trials do not count."""
+    done = subprocess.run(
+        [sys.executable, WORKERS / "open_worker.py", whole, tmp_path / "y.h5", "40"],
+        env=ENVIRONMENT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-1500:]
+    read, refused, other, died = map(int, done.stdout.split())
+    assert other == 0, done.stderr[-1500:]
+    assert refused > 5 and read > 10 and died < 8
+
+
+# ---- xarray
+
+
+def test_xarray_has_coordinates_units_and_names(whole: Path):
+    pytest.importorskip("xarray")
+    with msmpetsc.open(whole) as run:
+        data = run.to_xarray()
+        assert data.position.dims == ("time", "node", "axis") and data.surface.dims == ("time", "point", "axis")
+        assert data.kinetic.attrs == {"long_name": "kinetic energy", "units": "J"}
+        x = data.position.sel(axis="x").sel(time=2 * DT, method="nearest").isel(node=[11, 0])
+        assert x.values.tolist() == position(2)[[11, 0], 0].tolist()
+        assert np.array_equal(data.rest_position, NODES) and data.attrs["ranks"] == 1
+        weight = (data.mass * data.position).sum("node").isel(time=1, axis=2)
+        assert float(weight) == pytest.approx(0.25 * NODES[:, 2].sum())
+
+
+def test_without_xarray_one_line_says_so(whole: Path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with msmpetsc.open(whole) as run, pytest.raises(InputError, match="needs the package xarray: pip install xarray"):
+        run.to_xarray()

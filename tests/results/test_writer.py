@@ -1,0 +1,389 @@
+"""The result file: its layout, on several ranks, killed, refused; and the XDMF file beside it."""
+
+import io
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ENVIRONMENT, WORKERS
+from frames_worker import NODES, POINTS, STEPS, frame, positions
+from mpi4py import MPI
+
+from msmpetsc.checkpoint import Checkpoint
+from msmpetsc.errors import InputError
+from msmpetsc.fields import FRAME_FIELDS
+from msmpetsc.results import writer
+from msmpetsc.results.reader import finished, newest_slot, open_result
+from msmpetsc.results.writer import Begin, ResultFile
+from msmpetsc.results.xdmf import write_xdmf
+
+WORKER = WORKERS / "frames_worker.py"
+pytestmark = pytest.mark.timeout(60)
+
+
+def run_on_ranks(ranks: int, action: str, path: Path) -> str:
+    command = ["mpiexec", "--oversubscribe", "-n", str(ranks), sys.executable, str(WORKER), action, str(path)]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=40)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
+    with ResultFile(path, MPI.COMM_SELF, {}) as file:
+        file.start_frames(planned, NODES, POINTS, "f8")
+        for index in range(count):
+            file.append(frame(index))
+
+
+def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> None:
+    """The first `count` frames are those of frames_worker, bit for bit."""
+    expected = [frame(index) for index in range(count)]
+    fields = {name: field.dtype for name, field in FRAME_FIELDS.items() if name != "surface"}
+    if surface is not None:
+        fields["surface"] = surface
+    for name, kind in fields.items():
+        stored = file["frames"][name][:count]
+        wanted = np.array([getattr(one, name) for one in expected], kind).reshape(stored.shape)
+        assert np.array_equal(stored, wanted, equal_nan=True), name
+
+
+def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | None:
+    """Step, q and q_previous, of a file that need not have a path."""
+    group = file["checkpoint"]
+    slot = newest_slot(group["step"][:])
+    return None if slot is None else (group["step"][slot], group["q"][slot], group["q_previous"][slot])
+
+
+@pytest.mark.parametrize("ranks", [1, 3])
+def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
+    run_on_ranks(ranks, "all", tmp_path / "out" / "x.h5")  # the folder is made
+    assert os.listdir(tmp_path / "out") == ["x.h5"]
+    with h5py.File(tmp_path / "out" / "x.h5") as file:
+        assert finished(file) == STEPS + 1
+        assert_holds(file, STEPS + 1)
+        assert {**file.attrs} == {"format": "msmpetsc", "format_version": 1, "scene": "title = 'a test'", "ranks": 3}
+        assert file["frames/position"].shape == (STEPS + 1, NODES, 3) and file["frames/position"].dtype == "f8"
+        assert file["frames/surface"].shape == (STEPS + 1, POINTS, 3) and file["frames/surface"].dtype == "f4"
+        assert np.array_equal(file["lattice/nodes"], positions(0, NODES))
+        assert np.array_equal(file["lattice/springs"], np.arange(2 * NODES).reshape(-1, 2))
+        assert file["lattice/pinned"].shape == (0,)
+        units = {name: file["frames"][name].attrs["unit"] for name in file["frames"]}
+        assert units["momentum"] == "kg m/s" and units["elastic"] == "J" and units["position"] == "m"
+        assert file["lattice/nodes"].attrs["unit"] == "m"
+        step, q, q_previous = newest_checkpoint(file)
+        assert step == STEPS
+        assert np.array_equal(q, positions(STEPS, NODES)) and np.array_equal(q_previous, positions(STEPS - 1, NODES))
+
+
+def test_who_writes_does_not_show_in_the_file(tmp_path):
+    """Rank 0 for all, or each its own rows, which begin and end within chunks: the same bytes."""
+    for ranks, action in ((1, "all"), (3, "all"), (3, "gathered")):
+        run_on_ranks(ranks, action, tmp_path / f"{ranks} {action}.h5")
+    one, *others = [path.read_bytes() for path in sorted(tmp_path.glob("*.h5"))]
+    assert len(others) == 2 and all(other == one for other in others)
+
+
+def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
+    """Every write of HDF5, the trimming's too, is replayed: the file after each opens and holds all finished frames."""
+    disk = Disk()
+    path = tmp_path / "x.h5"
+
+    def open_new(_):
+        return h5py.File(disk, "w", libver="earliest", rdcc_nbytes=0)
+
+    monkeypatch.setattr(writer, "open_new", open_new)
+    marks = {}  # number of writes made -> (frames, newest checkpoint) that were then finished
+    file = ResultFile(path, MPI.COMM_SELF, {})
+    file.start_frames(40, NODES, POINTS)
+    for index in range(12):
+        marks[len(disk.log)] = index, index - 1
+        file.append(frame(index))
+        marks[len(disk.log)] = index + 1, index - 1
+        file.write_checkpoint(
+            Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+        )
+    marks[len(disk.log)] = 12, 11
+    file.close()
+    assert len(disk.log) > max(marks)  # the trimming wrote
+
+    for writes, image in disk.images(start=min(marks)):
+        count, checkpoint = marks[max(mark for mark in marks if mark <= writes)]
+        with h5py.File(io.BytesIO(image), "r") as killed:
+            assert count <= finished(killed) <= count + 1 and finished(killed) <= 12
+            assert_holds(killed, finished(killed))
+            kept = newest_checkpoint(killed)
+            if checkpoint >= 0:
+                assert kept[0] in (checkpoint, checkpoint + 1)
+                assert np.array_equal(kept[1], positions(kept[0], NODES))
+                assert np.array_equal(kept[2], positions(kept[0] - 1, NODES))
+
+
+def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypatch):
+    """As above, from the opening of a file that was left by a kill, until it is closed."""
+    path, disk = tmp_path / "x.h5", Disk()
+    with ResultFile(path, MPI.COMM_SELF, {}) as file:
+        file.start_frames(9, NODES, POINTS)
+        for index in range(3):
+            file.append(frame(index))
+            file.write_checkpoint(saved(index))
+        file.close(trim=False)
+    before = path.read_bytes()
+    io.BytesIO.write(disk, before)
+    monkeypatch.setattr(writer, "open_again", lambda _: h5py.File(disk, "r+", libver="earliest", rdcc_nbytes=0))
+    file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
+    file.start_frames(9, NODES, POINTS)
+    assert file.finished == 3
+    for index in range(3, 6):
+        file.append(frame(index))
+        file.write_checkpoint(saved(index))
+    file.close(trim=False)
+    with h5py.File(io.BytesIO(before)) as laid:
+        numbers = sorted(places(laid))
+    assert {change for change in disk.log if isinstance(change, int)} <= {len(before)}  # not cut, not stretched
+    for offset, data in [change for change in disk.log if not isinstance(change, int)]:
+        changed = [at for at, byte in enumerate(data, offset) if byte != before[at]]
+        inside = [any(start <= at < end for start, end in numbers) for at in changed]
+        assert all(inside)
+    for _, image in disk.images(start=1, begin=before):
+        with h5py.File(io.BytesIO(image), "r") as killed:
+            assert_holds(killed, finished(killed))
+            step, q, _ = newest_checkpoint(killed)
+            assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(q, positions(step, NODES))
+
+
+def saved(index: int) -> Checkpoint:
+    return Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
+
+
+def places(file: h5py.File) -> Iterator[tuple[int, int]]:
+    """Where the chunks of frames and checkpoints lie, [byte]."""
+    for group in ("frames", "checkpoint"):
+        for dataset in file[group].values():
+            for number in range(dataset.id.get_num_chunks()):
+                chunk = dataset.id.get_chunk_info(number)
+                yield chunk.byte_offset, chunk.byte_offset + chunk.size
+
+
+class Disk(io.BytesIO):
+    """A file that remembers every change of itself, in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.log = []  # (offset, bytes), or a length it was cut or stretched to
+
+    def write(self, data):
+        self.log.append((self.tell(), bytes(data)))
+        return super().write(data)
+
+    def truncate(self, size=None):
+        self.log.append(size)
+        self._stretch(size)
+        return super().truncate(size)
+
+    def _stretch(self, size):
+        here = self.tell()
+        missing = size - self.seek(0, io.SEEK_END)
+        super().write(bytes(max(0, missing)))
+        self.seek(here)
+
+    def images(self, start, begin=b""):
+        """(number of changes made, content) after each change from the start-th on."""
+        image = bytearray(begin)
+        for number, change in enumerate(self.log, 1):
+            end = change if isinstance(change, int) else change[0] + len(change[1])
+            image.extend(bytes(max(0, end - len(image))))
+            if isinstance(change, int):
+                del image[change:]
+            else:
+                image[change[0] : end] = change[1]
+            if number >= start:
+                yield number, bytes(image)
+
+
+def test_killed_at_any_moment(tmp_path):
+    chance = random.Random(1)
+    for batch in range(2):  # tests/test_kills.py has more
+        writers = [start_writer(tmp_path / f"{batch}-{number}.h5") for number in range(4)]
+        for process in writers:
+            process.stdout.readline()  # frame 0 is stored
+        for process in writers:
+            time.sleep(chance.uniform(0, 0.05))
+            process.send_signal(signal.SIGKILL)
+        for process in writers:
+            with process:
+                assert_nothing_lost(Path(process.args[-1]), told=1 + process.stdout.read().count("\n"))
+
+
+def start_writer(path: Path) -> subprocess.Popen:
+    command = [sys.executable, str(WORKER), "forever", str(path)]
+    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+
+
+def assert_nothing_lost(path: Path, told: int) -> None:
+    """`told`: how many frames the writer said were stored."""
+    with h5py.File(path, "r") as file:
+        assert told <= finished(file) <= told + 1
+        assert_holds(file, finished(file))
+        if told > 1:
+            step, q, _ = newest_checkpoint(file)
+            assert step >= told - 2 and np.array_equal(q, positions(step, NODES))
+
+
+def test_a_running_result_can_be_read(tmp_path):
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(5, NODES, POINTS)
+        file.append(frame(0))
+        look = "import h5py, sys; f = h5py.File(sys.argv[1], 'r'); print(f['frames/time'][:2])"
+        seen = subprocess.run([sys.executable, "-c", look, file.path], capture_output=True, text=True, timeout=20)
+    assert seen.stdout.strip() == "[ 0. nan]", seen.stderr
+
+
+@pytest.mark.parametrize("failure", [None, RuntimeError])
+def test_ended_early_it_is_trimmed(tmp_path, failure):
+    try:
+        with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+            file.start_frames(STEPS + 1, NODES, POINTS, "f8")
+            for index in range(4):
+                file.append(frame(index))
+            if failure:
+                raise failure
+    except RuntimeError:
+        assert failure
+    with open_result(tmp_path / "x.h5") as file:
+        assert {len(dataset) for dataset in file["frames"].values()} == {4}
+        assert finished(file) == 4
+        assert_holds(file, 4, "f8")
+
+
+def test_planned_frames_take_no_disk_until_written(tmp_path):
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(100, 10_000)
+        assert os.stat(file.path).st_size > 100 * 10_000 * 24
+        assert os.stat(file.path).st_blocks * 512 < 200_000
+
+
+def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
+    path = tmp_path / "x.h5"
+    write_serial(path, 3)
+    with pytest.raises(InputError, match=r"x\.h5 exists: --overwrite replaces it"):
+        ResultFile(path, MPI.COMM_SELF, {})
+    with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE):
+        pass  # never came to its first frame
+    with open_result(path) as file:
+        assert finished(file) == 3
+    with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE) as file:
+        file.start_frames(1, NODES)
+    with open_result(path) as file:
+        assert finished(file) == 0 and "surface" not in file["frames"]
+    assert os.listdir(tmp_path) == ["x.h5"]
+
+
+def test_refused_on_all_ranks_together(tmp_path):
+    path = tmp_path / "x.h5"
+    write_serial(path, 1)
+    assert run_on_ranks(2, "refuse", path) == f"refused: {path} exists: --overwrite replaces it\n" * 2
+    assert run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2  # a folder that is a file
+
+
+@pytest.mark.parametrize("action", ["full", "full for one"])
+def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, action):
+    path = tmp_path / "x.h5"
+    assert run_on_ranks(3, action, path) == f"refused: {path} cannot be written: No space left on device\n" * 3
+    with open_result(path) as file:
+        assert finished(file) == 2 and len(file["frames/position"]) == STEPS + 1  # left as it was: room to go on
+        assert_holds(file, 2, None)
+
+
+def test_too_small_a_disk_is_told_before_the_first_frame(tmp_path):
+    small = pytest.raises(InputError, match=r"will need .* GB, and only .* GB are free")
+    with small, ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(10**6, 10**7)
+    assert os.listdir(tmp_path) == []
+
+
+def test_wrong_frames_are_refused(tmp_path):
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.start_frames(1, NODES, POINTS)
+        with pytest.raises(ValueError, match="surface has shape"):
+            file.append(frame(0, points=slice(3)))
+        file.append(frame(0))
+        with pytest.raises(ValueError, match="was not planned"):
+            file.append(frame(1))
+
+
+@pytest.mark.parametrize("content", [None, b"not HDF5"])
+def test_what_is_no_result_is_told(tmp_path, content):
+    path = tmp_path / "x.h5"
+    if content:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"no such file|not an HDF5 file"):
+        open_result(path)
+    with h5py.File(tmp_path / "y.h5", "w"):
+        pass
+    with pytest.raises(InputError, match="is not a result"):
+        open_result(tmp_path / "y.h5")
+
+
+def test_xdmf_refers_to_what_is_there(tmp_path):
+    cells = np.arange(16).reshape(2, 8)
+    with ResultFile(tmp_path / "a b.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", positions(0, NODES))
+        file.write("lattice/cells", cells)
+        file.write("lattice/cell_kind", np.array([1, 2], "u1"))
+        file.write("surface/triangles", np.array([[0, 1, 2], [3, 4, 5]], "i4"))
+        file.start_frames(7, NODES, POINTS)
+        for index in range(3):
+            file.append(frame(index))
+    path = write_xdmf(tmp_path / "a b.h5")
+    assert sorted(os.listdir(tmp_path)) == ["a b.h5", "a b.xdmf"] and path.name == "a b.xdmf"
+    collections = ET.parse(path).getroot().findall("Domain/Grid")
+    assert [grid.get("Name") for grid in collections] == ["surface", "lattice"]
+    with h5py.File(tmp_path / "a b.h5") as file:
+        for collection, points in zip(collections, ("surface", "position"), strict=True):
+            grids = collection.findall("Grid")
+            assert [float(grid.find("Time").get("Value")) for grid in grids] == [0, 1 / 60, 2 / 60]
+            for index, grid in enumerate(grids):
+                slab = grid.find("Geometry/DataItem")
+                assert np.array_equal(read_item(slab, file), file["frames"][points][index])
+        assert np.array_equal(read_item(grid.find("Topology/DataItem"), file), cells)
+        assert np.array_equal(read_item(grid.find("Attribute/DataItem"), file), [1, 2])
+
+
+def read_item(item: ET.Element, file: h5py.File) -> np.ndarray:
+    """What a reader of XDMF would take from the file, its declared shape and type checked."""
+    if item.get("ItemType") == "HyperSlab":
+        start, stride, count = np.array(item[0].text.split(), int).reshape(3, 3)
+        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count, strict=True))
+        return read_item(item[1], file)[part].reshape([int(n) for n in item.get("Dimensions").split()])
+    name, dataset = item.text.split(":")
+    assert name == Path(file.filename).name
+    assert tuple(map(int, item.get("Dimensions").split())) == file[dataset].shape
+    kind = {"Float": "f", "Int": "i", "UInt": "u"}[item.get("NumberType")]
+    assert file[dataset].dtype == np.dtype(f"{kind}{item.get('Precision')}")
+    return file[dataset][...]
+
+
+def test_xdmf_opens_in_vtk(tmp_path):
+    pv = pytest.importorskip("pyvista")
+    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        file.write("lattice/nodes", cube)
+        file.write("lattice/cells", np.arange(8)[None])
+        file.write("lattice/cell_kind", np.array([1], "u1"))
+        file.start_frames(2, 8)
+        for index in range(2):
+            numbers = frame(index).__dict__ | {"position": cube * (1 + index), "surface": None}
+            file.append(type(frame(0))(**numbers))
+    reader = pv.XdmfReader(write_xdmf(tmp_path / "x.h5"))
+    reader.set_active_time_value(1 / 60)
+    body = reader.read()
+    assert body.n_cells == 1 and body.volume == pytest.approx(8)

@@ -1,0 +1,196 @@
+"""Every writer there is, in one table: on a disk that fills up it says so in one line and leaves nothing half-written.
+
+By the limit on the size of files, which the system tells like a full disk, and which needs no rights.
+"""
+
+import re
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import small_result
+from ball_result import write_ball
+from conftest import ROOT
+
+from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
+from msmpetsc.cli.commands import new
+from msmpetsc.cli.commands.check import Checked, write_junit
+from msmpetsc.errors import InputError
+from msmpetsc.export.formats import FORMATS, export
+from msmpetsc.results.reader import Result
+from msmpetsc.results.xdmf import write_xdmf
+from msmpetsc.study.baselines import baseline
+from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
+from msmpetsc.study.report import write_report
+from msmpetsc.study.runner import StudyResults
+from msmpetsc.study.scene_lines import put_into
+from msmpetsc.study.sizing.choice import Candidate
+from msmpetsc.study.table import write_table
+from msmpetsc.view.drawable import drawable_of_result
+from msmpetsc.view.film import written
+from msmpetsc.view.page import write_page
+from msmpetsc.view.playback import Style
+from msmpetsc.view.sheet import contact_sheet
+
+pytestmark = pytest.mark.timeout(100)
+PACKAGE = ROOT / "msmpetsc"
+Write = Callable[[Path], object]
+
+
+class Writer(NamedTuple):
+    """A writer: its module, what it writes under a path, and what must lie there before."""
+
+    module: str
+    write: Write
+    prepare: Write = lambda path: None
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with results to be drawn and exported."""
+    folder = tmp_path_factory.mktemp("sources")
+    small_result.write(folder / "bar.h5")
+    write_ball(folder / "ball.h5", True)
+    return folder
+
+
+def film(path: Path) -> None:
+    pictures = np.random.default_rng(1).integers(0, 255, (3, 64, 64, 3), np.uint8)
+    with written(path, (64, 64), 10) as add:
+        for picture in pictures:
+            add(picture)
+
+
+def page(result: Path, path: Path) -> None:
+    with Result(result) as run:
+        write_page(drawable_of_result(run), path, [0, 1], Style(), None)
+
+
+def chart(path: Path) -> None:
+    made = Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"]))
+    made.panel("", log_axis("x", [1, 10], COUNT), log_axis("y", [1, 10], COUNT)).line([1, 10], [1, 10])
+    save_png(made, path.parent)
+
+
+def writers(sources: Path) -> dict[str, Writer]:
+    """The table, by names of files."""
+    bar, ball = sources / "bar.h5", sources / "ball.h5"
+    table = {
+        "x.h5": Writer("results/writer.py", small_result.write),
+        "x.xdmf": Writer(
+            "results/xdmf.py",
+            lambda path: write_xdmf(path.with_suffix(".h5")),
+            lambda path: small_result.write(path.with_suffix(".h5")),
+        ),
+        "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
+        "x.baseline.json": Writer("study/baselines/baseline.py", lambda path: baseline.write(path, {"counts": {}})),
+        "junit.xml": Writer(
+            "cli/commands/check.py",
+            lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
+        ),
+        "planned.toml": Writer(
+            "study/scene_lines.py",
+            lambda path: put_into(path, Candidate("verlet", 0.02)),
+            lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
+        ),
+        "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),
+        "table.h5": Writer("study/table.py", lambda path: write_table(path.parent, [])),
+        "traces.json": Writer(
+            "study/runner.py",
+            lambda path: StudyResults(path.parent, ["a"], traces={"a": {"trace": [0] * 5000}}).write(),
+        ),
+        "report.html": Writer(
+            "study/report.py", lambda path: write_report(path.parent), lambda path: write_table(path.parent, [])
+        ),
+        "chart.png": Writer("study/charts/plot.py", chart),
+    }
+    table |= {f"y{end}": Writer("export/formats.py", partial(export, bar)) for end in FORMATS}
+    table |= {f"z{end}": Writer("view/sheet.py", partial(contact_sheet, ball)) for end in PICTURE_NAMES}
+    table |= {f"z{end}": Writer("view/film.py", film) for end in MOVIE_NAMES}
+    return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
+
+
+NAMES = [*writers(Path())]
+# what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
+NOT_TRIED = {"app/profile.py"}
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file may become longer [byte]."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_disk_that_fills_up(sources: Path, tmp_path: Path, name: str, part: float):
+    if name.startswith("y.usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
+    writer = writers(sources)[name]
+    whole, full = tmp_path / "whole" / name, tmp_path / "full" / name
+    for path in (whole, full):
+        path.parent.mkdir()
+        writer.prepare(path)
+    before = contents(full.parent)
+    writer.write(whole)
+    with room_for(int(part * whole.stat().st_size)), pytest.raises(InputError) as told:
+        writer.write(full)
+    assert re.search("File too large|cannot be written", str(told.value)) and "\n" not in str(told.value)
+    assert str(full.parent) in str(told.value)
+    left, made = contents(full.parent), contents(whole.parent)
+    assert left.get(name) == before.get(name)
+    for other in left.keys() - {name}:  # written before it, and whole
+        assert left[other] == before.get(other, made[other]), other
+    writer.write(full)
+    assert full.stat().st_size > 0
+
+
+def test_an_older_file_stays_where_a_new_one_fails(sources: Path, tmp_path: Path):
+    path = tmp_path / "x.obj"
+    path.write_text("old")
+    path.chmod(0o640)
+    with room_for(10), pytest.raises(InputError):
+        export(sources / "bar.h5", path)
+    assert contents(tmp_path) == {"x.obj": b"old"}
+    (tmp_path / "link.obj").symlink_to(path)
+    export(sources / "bar.h5", tmp_path / "link.obj")
+    assert (tmp_path / "link.obj").is_symlink() and path.stat().st_size > 3 and path.stat().st_mode & 0o777 == 0o640
+
+
+BY_HAND = re.compile(r"\.write_text\(|\.write_bytes\(|os\.replace\(|\.savefig\(|open\([^)\n]*\"[wax]|File\([^)\n]*\"w")
+ALLOWED = {
+    "results/disk.py": "the one way",
+    "results/writer.py": "a result, which grows",
+    "results/layout.py": "the same",
+    "cli/commands/new.py": "under the name that the one way gave",
+    "export/gltf.py": "the same",
+    "study/table.py": "into memory",
+    "geometry/step_cache.py": "a cache: what fails is not kept",
+    "backend/launcher.py": "a cache",
+    "study/process.py": "the log of a child",
+    "study/runner.py": "a result that a child wrote gets its name",
+    "app/profile.py": "asks before a run whether it could write",
+    "view/renderer.py": "/dev/null",
+}
+
+
+def test_nothing_is_written_by_hand():
+    texts = {str(path.relative_to(PACKAGE)): path.read_text() for path in PACKAGE.rglob("*.py")}
+    assert {name for name, text in texts.items() if BY_HAND.search(text)} == ALLOWED.keys()
+    users = {name for name, text in texts.items() if re.search(r"import .*\b(whole_file|write_whole)\b", text)}
+    tried = {writer.module for writer in writers(Path()).values()}
+    assert users | {"results/writer.py"} == tried | NOT_TRIED

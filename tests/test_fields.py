@@ -1,0 +1,36 @@
+"""The table of fields: what is written has its types, shapes and units, and the documentation's table has each once."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import h5py
+import small_result
+from conftest import ROOT
+
+from msmpetsc.fields import FIELDS, FRAME_FIELDS, SIZES, Frame, markdown_table
+
+
+def test_a_frame_stores_all_but_its_index():
+    assert list(FRAME_FIELDS) == [field.name for field in fields(Frame) if field.name != "index"]
+
+
+def test_what_is_written_is_what_the_table_says(tmp_path: Path):
+    sizes: dict[str, int] = {}
+    with h5py.File(small_result.write(tmp_path / "x.h5")) as file:
+        names: list[str] = []
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        assert {f"frames/{name}" for name in FRAME_FIELDS} < set(names) < set(FIELDS)
+        for name in names:
+            dataset, field = file[name], FIELDS[name]
+            assert (dataset.dtype, dataset.attrs["unit"]) == (field.dtype, field.unit), name
+            for size, symbol in zip(dataset.shape, field.shape, strict=True):
+                assert size == (sizes.setdefault(symbol, size) if symbol in SIZES else symbol), name
+
+
+def test_the_table_for_people_has_each_field_once():
+    rows = [line.split(" | ")[0].removeprefix("| /") for line in markdown_table().splitlines()[2:]]
+    assert rows == list(FIELDS)
+
+
+def test_the_documentation_has_this_very_table():
+    assert markdown_table() in (ROOT / "msmpetsc" / "output" / "README.md").read_text()

@@ -1,0 +1,132 @@
+"""Fields on a surface: each on a motion of which it is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_result import BARE, HEIGHTS, write_ball
+
+from msmpetsc.errors import InputError
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.results.reader import Result
+from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.toml import toml_of
+from msmpetsc.view.colours import (
+    COLOURINGS,
+    SCALE,
+    Colouring,
+    colouring_of,
+    on_scale,
+    opened_reference,
+    rgb,
+    scaled,
+)
+from msmpetsc.view.drawable import drawable_of_result, drawable_of_surface
+from msmpetsc.view.overlays import Rest
+
+
+@pytest.fixture
+def subject(tmp_path):
+    with Result(write_ball(tmp_path / "ball.h5", surface=True)) as run:
+        yield drawable_of_result(run)
+
+
+def test_displacement_of_a_fall_is_its_height(subject):
+    values = colouring_of(subject, "displacement").values
+    for index in (0, 2, 3, 8):
+        assert values(index) == pytest.approx(np.full(len(subject.rest.points), HEIGHTS[0] - HEIGHTS[index]), abs=1e-6)
+
+
+def test_speed_is_the_way_over_the_time_around_a_frame(subject):
+    values = colouring_of(subject, "speed").values
+    assert values(0) == pytest.approx(np.full(len(subject.rest.points), 0.05 / 0.1), rel=1e-4)  # towards frame 1
+    assert values(2) == pytest.approx(np.full(len(subject.rest.points), 0.35 / 0.2), rel=1e-4)  # 0.45 to 0.1 m
+    assert values(8) == pytest.approx(0.0, abs=1e-5)  # 0.2 m before and after
+
+
+def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
+    """Three nodes in a row: the first spring 10% longer, the second 20% shorter."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
+    subject = replace(
+        drawable_of_surface("x.ply", Surface(points, np.array([[0, 1, 2]]))),
+        nodes=lambda _: moved,
+        array={"lattice/springs": np.array([[0, 1], [1, 2]]), "lattice/rest_length": np.ones(2)}.__getitem__,
+    )
+    values = COLOURINGS["strain"](subject, None).values(0)
+    assert values == pytest.approx([0.1, np.sqrt((0.1**2 + 0.2**2) / 2), 0.2])
+
+
+def test_error_is_the_distance_from_the_reference(subject, tmp_path):
+    path = write_ball(tmp_path / "other.h5", surface=True)
+    with Result(tmp_path / "ball.h5") as run, opened_reference(path, run) as reference:
+        assert colouring_of(subject, "error", reference).values(4) == pytest.approx(0.0, abs=1e-12)
+        raised = replace(subject, surface=lambda index: subject.surface(index) + np.array([0.003, 0, 0.004]))
+        error = scaled(colouring_of(raised, "error", reference), [0, 4])
+        assert error.values(4) == pytest.approx(0.005, rel=1e-3)
+        assert error.ends == ("0", "distance from the reference [mm]", "5")
+
+
+def test_parts_are_those_of_the_nearest_cell(subject):
+    """Two cells; the later of two parts that both mean the second one counts."""
+    x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
+    cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
+    nodes, points = np.stack([x, y, z], axis=1).astype(float), np.array([[0.2, 0.5, 0.5], [1.9, 0.1, 0.1]])
+    rest = Rest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(2, int))
+    east = "region = { half_space = { point = [1, 0, 0], normal = [1, 0, 0] } }\n"
+    tables = f"[[part]]\n{east}density = 2.0\n[[part]]\n{east}density = 3.0\n"
+    parted = replace(subject, rest=rest, scene=SceneFile.model_validate(toml_of(BARE + tables)))
+    part = colouring_of(parted, "part")
+    assert part.values(0).tolist() == [0, 2] and part.classes == ("material", "part.0", "part.1")
+
+
+@pytest.mark.parametrize(
+    ("high", "end"), [(0.0125, ("0", "way [mm]", "12.5")), (3.0, ("0", "way [m]", "3")), (0.0, ("0", "way [m]", "0"))]
+)
+def test_ends_of_the_scale_have_a_fitting_unit(high, end):
+    assert Colouring("way", "m", lambda _: np.zeros(1), high).ends == end
+
+
+def test_the_scale_ends_where_its_colours_do():
+    assert on_scale(np.array([-1.0, 0, 1, 7])) == pytest.approx(np.array([rgb(SCALE[k]) for k in (0, 0, -1, -1)]))
+
+
+def test_contact_is_the_gap_to_the_ground_where_that_is_small(subject):
+    """A ball of 0.2 m: gaps of up to 2 mm are told apart, and at its lowest it stands on the ground."""
+    contact = scaled(colouring_of(subject, "contact"), range(11))
+    assert contact.ends == ("2 or more", "gap to obstacles [mm]", "0")
+    height = subject.surface(3)[:, 2]
+    assert height.min() < 1e-6 and contact.values(3) == pytest.approx(np.maximum(0.002 - height, 0), abs=1e-9)
+    assert not contact.values(0).any() and contact.shares(3).max() == pytest.approx(1, abs=1e-3)
+
+
+def test_contact_counts_bodies_that_face_each_other_and_is_dark_wherever_it_touches(subject):
+    """The ground is 1 mm too high. Of two balls that rest on it the second is half a millimetre from the first."""
+    points, triangles, count = subject.rest.points, subject.triangles, len(subject.rest.points)
+    body = np.repeat([0, 1], count)
+    far = points + np.array([1.0, 0, 0])
+    rest = Rest(np.concatenate([points, far]), subject.rest.cells, np.concatenate([points, far]), body, body)
+    lowest = subject.surface(3)
+    beside = lowest + np.array([np.ptp(lowest[:, 0]) + 5e-4, 0, 0])
+    plane = {"shape": "plane", "point": [0, 0, 0.001], "normal": [0, 0, 1], "response": "penalty"}
+    scene = toml_of(BARE) | {"obstacle": [plane], "self_contact": {}}
+    two = replace(
+        subject,
+        rest=rest,
+        triangles=np.concatenate([triangles, triangles + count]),
+        surface=lambda _: np.concatenate([lowest, beside]),
+        scene=SceneFile.model_validate(scene),
+    )
+    contact = scaled(colouring_of(two, "contact"), [3])
+    assert contact.ends == ("2 or more", "gap to obstacles and the surface itself [mm]", "0")
+    assert contact.shares(3).max() == 1, "what touches is dark, however deep an obstacle is entered elsewhere"
+    gaps = 0.002 - contact.values(3)
+    assert gaps[np.argmax(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)
+    assert gaps[count + np.argmin(lowest[:, 0])] == pytest.approx(5e-4, abs=2e-5)
+    assert (gaps > 0.0019).sum() > 1.9 * count - 40  # nothing else is near
+
+
+def test_without_anything_to_touch_one_line_says_so(subject):
+    alone = replace(subject, scene=SceneFile.model_validate(toml_of(BARE)))
+    with pytest.raises(InputError, match="has neither obstacles nor self-contact"):
+        colouring_of(alone, "contact")

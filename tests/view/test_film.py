@@ -1,0 +1,200 @@
+"""Films: their playback, their pictures as they come out of the file, and what cannot be filmed."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_result import BARE, HEIGHTS, write_ball
+from PIL import Image, ImageSequence
+
+from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
+from msmpetsc.errors import InputError, as_expected
+from msmpetsc.view.camera import camera_facing, turned
+from msmpetsc.view.playback import playback_of, usual_speed
+
+pytestmark = pytest.mark.timeout(60)
+TIMES = np.arange(11) / 10  # of the ball's frames [s]
+
+
+@pytest.fixture
+def result(tmp_path) -> Path:
+    return write_ball(tmp_path / "ball.h5", surface=True)
+
+
+def render(*words: object) -> None:
+    assert command.run(parsed(["render", *map(str, words)])) == 0
+
+
+def pictures_of(path: Path) -> list[np.ndarray]:
+    """The pictures of a film as a player has them."""
+    if path.suffix != ".mp4":
+        with Image.open(path) as film:
+            return [np.array(picture.convert("RGB")).astype(int) for picture in ImageSequence.Iterator(film)]
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    frames = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(frames)["size"]
+    return [np.frombuffer(frame, np.uint8).reshape(height, width, 3).astype(int) for frame in frames]
+
+
+def middle_of_body(picture: np.ndarray) -> float:
+    """The row halfway between the first and the last with pixels that are clearly blue: the body's."""
+    rows = np.flatnonzero((picture[..., 2] - picture[..., 0] > 15).sum(axis=1) > 3)
+    return (rows[0] + rows[-1]) / 2
+
+
+def test_pace_in_real_time_shows_each_frame_at_its_time():
+    playback = playback_of(4 * TIMES)  # ten frames in four seconds are fewer than a film has at the most
+    assert playback.numbers.tolist() == list(range(11)) and playback.fps == pytest.approx(2.5) and playback.speed == 1
+    assert playback.words == ""
+
+
+def test_pace_leaves_frames_out_where_they_come_faster_than_pictures():
+    playback = playback_of(np.arange(4001) / 1000)  # four seconds of four thousand frames
+    assert playback.fps == 30 and len(playback.numbers) == 121
+    assert playback.numbers[[0, 3, -1]].tolist() == [0, 100, 4000]
+
+
+@pytest.mark.parametrize("span", [*np.geomspace(1e-6, 1e6, 50), 2.999, 3.0, 8.0, 8.001])
+def test_a_film_lasts_three_to_eight_seconds_where_nothing_is_said(span: float):
+    speed = usual_speed(span)
+    assert span / speed * (1 + 1e-9) >= 3 and span / speed <= 8
+    assert (speed == 1) == (3 <= span <= 8)
+
+
+def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
+    playback = playback_of(np.arange(41) / 120)
+    assert 3 <= playback.seconds <= 8 and playback.words == "10 times slower than real"
+    assert playback_of(np.arange(61.0)).words == "10 times faster than real"
+
+
+def test_a_film_fills_its_frame_and_says_its_speed(result, tmp_path, caplog):
+    """The ball's way is four times as high as wide, and so is the film, as far as its caption lets it."""
+    with caplog.at_level("INFO", logger="msmpetsc"):
+        render(result, "-o", tmp_path / "x.gif")
+    with Image.open(tmp_path / "x.gif") as film:
+        seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
+    assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-68]  # above the caption
+    assert pictures.shape[1] > 1.5 * pictures.shape[2]
+    body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
+    rows = np.flatnonzero(body.any(axis=1))
+    assert np.ptp(rows) > 0.75 * pictures.shape[1]
+
+
+def test_slow_motion_shows_all_frames_for_longer():
+    slow = playback_of(TIMES, speed=0.1)
+    assert slow.fps == pytest.approx(1) and slow.seconds == pytest.approx(11)
+    both = playback_of(TIMES, fps=20, speed=0.1)  # 0.005 s a picture, so twenty pictures a frame
+    assert len(both.numbers) == 201 and (abs(np.bincount(both.numbers)[1:-1] - 20) <= 1).all()
+
+
+def test_pictures_a_second_alone_are_of_a_frame_each():
+    playback = playback_of(TIMES, fps=25)
+    assert playback.numbers.tolist() == list(range(11)) and playback.speed == pytest.approx(2.5)
+
+
+def test_frames_out_of_order_have_no_speed():
+    assert playback_of(TIMES[[5, 2, 0]], fps=4).numbers.tolist() == [0, 1, 2]
+    with pytest.raises(InputError, match="--speed needs frames in order of time"):
+        playback_of(TIMES[[5, 2, 0]], speed=1)
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
+def test_the_ball_falls_and_leaps_in_the_film(result, tmp_path, ending, capsys):
+    if ending == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "new" / f"x.{ending}"
+    render(result, "-o", path, "--size", "320x480", "--eye", "0,-1,0", "--fps", 5)
+    assert capsys.readouterr().out.strip() == str(path)
+    pictures = pictures_of(path)
+    assert len(pictures) == len(HEIGHTS) and pictures[0].shape == (480, 320, 3)
+    whole = np.array(HEIGHTS) >= 0.1  # the underside of the squashed ball is too dark to be blue
+    rows = np.array([middle_of_body(picture) for picture in pictures])[whole]
+    centres = np.array(HEIGHTS)[whole]
+    scale = (rows[0] - rows[2]) / (centres[0] - centres[2])  # pixels a metre, downwards
+    assert scale < 0 and rows - rows[0] == pytest.approx(scale * (centres - centres[0]), abs=6)
+    assert [path.name for path in path.parent.iterdir()] == [path.name]  # nothing half done is left
+
+
+def test_a_slice_of_the_frames_is_filmed(result, tmp_path):
+    render(result, "-o", tmp_path / "x.gif", "--size", "320x320", "--frames", "0,3:10:3", "--fps", 5)
+    assert len(pictures_of(tmp_path / "x.gif")) == 4  # 0, 3, 6, 9
+
+
+def test_a_turning_camera_stays_upright():
+    """After a quarter to its right the eye stands where the right was, as high as before."""
+    camera = camera_facing(np.eye(3), None, (0, -3, 4))
+    quarter = turned(camera, np.pi / 2)
+    assert quarter.to_eye == pytest.approx([0.6, 0, 0.8]) and quarter.right == pytest.approx([0, 1, 0])
+    assert np.cross(quarter.right, quarter.upward) == pytest.approx(quarter.to_eye)
+
+
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+
+
+def test_on_the_turntable_every_side_is_seen_once(tmp_path):
+    """The ball is held on its east: seen from the east it is dark, from the west it is not, and the turn goes on."""
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
+    film = tmp_path / "x.gif"
+    render(path, "-o", film, "--turntable", "--fps", 2, "--size", "320x320", "--eye", "1,0,0", "--frames", "0")
+    pictures = [picture[:250] for picture in pictures_of(film)]  # above caption and legend
+    assert len(pictures) == 12  # six seconds
+    dark = [(picture[..., 0] < 58).sum() for picture in pictures]  # the plain body has more red in its deepest shade
+    assert dark[6] < 0.05 * dark[0] and dark[0] > 1000
+    assert dark[3] == pytest.approx(dark[9], rel=0.15)  # from south and north alike
+    assert dark[6] < dark[3] < dark[0]
+
+
+def test_the_legend_names_what_is_drawn(result, tmp_path):
+    """The bar of colours goes from the palest to the darkest, and without colours there is none."""
+    for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
+        render(result, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
+    plain, coloured = (np.array(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("plain", "coloured"))
+    assert len(coloured) == len(plain) + 34
+    row = coloured[-17]
+    assert (abs(row - [0xED, 0xF8, 0xB1]).max(axis=1) < 12).any() and (
+        abs(row - [8, 0x1D, 0x58]).max(axis=1) < 12
+    ).any()
+
+
+@pytest.mark.parametrize(
+    "words, line",
+    [
+        (["--frames", "0:x"], "--frames takes numbers like 0,10,20 or slices"),
+        (["--frames", "20:"], "of which --frames names none"),
+        (["--frames", "0:5:0"], "--frames takes numbers"),
+        (["--colour", "sped"], "did you mean 'speed'"),
+        (["--colour", "error"], "--colour error goes with --reference"),
+        (["--colour", "part"], "has no part"),
+        (["--show", "cell"], "did you mean 'cells'"),
+        (["--size", "100x"], "--size takes two even numbers"),
+        (["--size", "101x100"], "--size takes two even numbers"),
+        (["--fps", "10"], r"--fps is for \*.mp4"),
+        (["--turntable"], r"--turntable is for \*.mp4"),
+        (["-o", "x.mp4", "--fps", "0"], "--fps must be above 0"),
+        (["-o", "x.mp4", "--speed", "nan"], "--speed must be above 0"),
+        (["-o", "x.mp4", "--count", "3"], r"--count is for \*.png"),
+        (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
+        (["-o", "x.gif", "--turntable", "--speed", "2"], "--speed needs --frames"),
+        (["-o", "x.gif", "--size", "64x64", "--colour", "speed"], "too small for caption and legend"),
+        (["-o", "/proc/x.gif"], "/proc/x.gif cannot be written"),
+        (["-o", "/proc/x.html"], "/proc/x.html cannot be written"),
+    ],
+)
+def test_what_cannot_be_drawn_ends_in_one_line(result, words, line):
+    with pytest.raises(InputError, match=line) as caught:
+        render(result, *words)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_the_package_one_line_names_its_extra(result, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        render(result, "-o", tmp_path / "x.mp4", "--size", "320x320")
+    assert "msmpetsc[movie]" in str(as_expected(caught.value))
+    assert list(tmp_path.glob("*.mp4")) == []

@@ -1,0 +1,161 @@
+"""The page of a result: what is packed into it comes out again, and a browser shows the body where it should."""
+
+import base64
+import json
+import logging
+import re
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ball_result import BARE, HEIGHTS, write_ball
+from browser import CHROMIUM
+from conftest import ENVIRONMENT
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+
+from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
+from msmpetsc.results.reader import Result
+from msmpetsc.view import page
+from msmpetsc.view.drawable import surface_points
+
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+
+
+def written_page(folder: Path, *words: str, scene: str | None = None) -> Path:
+    result = write_ball(folder / "x.h5", surface=True, **({} if scene is None else {"scene": scene}))
+    assert command.run(parsed(["render", str(result), "-o", str(folder / "x.html"), *words])) == 0
+    return folder / "x.html"
+
+
+def data_of(path: Path) -> dict:
+    text = path.read_text(encoding="utf-8")
+    return json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def stream(data: dict, name: str) -> np.ndarray:
+    return np.frombuffer(zlib.decompress(base64.b64decode(data["streams"][name])), np.uint8)
+
+
+def restored(raw: np.ndarray, frames: int) -> np.ndarray:
+    """The frames (f, n) of 16 bits, as page.js restores them."""
+    low, high = raw.reshape(frames, 2, -1).astype(int).swapaxes(0, 1)
+    coded = low | high << 8
+    left = np.where(coded & 1, -((coded + 1) >> 1), coded >> 1)
+    restored = []
+    for f, numbers in enumerate(left):
+        before = 0 if f == 0 else restored[0] if f == 1 else 2 * restored[-1] - restored[-2]
+        restored.append((before + numbers) % 2**16)
+    return np.array(restored)
+
+
+@given(arrays(np.int64, (4, 6), elements=st.sampled_from([0, 1, 2, 255, 256, 32767, 32768, 40000, 65534, 65535])))
+def test_any_frames_come_out_of_their_residuals(frames):
+    raw = np.frombuffer(b"".join(page.residuals(frames)), np.uint8)
+    assert (restored(raw, len(frames)) == frames).all()
+
+
+def test_the_page_holds_every_frame_to_its_levels(tmp_path):
+    path = written_page(tmp_path)
+    data = data_of(path)
+    low, high = np.array(data["box"])
+    numbers = restored(stream(data, "positions"), len(HEIGHTS)).reshape(len(HEIGHTS), -1, 3)
+    with Result(tmp_path / "x.h5") as run:
+        for index, frame in enumerate(numbers):
+            error = abs(low + frame / 65535 * (high - low) - surface_points(run, index))
+            assert (error <= 0.5001 * (high - low) / 65535).all()
+        assert (stream(data, "triangles").view("<u2").reshape(-1, 3) == run.surface.triangles[:]).all()
+    assert data["times"] == pytest.approx([index / 10 for index in range(11)])
+
+
+def test_the_page_loads_nothing(tmp_path):
+    text = written_page(tmp_path).read_text(encoding="utf-8")
+    assert not re.search(r"""(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{""", text)
+
+
+@pytest.mark.parametrize("name", ["pyvista", "vtkmodules", "matplotlib", "PIL", "jinja2"])
+def test_a_page_needs_nothing_that_draws(tmp_path, name):
+    path = write_ball(tmp_path / "x.h5", surface=True)
+    program = "import sys; sys.modules[sys.argv.pop()] = None; from msmpetsc.cli.main import main; sys.exit(main())"
+    words = [sys.executable, "-c", program, "render", str(path), "-o", str(tmp_path / "x.html")]
+    done = subprocess.run(
+        [*words, "--colour", "speed", name], env=ENVIRONMENT, capture_output=True, text=True, timeout=40
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_title_cannot_end_the_script(tmp_path):
+    evil = "</script><script>document.title = 1</script>"
+    path = written_page(tmp_path, scene=f'title = "{evil}"\n{BARE}')
+    text = path.read_text(encoding="utf-8")
+    assert evil not in text and data_of(path)["title"] == evil
+
+
+def test_colours_come_out_as_shares_of_the_scale(tmp_path):
+    data = data_of(written_page(tmp_path, "--colour", "displacement"))
+    shares = np.cumsum(stream(data, "colours").reshape(len(HEIGHTS), -1).astype(int), axis=0) % 256
+    assert (shares[0] == 0).all() and shares.max() == 255
+    assert data["legend"][0]["kind"] == "bar" and data["legend"][0]["text"] == "displacement [mm]"
+
+
+def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, caplog):
+    whole = sum(len(text) for text in data_of(written_page(tmp_path))["streams"].values())
+    monkeypatch.setattr(page, "MOST", 0.9 * whole)
+    with caplog.at_level(logging.INFO, logger="msmpetsc"):
+        data = data_of(written_page(tmp_path))
+    assert data["frames"][0] == 0 and data["frames"][-1] == 10 and 2 < len(data["frames"]) < 11
+    assert f"has {len(data['frames'])} of the 11 frames" in caplog.text
+
+
+def test_anchored_points_are_free_after_their_stop(tmp_path):
+    led = "[[anchor]]\nregion = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }\nstop = 0.5\n"
+    led += "path = [{ time = 1.0, by = [0, 0, 1] }]\n"
+    data = data_of(written_page(tmp_path, scene=BARE + led))
+    assert data["fixed"] == [0] * 5 + [1] * 6
+    first, second = stream(data, "fixed").reshape(2, -1)
+    assert set(first) == {0, 255} and not second.any()
+
+
+# In a browser
+
+
+def seen(path: Path, address: str) -> np.ndarray:
+    """What a browser shows of a page at an address, (h, w, 3)."""
+    picture = path.with_suffix(".seen.png")
+    words = [CHROMIUM, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    words += ["--hide-scrollbars", "--window-size=600,700", "--virtual-time-budget=4000", f"--screenshot={picture}"]
+    subprocess.run([*words, f"{path.as_uri()}#{address}"], capture_output=True, timeout=50, check=True)
+    return np.array(Image.open(picture).convert("RGB")).astype(int)[60:-120]  # between header and player
+
+
+@in_browser
+@pytest.mark.timeout(120)
+def test_an_address_is_a_frame_and_a_turn(tmp_path):
+    """The ball falls between two frames, and its dark side turns away."""
+    path = written_page(tmp_path, "--eye", "1,0,0", scene=BARE + EAST_HELD)
+    start, fallen, turned = (seen(path, address) for address in ("frame=0", "frame=3", "frame=0&turn=180,0"))
+    rows = [np.flatnonzero(picture.min(axis=2).min(axis=1) < 200) for picture in (start, fallen)]
+    metre = np.ptp(rows[0]) / 0.2  # pixels, of the ball's 0.2 m
+    assert rows[1].mean() - rows[0].mean() == pytest.approx(0.4 * metre, rel=0.05)
+    dark = [(picture[..., 0] < 58).sum() for picture in (start, turned)]
+    assert dark[0] > 1000 and dark[1] < 0.05 * dark[0]
+
+
+@in_browser
+def test_a_page_that_cannot_be_read_says_so(tmp_path):
+    path = written_page(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r'"positions":"[^"]{40}', '"positions":"', text), encoding="utf-8")
+    words = [CHROMIUM, "--headless=new", "--no-sandbox", "--virtual-time-budget=3000", "--dump-dom", path.as_uri()]
+    page_text = subprocess.run(words, capture_output=True, text=True, timeout=50).stdout
+    assert "This page cannot be shown" in page_text.split("<script")[0]

@@ -1,0 +1,105 @@
+"""Obstacles that are meshes: drawn where they are at a time, from what the result holds of them."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from ball_result import BARE, HEIGHTS, write_ball
+from PIL import Image
+from test_page import data_of, in_browser, seen
+
+from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.commands import render as command
+from msmpetsc.errors import InputError
+from msmpetsc.results.reader import Result
+from msmpetsc.view import sheet
+from msmpetsc.view.drawable import solids_of
+
+STATUE = """
+picture.eye = [0, -1, 0]
+[[obstacle]]
+shape = "plane"
+point = [0, 0, -9]
+normal = [0, 0, 1]
+[[obstacle]]
+shape = "mesh"
+mesh.source = "statue.ply"
+path = [{ time = 1.0, by = [0, 0, -0.4] }]
+stop = 0.95
+"""
+LOW, HIGH = np.array([0.15, -0.05, 0.45]), np.array([0.25, 0.05, 0.55])  # to the right of the ball [m]
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """The ball, and beside it a cube that sinks with it, slower."""
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + STATUE)
+    cube = trimesh.creation.box(bounds=[LOW, HIGH])
+    with h5py.File(path, "r+", libver="earliest") as file:
+        file["obstacle/points"], file["obstacle/triangles"] = cube.vertices, cube.faces
+        file["obstacle/number"] = np.ones(len(cube.faces), "i4")
+    return path
+
+
+def right_of_the_ball(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rows and columns of what is drawn a diameter and more right of the ball's left end, and the ball's diameter."""
+    rows, columns = np.nonzero(picture.min(axis=2) < 230)
+    left = columns.min()
+    # ball from 0 to 0.2 m, cube from 0.25 to 0.35 m
+    metre = (columns.max() - left) / 0.35
+    cube = columns > left + 0.225 * metre
+    return rows[cube], columns[cube], metre
+
+
+def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path, monkeypatch):
+    panels: list[sheet.Panel] = []
+    draw = sheet.draw
+    monkeypatch.setattr(sheet, "draw", lambda given, *rest: (panels.extend(given), draw(given, *rest))[1])
+    sheet.contact_sheet(result, result.with_suffix(".png"), frames=[0, 5, 10])
+    first, middle, last = (panel.overlays.shapes for panel in panels)
+    assert [shape[0].number for shape in (first, middle)] == [1, 1] and last == []
+    np.testing.assert_allclose(middle[0].by, [0, 0, -0.2])
+    np.testing.assert_allclose(middle[0].seen[[0, 7]], np.array([LOW, HIGH]) - [0, 0, 0.2])
+    picture = np.array(Image.open(result.with_suffix(".png")).convert("RGB")).astype(int)
+    bodies = np.array_split(picture[: picture.shape[0] * 3 // 4], 3, axis=1)  # without the captions
+    wide = [np.ptp(np.nonzero(body.min(axis=2) < 230)[1]) for body in bodies]
+    assert wide[0] == pytest.approx(1.75 * wide[2], rel=0.05)  # 0.35 m, and the ball alone 0.2 m
+
+
+@in_browser
+@pytest.mark.timeout(120)
+def test_a_page_has_it_once_and_moves_it(result: Path):
+    path = result.with_suffix(".html")
+    assert command.run(parsed(["render", str(result), "-o", str(path), "--eye", "0,-1,0"])) == 0
+    data = data_of(path)
+    assert len(data["solids"]["1"]["corners"]) == 9 * 12
+    assert [len(state["shapes"]) for state in data["overlays"]["states"]] == [1] * 10 + [0]
+    rows, columns, metre = right_of_the_ball(seen(path, "frame=0"))
+    assert np.ptp(rows) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(columns) == pytest.approx(
+        0.1 * metre, rel=0.1
+    )
+    sunk = right_of_the_ball(seen(path, "frame=5"))[0]
+    assert sunk.mean() - rows.mean() == pytest.approx(0.2 * metre, rel=0.1)
+
+
+DAMAGE = {
+    "obstacle/triangles names what is not among its 8 points": ("triangles", lambda old: old + 1),
+    "the surfaces of its obstacles are none": ("points", lambda old: old * np.inf),
+}
+
+
+@pytest.mark.parametrize("said", DAMAGE)
+def test_a_damaged_one_is_refused(result: Path, said: str):
+    name, change = DAMAGE[said]
+    with h5py.File(result, "r+", libver="earliest") as file, np.errstate(all="ignore"):
+        file[f"obstacle/{name}"][...] = change(file[f"obstacle/{name}"][...])
+    with Result(result) as run, pytest.raises(InputError, match="is damaged") as refused:
+        solids_of(run)
+    assert said in str(refused.value)
+
+
+def test_a_body_is_drawn_without_any(tmp_path: Path):
+    with Result(write_ball(tmp_path / "x.h5", surface=True)) as run:
+        assert solids_of(run) == {} and len(HEIGHTS) == len(run.frames.time)

@@ -1,0 +1,124 @@
+"""The surface as it is drawn: what the points put into long edges follow, and where sharp edges part the shading."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.sparse import csr_array
+
+from msmpetsc.geometry.surface import Surface
+from msmpetsc.view.annotations import rounded
+from msmpetsc.view.camera import camera_facing
+from msmpetsc.view.colours import plain_colouring
+from msmpetsc.view.drawable import Drawable, drawable_of_surface
+from msmpetsc.view.mesh import CORNERS, drawn, split_at_edges, subdivided
+from msmpetsc.view.overlays import Overlays, Rest
+from msmpetsc.view.renderer import Panel, Renderer
+
+CELLS, H = np.array([16, 2, 2]), 1 / 16  # of a block of 1 x 1/8 x 1/8 m
+
+
+def bent(points: np.ndarray) -> np.ndarray:
+    """A beam whose end sinks by 0.3 m."""
+    return points - 0.3 * points[:, [0]] ** 2 * [0, 0, 1]
+
+
+def block() -> Drawable:
+    """A block of 12 triangles and its 64 cells, at rest and bent."""
+    box = trimesh.creation.box(bounds=[[0, 0, 0], H * CELLS])
+    points, triangles = np.array(box.vertices), np.array(box.faces)
+    nodes = np.stack(np.meshgrid(*(np.arange(n + 1) for n in CELLS), indexing="ij"), axis=-1).reshape(-1, 3)
+    low = np.stack(np.meshgrid(*(np.arange(n) for n in CELLS), indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    cells = np.ravel_multi_index(np.moveaxis(low + CORNERS, -1, 0), tuple(CELLS + 1))
+    nodes = H * nodes
+    W = csr_array((np.linalg.norm(points[:, None] - nodes, axis=2) < 1e-9).astype(float))
+    zeros = np.zeros(len(points), int)
+    return replace(
+        drawable_of_surface("block.ply", Surface(points, triangles)),
+        rest=Rest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
+        times=np.arange(2.0),
+        nodes=lambda index: bent(nodes) if index else nodes,
+        surface=lambda index: bent(points) if index else points,
+        embedding=W,
+    )
+
+
+def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
+    subject = drawn(block())
+    rest, points = subject.rest.points, subject.surface(1)
+    assert len(subject.triangles) > 12 and len(points) == len(rest)
+    longest = np.linalg.norm(rest[subject.triangles] - rest[np.roll(subject.triangles, 1, axis=1)], axis=2).max()
+    assert longest <= H * (1 + 1e-9)
+    # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell, where 12 triangles are 0.075 off
+    assert points == pytest.approx(bent(rest), abs=0.3 * H**2 / 4 + 1e-9)
+    assert subject.embedding @ subject.nodes(1) == pytest.approx(points)
+    assert subject.carry @ block().rest.points == pytest.approx(rest)
+
+
+def test_long_edges_are_divided_without_holes():
+    box = trimesh.creation.box([1, 0.3, 0.1])
+    finer = subdivided(np.array(box.vertices), np.array(box.faces), 0.07)
+    mesh = trimesh.Trimesh(finer.points, finer.triangles, process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(0.03)
+    assert mesh.edges_unique_length.max() <= 0.07 and (finer.points[:8] == box.vertices).all()
+
+
+def test_normals_are_split_at_sharp_edges_alone():
+    """A cube has three normals at each corner; a ball of fine triangles one at each point."""
+    cube, ball = trimesh.creation.box([1, 1, 1]), trimesh.creation.icosphere(subdivisions=2)
+    origin, triangles = split_at_edges(np.array(cube.vertices), np.array(cube.faces))
+    assert len(origin) == 24 and (origin[triangles] == cube.faces).all()
+    for point in range(24):
+        around = cube.face_normals[(triangles == point).any(axis=1)]
+        assert around == pytest.approx(np.tile(around[0], (len(around), 1)))
+    assert len(split_at_edges(np.array(ball.vertices), np.array(ball.faces))[0]) == len(ball.vertices)
+
+
+@pytest.mark.parametrize(("degrees", "points"), [(25, 6), (35, 8)])
+def test_an_edge_is_sharp_from_thirty_degrees_on(degrees: float, points: int):
+    """Two squares that meet at an edge of two points."""
+    angle = np.radians(degrees)
+    ends = [(-1, 0), (0, 0), (np.cos(angle), np.sin(angle))]
+    corners = np.array([(x, y, z) for x, z in ends for y in (0, 1)])
+    triangles = np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]])
+    assert len(split_at_edges(corners, triangles)[0]) == points
+
+
+def test_a_mesh_whose_triangles_share_no_points_is_drawn_smooth():
+    """As an STL has them."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    loose = Surface(np.array(ball.triangles.reshape(-1, 3)), np.arange(3 * len(ball.faces)).reshape(-1, 3))
+    assert len(np.unique(drawn(drawable_of_surface("ball.stl", loose)).triangles)) == len(ball.vertices)
+
+
+def test_pins_are_coloured_by_face():
+    """A flat strip from above, of which one end is held: two colours, and none between them."""
+    x = np.arange(6.0)
+    points = np.array([(a, b, 0) for a in x for b in (0, 1)])
+    triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
+    panel = Panel(points, np.where(points[:, 0] < 1.5, 1.0, 0.3), Overlays([], [], [], [], []), ("", ""))
+    with Renderer(300, 100, triangles) as renderer:
+        renderer.face(camera_facing(points, None, (0, 0, 1)), np.array([2.5, 0.5, 0]), 3, 6)
+        row = renderer.picture(panel)[50].astype(int)
+    colours = row[(row < 250).any(axis=1)][3:-3]  # without the rim
+    steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
+    assert len(steps) and np.ptp(steps) <= 1, "one edge, which antialiasing may widen by a pixel"
+    assert steps[0] == pytest.approx(len(colours) / 5, abs=4) and colours[0, 0] < colours[-1, 0] - 30
+
+
+def test_bodies_have_a_colour_each():
+    subject = block()
+    assert plain_colouring(subject) is None
+    halves = replace(subject.rest, body_of_point=np.repeat([0, 1], 4))
+    colouring = plain_colouring(replace(subject, rest=halves))
+    assert len(np.unique(colouring.rgb(0), axis=0)) == 2
+
+
+@pytest.mark.parametrize(
+    ("span", "texts"),
+    [((-1.08e-05, 0.3), ("0", "0.3")), ((1000.0, 1000.25), ("1000", "1000.25")), ((-0.1044, 0.2), ("-0.104", "0.2")),
+     ((0.0, 12345.0), ("0", "12300")), ((0.0, 0.0), ("0", "0"))],
+)  # fmt: skip
+def test_ends_of_axes_are_rounded_to_their_span(span: tuple[float, float], texts: tuple[str, str]):
+    assert rounded(*span) == texts

@@ -29,7 +29,7 @@ LONG = 5.0  # [s] a choice that takes as long for the whole scene is run so
 SHORTER = 4  # times, of implicit steps
 NOT_MET = 3  # exit status of a plan that is there all the same
 Setting = tuple[tuple[int | None, ...], tuple[int, ...]]
-STUDIES: dict[str, Setting] = {  # for each of ERRORS: the first frames, that are tried, and the cells of the plan's finest trial
+STUDIES: dict[str, Setting] = {  # for each of ERRORS: first frames, that are tried, and cells of the finest trial
     "armadillo_forehead": ((2, 2, 2), (1000, 4000, 8000)),
     "armadillo_leg": ((4, 2, 2), (1000, 4000, 8000)),
     "armadillo_palm": ((4, 2, 2), (1000, 4000, 8000)),

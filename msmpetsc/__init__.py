@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from msmpetsc.results.reader import Result
     from msmpetsc.scene.schema import Scene
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Frame",
     "Result",

@@ -147,7 +147,7 @@ def test_result_and_first_lines_say_whose_is_what(on_three: Path):
 
 def test_a_run_of_bodies_goes_on(folder: Path, on_three: Path, msmpetsc: Run):
     scene, part = on_three.with_name("ranks.toml"), folder / "part.h5"
-    assert msmpetsc(1, "run", scene, "-o", part, "--frames", "3").returncode == 0
+    assert msmpetsc(1, "run", scene, "-o", part, "--frames", "3", "--checkpoint-every", "3").returncode == 0
     resumed = msmpetsc(2, "run", scene, "--resume", part, "--frames", "6", "--force")
     assert resumed.returncode == 0 and "goes on after step 3" in resumed.stderr, resumed.stderr
     with package.open(part) as a, package.open(on_three) as b:

@@ -72,6 +72,7 @@ def test_what_pip_says_is_shown_where_it_fails_and_the_next_start_tries_again(cl
 def test_slow_tests_are_run_where_they_are_chosen(tmp_path: Path, words: tuple, run: str):
     (tmp_path / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "conftest.py", tmp_path / "tests")
+    (tmp_path / "tests" / "helpers").symlink_to(ROOT / "tests" / "helpers")
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     quick, slow = "def test_1():\n    pass\n", "@pytest.mark.slow\ndef test_2():\n    pass\n"
     (tmp_path / "tests" / "test_a.py").write_text(f"import pytest\n\n\n{quick}\n\n{slow}")

@@ -23,6 +23,13 @@ PATHS = os.pathsep.join(
 )  # petsc4py may be found by it
 ENVIRONMENT = {**os.environ, **AS_ROOT, "PYTHONPATH": PATHS, "OMP_NUM_THREADS": "1", **SHARED_CORES, **ONE_MACHINE}
 
+# three minutes: a file of each room, what any change may break
+SMOKE = {
+    "test_cages", "test_contact", "test_export", "test_fill_fractions", "test_keys", "test_lattice",
+    "test_layers", "test_open", "test_process", "test_python", "test_scene", "test_sheet", "test_springs",
+    "test_static", "test_step", "test_writer",
+}  # fmt: skip
+
 Run = Callable[..., subprocess.CompletedProcess]
 
 
@@ -31,6 +38,13 @@ def pytest_configure(config: pytest.Config) -> None:
     options = config.option
     if config.args_source is not config.ArgsSource.ARGS and not options.markexpr and not options.keyword:
         options.markexpr = "not slow"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of a few files as smoke, so that `-m smoke` means them."""
+    for item in items:
+        if item.path.stem in SMOKE and not item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.smoke)
 
 
 def run(ranks: int, *arguments: object, timeout: float = 120) -> subprocess.CompletedProcess:

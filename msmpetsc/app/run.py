@@ -235,8 +235,6 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
     Returns the number of frames of the steps taken so far.
     """
     write_model(comm, file, model)
-    if plan.interval.frames:
-        simulation.forget_at(plan.interval.frames)
     if plan.resumed:
         plan.resumed.restore(comm, file, simulation)
     lattice, embedding = model.lattice, model.embedding

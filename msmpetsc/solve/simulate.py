@@ -37,7 +37,7 @@ from msmpetsc.solve.recovery import ROBUST, Recovery
 from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 
-REMEMBERED = 20  # steps between checkpoints, at most: what steps know of those before is forgotten there
+REMEMBERED = 20  # steps between checkpoints: what steps know of those before is forgotten there
 
 
 def solvers_of(scene: Scene, probes: Probes) -> dict[str, tuple[Preset, int]]:
@@ -118,7 +118,7 @@ class Simulation:
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
         self.time_error = np.nan  # estimated, of the trajectory so far
-        self._remembered, self._saved = REMEMBERED, Checkpoint()
+        self._saved = Checkpoint()
 
     def frames(self) -> Iterator[Frame]:
         """Yield frame 0, then one frame for every ``every``-th step and for the last (collective).
@@ -170,7 +170,7 @@ class Simulation:
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
         frame = self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
-        if index % self._remembered == 0 or (self.rest and self.rest.has_come and index == self.steps):
+        if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
             self._saved = self._save()
         return frame
 
@@ -185,10 +185,6 @@ class Simulation:
 
     def _overlaps(self, index: int, time: float) -> None:
         self.monitors.overlaps(index, self.environment, self.state.q, time, self.time_step)
-
-    def forget_at(self, frames: int) -> None:
-        """Let the run go on from every so many frames, where that is more often than every ``REMEMBERED``-th step."""
-        self._remembered = min(REMEMBERED, frames * self.every)
 
     def saved(self) -> Checkpoint:
         """The last step that the run may go on from: every ``REMEMBERED``-th, and that of a body at rest."""

@@ -116,8 +116,9 @@ def test_one_body_of_several_is_the_same_as_a_mesh(folder: Path, number: int):
 @pytest.fixture(scope="module")
 def on_three(folder: Path) -> Path:
     """The result of all bodies on three ranks, whose standard error lies beside it."""
-    path = write(folder, "ranks", body=BODIES, solver={"preset": "newton-multigrid", "error": 1e-10})
-    done = run(3, "-m", "msmpetsc", "run", path, "-o", folder / "three.h5", "--frames", "6")
+    tables = {"time": {"step": 0.0025, "duration": 0.25}, "output": {"every": 4}}
+    path = write(folder, "ranks", body=BODIES, solver={"preset": "newton-multigrid", "error": 1e-10}, **tables)
+    done = run(3, "-m", "msmpetsc", "run", path, "-o", folder / "three.h5", "--frames", "24")
     assert done.returncode == 0, done.stderr
     (folder / "three.log").write_text(done.stderr)
     return folder / "three.h5"
@@ -147,9 +148,9 @@ def test_result_and_first_lines_say_whose_is_what(on_three: Path):
 
 def test_a_run_of_bodies_goes_on(folder: Path, on_three: Path, msmpetsc: Run):
     scene, part = on_three.with_name("ranks.toml"), folder / "part.h5"
-    assert msmpetsc(1, "run", scene, "-o", part, "--frames", "3", "--checkpoint-every", "3").returncode == 0
-    resumed = msmpetsc(2, "run", scene, "--resume", part, "--frames", "6", "--force")
-    assert resumed.returncode == 0 and "goes on after step 3" in resumed.stderr, resumed.stderr
+    assert msmpetsc(1, "run", scene, "-o", part, "--frames", "20").returncode == 0
+    resumed = msmpetsc(2, "run", scene, "--resume", part, "--frames", "24", "--force")
+    assert resumed.returncode == 0 and "goes on after step 20" in resumed.stderr, resumed.stderr
     with package.open(part) as a, package.open(on_three) as b:
         compared = compare(a, b, ["position", "surface"])
         assert len(compared.times) == 7 and all(field.first_above(1e-7) is None for field in compared.fields)

@@ -25,7 +25,7 @@ SCENES = Path(__file__).parents[1] / "scenes"
 PAPER_CELLS = {"armadillo": 8338, "dragon": 11536, "lung": 6499, "heart": 3126, "bunny": 9946, "brain": 13661}
 TOUCHING_CELLS = {"two_bunnies": 1500, "pile": 1000, "armadillo_fold": 3000}  # of scenes that are not the paper's
 ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
-pytestmark = pytest.mark.timeout(400)
+pytestmark = pytest.mark.timeout(450)
 
 
 class Result:
@@ -82,7 +82,7 @@ def result(tmp_path_factory):
         skip_without_mesh(name)
         path = folder / f"{name}{len(list(folder.iterdir()))}.h5"
         command = ("-m", "msmpetsc.cli.main", "run", SCENES / f"{name}.toml", "-o", path)
-        done = run(ranks, *command, "--set", "cages.count=1000", *options, timeout=300)
+        done = run(ranks, *command, "--set", "cages.count=1000", *options, timeout=400)
         assert done.returncode == 0 or (may_fail and done.returncode == 3), done.stderr
         return Result(path)
 

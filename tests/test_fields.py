@@ -33,4 +33,4 @@ def test_the_table_for_people_has_each_field_once():
 
 
 def test_the_documentation_has_this_very_table():
-    assert markdown_table() in (ROOT / "msmpetsc" / "output" / "README.md").read_text()
+    assert markdown_table() in (ROOT / "msmpetsc" / "results" / "README.md").read_text()

@@ -100,7 +100,7 @@ def test_a_step_that_fails_raises_and_leaves_the_frames_before_it(scene: Path, t
 
 
 def test_an_interrupt_raises_and_the_run_goes_on(scene: Path, tmp_path: Path, monkeypatch):
-    from test_signals import signal_after
+    from stopped_runs import signal_after
 
     with monkeypatch.context() as patch:
         signal_after(patch, 2, signal.SIGINT)

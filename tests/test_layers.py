@@ -5,14 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from house import HEIGHT
 
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
-LAYERS = [
-    {"errors"}, {"scene", "comm", "backend", "extensions", "fields", "checkpoint"}, {"geometry"}, {"lattice"},
-    {"elasticity"}, {"constraints"}, {"contact"}, {"build"}, {"environment"}, {"solve"}, {"results"},
-    {"view", "export"}, {"app"}, {"study"}, {"cli", "__main__"},
-]  # fmt: skip
-HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
 ONLY_IN = {"petsc4py": {"solve", "app", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
 NEVER = {
     ("results", "solve"),

@@ -66,7 +66,7 @@ class RunPlan:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunEnd:
     """How the steps of a run ended: at its last step, by a signal, or by a step that failed."""
 
     simulation: Simulation
@@ -98,7 +98,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, k
     return RunPlan(request, scene, probes, interval, resumed, attributes, began, kernels_are_new)
 
 
-def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
+def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
     """Build the model and take its steps; after each, call the observers (collective)."""
     failure = None
     with (
@@ -127,26 +127,26 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> Outcome:
         except StepFailed as error:
             failure = error  # the frames before it are worth a look
         file.close(trim=not checkpoints.signal)
-    return Outcome(simulation, file, cost, checkpoints.signal, failure)
+    return RunEnd(simulation, file, cost, checkpoints.signal, failure)
 
 
-def finish(comm: MPI.Intracomm, plan: RunPlan, outcome: Outcome, started: float) -> int:
+def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) -> int:
     """Write what stands beside the result and say how the run ended; return the exit status (collective).
 
     started : count of perf_counter at the start of the command [s]
 
     Raises the StepFailed that ended the run.
     """
-    request, simulation = plan.request, outcome.simulation
+    request, simulation = plan.request, ended.simulation
     if request.measured:
-        outcome.cost.write(request.measured, request.command, outcome.failure)
-    on_root(comm, lambda: write_companions(request, outcome.is_whole))
-    left = files_of(request, outcome.is_whole)
-    on_root(comm, lambda: log_end(outcome.file.finished, perf_counter() - started, outcome.cost.setup, left))
-    if outcome.failure:
-        raise outcome.failure
-    if outcome.signal:
-        return tell_stop(outcome.signal, request.path, simulation)
+        ended.cost.write(request.measured, request.command, ended.failure)
+    on_root(comm, lambda: write_companions(request, ended.is_whole))
+    left = files_of(request, ended.is_whole)
+    on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
+    if ended.failure:
+        raise ended.failure
+    if ended.signal:
+        return tell_stop(ended.signal, request.path, simulation)
     simulation.refuse_unused_options(at_end=True)
     return 0
 

@@ -24,9 +24,13 @@ SERVER.set_forkserver_preload(
 class Forked:
     """``msmpetsc`` with these arguments, in a session of its own; used as subprocess.Popen is."""
 
-    def __init__(self, arguments: Sequence[str], log: Path, environment: Mapping[str, str]):
-        """Start the run; its output goes to ``log``, and it has this environment alone."""
-        self.process = SERVER.Process(target=_run, args=(list(arguments), str(log), dict(environment)), daemon=True)
+    def __init__(self, arguments: Sequence[str], log: Path, environment: Mapping[str, str], errors: Path | None = None):
+        """Start the run, here; its output goes to ``log``, its errors to ``errors`` where that is another file.
+
+        environment : all that it has
+        """
+        where = (str(log), str(errors or log), os.getcwd())
+        self.process = SERVER.Process(target=_run, args=(list(arguments), where, dict(environment)), daemon=True)
         self.process.start()
         self.pid = int(self.process.pid or 0)
 
@@ -46,13 +50,14 @@ class Forked:
         self.process.kill()
 
 
-def _run(arguments: list[str], log: str, environment: Mapping[str, str]) -> None:
+def _run(arguments: list[str], where: tuple[str, str, str], environment: Mapping[str, str]) -> None:
+    *files, folder = where
     os.setsid()
     for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
         signal.signal(number, signal.SIG_DFL)
-    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(out, 1)
-    os.dup2(out, 2)
+    for stream, path in enumerate(files, 1):  # standard output and error
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+    os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
     from mpi4py import MPI

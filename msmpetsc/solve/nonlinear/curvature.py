@@ -43,7 +43,7 @@ class Alarm(IntEnum):
     HERE = 2
 
 
-class Effort(NamedTuple):
+class SearchEffort(NamedTuple):
     """block: directions of a long search; least: its iterations where it finds nothing; followed: iterations of a short
     one, of two directions."""
 
@@ -52,9 +52,10 @@ class Effort(NamedTuple):
     followed: int
 
 
-EFFORT = Effort(4, 12, 2)
-UNIFORM_EFFORT = Effort(2, 3, 1)  # with multigrid smooth modes come at once; but not where something is alarming: one
-# bent by 270 degrees had a lowest curvature of 0.04, and seemed to have 0.35
+EFFORT = SearchEffort(4, 12, 2)
+# With multigrid smooth modes come at once. But not where something is alarming: one bent by 270 degrees had a lowest
+# curvature of 0.04, and seemed to have 0.35.
+UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class LowestCurvature:
         self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
 
     @property
-    def effort(self) -> Effort:
+    def effort(self) -> SearchEffort:
         """Effort that a search takes with this preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
@@ -159,7 +160,9 @@ class LowestCurvature:
         direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(self, q: np.ndarray, hint: PETSc.Vec | None, effort: Effort) -> tuple[np.ndarray, np.ndarray]:
+    def _search_at_length(
+        self, q: np.ndarray, hint: PETSc.Vec | None, effort: SearchEffort
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
         rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
         of all of them."""

@@ -10,25 +10,18 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 LINE = "msmpetsc: %(levelname)s: %(message)s"
-
-
-class TimedFormatter(logging.Formatter):
-    """Formats a line of the log with the seconds since the program started."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        record.levelname = f"{record.levelname} [{record.relativeCreated / 1000:.2f} s]"
-        return super().format(record)
+TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
 
 
 @contextmanager
 def logged_on_root(comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
-    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with the seconds since the start."""
+    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with the milliseconds since the start."""
     log = logging.getLogger("msmpetsc")
     before = log.handlers, log.level
     logging.addLevelName(logging.WARNING, "warning")
     logging.addLevelName(logging.INFO, "note")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter((TimedFormatter if timed else logging.Formatter)(LINE))
+    handler.setFormatter(logging.Formatter(TIMED if timed else LINE))
     log.handlers = [handler]
     log.setLevel(level if comm.rank == 0 else logging.CRITICAL)
     try:

@@ -24,10 +24,10 @@ if TYPE_CHECKING:  # imports PETSc, which must first be given its options
 
 
 class Cost:
-    """What a run costs, summed as an observer of its steps.
+    """What a run costs, summed frame by frame.
 
     setup    : seconds until the first step
-    output   : seconds that observers take: frames and checkpoints are written in them
+    output   : seconds in which frames and checkpoints are written
     stepping : seconds of the steps
     products : with the Hessian
     """
@@ -49,12 +49,10 @@ class Cost:
             yield
         self.output += perf_counter() - began
 
-    def after_step(self, frame: Frame | None) -> bool:
+    def count(self, frame: Frame) -> None:
         """Count the steps since the frame before."""
-        if frame:
-            self.stepping += frame.wall_time
-            self.products += frame.products
-        return False
+        self.stepping += frame.wall_time
+        self.products += frame.products
 
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""

@@ -5,12 +5,12 @@ and the table of options in README.
 """
 
 import inspect
-import operator
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import partial, wraps
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, ParamSpec, TypeVar, cast
 
@@ -118,8 +118,8 @@ class RunRequest:
             value = getattr(self, name)
             if isinstance(value, str | os.PathLike) and option.kind in (checked_path, checked_file):
                 option.kind(os.fspath(value))
-            if option.kind is int and value is not None:
-                _refuse_other_than_whole(name, value)
+            if option.kind is int and not isinstance(value, Integral | None):  # Python alone can give it
+                raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
             if option.choices and value not in (None, *option.choices):
                 raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
@@ -141,11 +141,11 @@ class RunRequest:
     @property
     def made(self) -> tuple[Path, Mapping[str, Any]] | None:
         """Folder and tables of the scene, if that is no file."""
-        if self.scene is None or isinstance(self.scene, str | os.PathLike):
+        if self.scene is None or self.file:
             return None
         if isinstance(self.scene, Mapping):
             return Path(), self.scene
-        return self.scene.folder, toml_of(self.scene.text)
+        return cast("Scene", self.scene).folder, toml_of(cast("Scene", self.scene).text)
 
     @property
     def path(self) -> Path:
@@ -193,14 +193,6 @@ def flag_of(name: str) -> str:
 
 OPTIONS: dict[str, Option] = {field.name: cast(Any, field.type).__metadata__[0] for field in fields(RunRequest)}
 FLAGS = [flag_of(name) for name, option in OPTIONS.items() if name != "scene" and not option.python]
-
-
-def _refuse_other_than_whole(name: str, value: Any) -> None:
-    """Raise InputError for what is no whole number: Python alone can give it."""
-    try:
-        operator.index(value)
-    except TypeError:
-        raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}") from None
 
 
 def asked_by(request: Callable[P, RunRequest]) -> Callable[[Callable[[Callable[[], RunRequest]], T]], Callable[P, T]]:

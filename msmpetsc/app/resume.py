@@ -2,7 +2,8 @@
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,41 +45,29 @@ def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
     if request.scene is not None and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None  # the first start of a job that may be started again
-    return comm.bcast(on_root(comm, lambda: _examined(path)))
-
-
-def _examined(path: Path) -> Earlier:
-    """Look at the file of an earlier run, on one rank. Raises InputError for what is no result, or a damaged one."""
-    refuse_deadly(path)
-    return Earlier.read(path)
+    on_root(comm, lambda: refuse_deadly(path))
+    return comm.bcast(on_root(comm, lambda: Earlier.read(path)))
 
 
 def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
-    """Return the request with what the earlier run was asked for and this one is not. Raises InputError."""
+    """Return the request with what the earlier run was asked for and this one is not.
+
+    Of PETSc's options that are those with an effect on results. Raises InputError for an option that could do more
+    than choose a solver, and is not given again: the file may be from anywhere.
+    """
     if earlier is None:
         return request
-    words = request.petsc_words
-    true_error = request.true_error or earlier.true_error or None
-    return replace(request, petsc_options=shlex.join([*options_to_keep(earlier, words), *words]), true_error=true_error)
-
-
-def options_to_keep(earlier: Earlier, given: Sequence[str]) -> Iterator[str]:
-    """Yield PETSc's options of the earlier run as words, less those without effect on results.
-
-    given : words of the options of this run
-
-    Raises InputError for an option that could do more than choose a solver, and is not given again: the file may be
-    from anywhere.
-    """
+    given, kept = request.petsc_words, []
     for name, value in _stored(earlier).items():
-        words = [f"-{name}", value] if value else [f"-{name}"]
+        words = [f"-{name}", *filter(None, [value])]
         if name in options_of(given) or OF_NO_EFFECT.search(name):
             continue
         if unsafe_word(words):
-            raise InputError(
-                f"{earlier.path} was run with {' '.join(words)}, which is not taken from a file: give it again"
-            )
-        yield from words
+            told = f"{earlier.path} was run with {' '.join(words)}"
+            raise InputError(f"{told}, which is not taken from a file: give it again")
+        kept += words
+    true_error = request.true_error or earlier.true_error or None
+    return replace(request, petsc_options=shlex.join([*kept, *given]), true_error=true_error)
 
 
 def _stored(earlier: Earlier) -> dict[str, str]:
@@ -105,25 +94,16 @@ def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes:
 
     The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
     """
-    given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
-    unknown = {
-        keys: name
-        for keys, name in scene.named_files()
-        if name not in MODELS
-        and (file.parent / name).resolve().parent != earlier.path.resolve().parent
-        and not any(tuple(map(str, keys))[: len(own)] == own for own in given)
-    }
-    if not unknown:
-        return
-    try:
-        known = {name for _, name in load_scene(file).named_files()}
-    except InputError:
-        known = set()
-    for keys, name in unknown.items():
-        if name not in known:
+    given, known = [tuple(change.partition("=")[0].strip().split(".")) for change in changes], set(MODELS)
+    with suppress(InputError):
+        known |= {name for _, name in load_scene(file).named_files()}
+    for path, name in scene.named_files():
+        keys = tuple(map(str, path))
+        lies_beside = (file.parent / name).resolve().parent == earlier.path.resolve().parent
+        if not (name in known or lies_beside or any(keys[: len(own)] == own for own in given)):
             raise InputError(
                 f"{earlier.path} names {as_given(name)}, and {as_given(str(file))} does not: name the SCENE too, "
-                f"or --set {'.'.join(map(str, keys))}=PATH"
+                f"or --set {'.'.join(keys)}=PATH"
             )
 
 
@@ -140,8 +120,7 @@ class Resumed:
         self.differs = list(self._differences(scene, options))
         if self.differs and not force:
             raise InputError("\n".join([*self.differs, "--force goes on all the same"]))
-        fixed = [line for line in self.differs if line.startswith(FIXED)]
-        if fixed:
+        if fixed := [line for line in self.differs if line.startswith(FIXED)]:
             raise InputError("\n".join([*fixed, "that cannot change within a file"]))
         if (version := earlier.texts.get("msmpetsc_version")) != __version__:
             log.warning(
@@ -155,16 +134,13 @@ class Resumed:
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier
+        was, now = _with_an_effect(_stored(earlier)), _with_an_effect(options)
         if "scene" in earlier.texts:
-            was = flat(scene_of(earlier.path, earlier.texts["scene"], to_read=False))
-            now = flat(scene)
-            for key in sorted(was.keys() | now.keys()):
-                if was.get(key) != now.get(key):
-                    yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
-        was = _stored(earlier)
-        for name in sorted(was.keys() | options.keys()):
-            if was.get(name) != options.get(name) and not OF_NO_EFFECT.search(name):
-                yield f"-{name}: {_shown(was.get(name))} in {earlier.path}, {_shown(options.get(name))} now"
+            was |= flat(scene_of(earlier.path, earlier.texts["scene"], to_read=False))
+            now |= flat(scene)
+        for key in sorted(was.keys() | now.keys()):
+            if was.get(key) != now.get(key):
+                yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
 
     def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
@@ -187,12 +163,14 @@ class Resumed:
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
         path, saved = self.earlier.path, read_checkpoint(comm, self.earlier.path, simulation.model.lattice.owned)
-        if saved is not None and saved.step >= simulation.steps:
-            raise InputError(f"{path} has come to step {saved.step} already: it cannot end at step {simulation.steps}")
-        kept = 0 if saved is None else simulation.stored_until(saved.step)
-        if kept > self.earlier.finished:
-            raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
+        kept = 0
         if saved is not None:
+            if saved.step >= simulation.steps:
+                end = f"it cannot end at step {simulation.steps}"
+                raise InputError(f"{path} has come to step {saved.step} already: {end}")
+            kept = simulation.stored_until(saved.step)
+            if kept > self.earlier.finished:
+                raise InputError(f"{path} is damaged: it lacks frames of before its checkpoint")
             is_frame = (kept - 1) * simulation.every == saved.step
             on_root(comm, lambda: refuse_unlike_frame(path, kept - 1, is_frame))
         if self.differs:  # later frames are of how it was
@@ -210,13 +188,18 @@ def flat(scene: Scene) -> dict[str, Any]:
 
 
 def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    items: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, dict) else ()
     if isinstance(value, (list, tuple)) and any(isinstance(item, dict) for item in value):
-        items = enumerate(value)
-    for key, inner in items:
-        yield from _leaves(f"{name}.{key}" if name else str(key), inner)
-    if not isinstance(value, dict) and not items:
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
         yield name, value
+        return
+    for key, inner in value.items():
+        yield from _leaves(f"{name}.{key}".lstrip("."), inner)
+
+
+def _with_an_effect(options: dict[str, str]) -> dict[str, Any]:
+    """Return PETSc's options that have an effect on results, by what stands on the command line."""
+    return {f"-{name}": value for name, value in options.items() if not OF_NO_EFFECT.search(name)}
 
 
 def _shown(value: Any) -> str:

@@ -1,7 +1,10 @@
 """A run, once PETSc has its options: prepared, its output opened, its steps taken and observed, its files finished."""
 
+import logging
 import shlex
+from contextlib import closing
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 
@@ -9,16 +12,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc import __version__
+from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
 from msmpetsc.app.failure import ending_together
-from msmpetsc.app.observers import (
-    Callback,
-    Checkpoints,
-    FrameWriter,
-    Interval,
-    Observer,
-    ProgressLine,
-    Signals,
-)
 from msmpetsc.app.profile import Cost, refuse_unwritable, versions
 from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
@@ -28,6 +23,7 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.results.constant_parts import write_model
+from msmpetsc.results.progress import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.results.xdmf import write_xdmf
@@ -45,9 +41,8 @@ from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 class RunPlan:
     """What a run does, once its request is understood.
 
-    began           : count of perf_counter when that began [s]
-    attributes      : what the file says of the run that made it
-    kernels_are_new : whether numba's cache was empty
+    attributes : what the file says of the run that made it
+    began      : count of perf_counter when that began [s]
     """
 
     request: RunRequest
@@ -57,12 +52,6 @@ class RunPlan:
     resumed: Resumed | None
     attributes: dict[str, str | int]
     began: float
-    kernels_are_new: bool
-
-    @property
-    def is_done(self) -> bool:
-        """Whether the file has all frames already."""
-        return self.resumed is not None and self.resumed.is_done
 
 
 @dataclass(frozen=True)
@@ -81,7 +70,7 @@ class RunEnd:
         return not self.signal and self.failure is None
 
 
-def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, kernels_are_new: bool) -> RunPlan:
+def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
     """Read the scene, and raise InputError for what can be refused before there is a model (collective)."""
     refuse_early(comm, FLAGS)
     choose(comm, request.device)
@@ -95,14 +84,14 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, k
     on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
-    return RunPlan(request, scene, probes, interval, resumed, attributes, began, kernels_are_new)
+    return RunPlan(request, scene, probes, interval, resumed, attributes, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
-    """Build the model and take its steps; after each, call the observers (collective)."""
+    """Build the model and take its steps; after each, keep its frame and a checkpoint that is due (collective)."""
     failure = None
     with (
-        compilation_logged(plan.kernels_are_new),
+        compilation_logged(),
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
@@ -112,17 +101,21 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
             with ending_together(comm):
                 simulation.refuse_unused_options()
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
-                frames = start_output(comm, plan, file, model, simulation)
+                numbers = count(start_output(comm, plan, file, model, simulation))
                 checkpoints = Checkpoints(file, simulation, plan.interval, signals)
+                is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
-                with ProgressLine.shown(comm, simulation.steps) as progress:
-                    observers: list[Observer] = [FrameWriter(file, frames), progress, checkpoints, cost]
-                    observers += [Callback(plan.request.on_frame)] if plan.request.on_frame else []
+                with closing(Progress(simulation.steps, is_shown)) as progress:
+                    observers = [cost.count, progress.update, *filter(None, [plan.request.on_frame])]
                     signals.begin()
                     for frame in simulation.advance():
                         with cost.of_output():
-                            stops = [observer.after_step(frame) for observer in observers]
-                        if any(stops):
+                            if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some
+                                file.append(frame)
+                            stops = checkpoints.after_step(frame is not None)
+                            for see in observers if frame is not None else ():
+                                see(frame)
+                        if stops:
                             break
         except StepFailed as error:
             failure = error  # the frames before it are worth a look
@@ -140,8 +133,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     request, simulation = plan.request, ended.simulation
     if request.measured:
         ended.cost.write(request.measured, request.command, ended.failure)
-    on_root(comm, lambda: write_companions(request, ended.is_whole))
-    left = files_of(request, ended.is_whole)
+    left = write_companions(comm, request, ended.is_whole)
     on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, ended.cost.setup, left))
     if ended.failure:
         raise ended.failure
@@ -151,14 +143,14 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     return 0
 
 
-def tell_done(comm: MPI.Intracomm, plan: RunPlan) -> int:
+def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int:
     """Finish the files of a run that has all its frames; return the exit status (collective)."""
-    on_root(comm, lambda: write_companions(plan.request, whole=True))
-    earlier = plan.resumed.earlier if plan.resumed else None
-    if earlier and earlier.finished < plan.scene.stored:
-        log.info("%s came to rest after step %d: nothing left to do", plan.request.path, earlier.step)
+    write_companions(comm, request, whole=True)
+    earlier = resumed.earlier
+    if earlier.finished < resumed.stored:
+        log.info("%s came to rest after step %d: nothing left to do", request.path, earlier.step)
     else:
-        log.info("%s has all its %d frames: nothing left to do", plan.request.path, plan.scene.stored)
+        log.info("%s has all its %d frames: nothing left to do", request.path, resumed.stored)
     return 0
 
 
@@ -167,20 +159,15 @@ def tell_done(comm: MPI.Intracomm, plan: RunPlan) -> int:
 
 def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     """Read the scene with what the request changes; --set comes last and wins."""
-
-    def changed(changes: list[str]) -> Scene:
-        if request.made is not None:
-            return scene_in(*request.made, changes)
-        if request.file is not None:
-            return load_scene(request.file, changes, preset_names())
-        assert earlier is not None  # as earlier_run sees to
-        return stored_scene(earlier, changes, preset_names())
-
     changes = request.overrides
-    scene = changed(changes)
-    if request.frames is None:
-        return scene
-    return changed([*changes, f"time.duration={request.frames * scene.time.step!r}"])
+    if request.made is not None:
+        scene = scene_in(*request.made, changes)
+    elif request.file is not None:
+        scene = load_scene(request.file, changes, preset_names())
+    else:
+        assert earlier is not None  # as earlier_run sees to
+        scene = stored_scene(earlier, changes, preset_names())
+    return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
 
 
 def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
@@ -246,18 +233,17 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
 # After the steps
 
 
-def write_companions(request: RunRequest, whole: bool) -> None:
-    """Write the XDMF file, and draw a whole run where asked. Raises InputError."""
+def write_companions(comm: MPI.Intracomm, request: RunRequest, whole: bool) -> list[Path]:
+    """Write the XDMF file, and draw a whole run where asked; return all files that it leaves, the result first.
+
+    Collective. Raises InputError.
+    """
     path = request.path
-    write_xdmf(path)
+    left = [path, path.with_suffix(".xdmf")]
+    on_root(comm, lambda: write_xdmf(path))
     if whole and request.picture:
         from msmpetsc.view.sheet import contact_sheet  # loads VTK: a second that other runs need not wait
 
-        contact_sheet(path, path.with_suffix(".png"))
-
-
-def files_of(request: RunRequest, whole: bool) -> list[Path]:
-    """List the files that a run leaves, the result first; a picture is drawn of a whole one."""
-    path = request.path
-    picture = [path.with_suffix(".png")] if request.picture and whole else []
-    return [path, path.with_suffix(".xdmf"), *picture, *([request.measured] if request.measured else [])]
+        left.append(path.with_suffix(".png"))
+        on_root(comm, lambda: contact_sheet(path, left[-1]))
+    return [*left, *filter(None, [request.measured])]

@@ -45,19 +45,17 @@ def carry_out(comm: "MPI.Intracomm", request: RunRequest) -> int:
     import numpy as np
 
     from msmpetsc.app.resume import as_before, earlier_run
-    from msmpetsc.backend.compiling import cache_is_empty
     from msmpetsc.solve.petsc.words import lent_options
 
     started = perf_counter()
     earlier = earlier_run(comm, request)
     request = as_before(request, earlier)
     with lent_options(comm, request.petsc_words), np.errstate(all="ignore"):  # a step tells of what overflows
-        kernels_are_new = cache_is_empty()
         from msmpetsc.app.run import finish, prepare, take_steps, tell_done  # PETSc, which has its options now
 
-        plan = prepare(comm, request, earlier, kernels_are_new)
-        if plan.is_done:
-            return tell_done(comm, plan)
+        plan = prepare(comm, request, earlier)
+        if plan.resumed and plan.resumed.is_done:
+            return tell_done(comm, request, plan.resumed)
         return finish(comm, plan, take_steps(comm, plan), started)
 
 

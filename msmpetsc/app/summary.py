@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from tqdm import tqdm
 
-from msmpetsc.app.observers import STATUS
+from msmpetsc.app.checkpointing import STATUS
 from msmpetsc.build import Model
 from msmpetsc.comm import log
 from msmpetsc.constraints.coverage import Reach

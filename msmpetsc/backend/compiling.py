@@ -36,7 +36,7 @@ class FirstCompilation(Listener):
 
 
 @contextmanager
-def compilation_logged(all_are_new: bool) -> Iterator[None]:
+def compilation_logged() -> Iterator[None]:
     """Log the first compilation within this block."""
-    with install_listener("numba:compile", FirstCompilation(all_are_new)):
+    with install_listener("numba:compile", FirstCompilation(cache_is_empty())):
         yield

@@ -1,24 +1,24 @@
-"""The command line parsed; options.py has the arguments of each command.
+"""The command line parsed, by the table of commands.
 
 What is imported at the top starts neither MPI nor PETSc, so that ``--help`` answers at once.
 """
 
 import argparse
+import platform
+import re
 import shlex
-import sys
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
-from msmpetsc.cli import options
-from msmpetsc.cli.options import EXAMPLES, EXAMPLES_HEAD, Commands, ExamplesKept, add_verbosity
+from msmpetsc.cli.command_table import COMMANDS, SAID, Argument, Shown
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
 TAKE_PETSC_OPTIONS = ("run",)
+EXAMPLES_HEAD = "examples:"
 
 
 def parsed(words: list[str]) -> argparse.Namespace:
@@ -83,57 +83,60 @@ class Parser(argparse.ArgumentParser):
             super()._print_message(message, file)
 
 
-class Version(argparse.Action):
-    """Print the versions and leave; PETSc and MPI are loaded only here."""
+class ExamplesKept(argparse.HelpFormatter):
+    """Formats help, and leaves the lines of examples as they are."""
 
-    def __init__(self, option_strings: list[str], dest: str, help: str):
-        super().__init__(option_strings, dest, nargs=0, help=help)
+    def _fill_text(self, text: str, width: int, indent: str) -> str:  # where argparse wraps description and epilog
+        return text if text.startswith(EXAMPLES_HEAD) else super()._fill_text(text, width, indent)
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from msmpetsc.cli.versions import library_versions
 
-        libraries = ", ".join(library_versions())
-        parser._print_message(f"msmpetsc {msmpetsc.__version__} ({libraries})\n", sys.stdout)
-        parser.exit()
+def versions_line() -> str:
+    """Return the versions of this package, PETSc, MPI and Python; what cannot be loaded says so."""
+    libraries = []
+    for name, version in {"PETSc": petsc_version, "MPI": mpi_version}.items():
+        try:
+            libraries.append(version())
+        except Exception:  # a library that is missing, or built for another: each in its own way
+            libraries.append(f"no {name}")
+    return f"msmpetsc {msmpetsc.__version__} ({', '.join(libraries)}, Python {platform.python_version()})"
+
+
+def petsc_version() -> str:
+    """Return "PETSc 3.22.4"."""
+    from petsc4py import PETSc
+
+    return f"PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}"
+
+
+def mpi_version() -> str:
+    """Return "Open MPI v5.0.7", or as much of what the library says of itself."""
+    from mpi4py import MPI
+
+    return re.split(r"[,\n\0]", MPI.Get_library_version())[0].strip()
 
 
 def command_parser() -> Parser:
-    """Make the parser of the whole program."""
+    """Make the parser of the whole program, or of one of its commands."""
     parser = Parser(prog="msmpetsc", description=msmpetsc.__doc__)
-    parser.add_argument("--version", action=Version, help="show the versions of msmpetsc, PETSc and MPI")
+    about = "show the versions of msmpetsc, PETSc and MPI"
+    parser.add_argument("--version", action=Shown, const=versions_line, help=about)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name in COMMANDS:
-        add_command(commands, name)
-    return parser
-
-
-def add_command(commands: Commands, name: str) -> Parser:
-    """Add a command with its own arguments, with those that all have, and with its examples."""
-    COMMANDS[name](commands)
-    parser = commands.choices[name]
-    add_verbosity(parser)
-    parser.epilog, parser.formatter_class = "\n  ".join((EXAMPLES_HEAD, *EXAMPLES[name])), ExamplesKept
+    for name, command in COMMANDS.items():
+        examples = "\n  ".join((EXAMPLES_HEAD, *command.examples))
+        add = commands.add_parser(
+            name, help=command.help, description=command.description, epilog=examples, formatter_class=ExamplesKept
+        )
+        for argument in command.arguments:
+            add.add_argument(*argument.names, **argument.keywords)
+        for choice in filter(None, (command.exclusive, SAID)):
+            group = add.add_mutually_exclusive_group()
+            for argument in choice:
+                group.add_argument(*argument.names, **argument.keywords)
     return parser
 
 
 def option_names(command: str) -> list[str]:
     """List the options of a command: "--preset"."""
-    return list(add_command(Parser().add_subparsers(), command)._option_string_actions)
-
-
-COMMANDS: dict[str, Callable[[Commands], None]] = {  # each is run by the module of its name
-    "new": options.add_new,
-    "run": options.add_run,
-    "inspect": options.add_inspect,
-    "study": options.add_study,
-    "plan": options.add_plan,
-    "compare": options.add_compare,
-    "render": options.add_render,
-    "export": options.add_export,
-    "check": options.add_check,
-    "fetch": options.add_fetch,
-    "keys": options.add_keys,
-    "schema": options.add_schema,
-    "doctor": options.add_doctor,
-    "completion": options.add_completion,
-}
+    known = COMMANDS[command]
+    given: tuple[Argument, ...] = (*known.arguments, *known.exclusive, *SAID)
+    return ["--help", *(name for argument in given for name in argument.names if name.startswith("-"))]

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ENVIRONMENT, ROOT, WORKERS
+from conftest import ENVIRONMENT, ROOT, WORKERS, run
 from mpi4py import MPI
 
 from msmpetsc.build import build_model, fill_cages, read_bodies
-from msmpetsc.cli.commands.inspect import largest
 from msmpetsc.cli.main import main
-from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
@@ -43,14 +41,6 @@ def scene(ball: Path, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def own_log():
-    """The command line sets up the log for its own process: afterwards it is as it was."""
-    before = log.handlers, log.level
-    yield
-    log.handlers, log.level = before
-
-
 def counted(scene: Path, cells: int, ranks: int) -> Partition:
     """What count_partition says."""
     read = load_scene(scene, [f"cages.count={cells}"])
@@ -59,40 +49,28 @@ def counted(scene: Path, cells: int, ranks: int) -> Partition:
     return count_partition(bodies, cages, build_model(SELF, read).lattice, ranks)
 
 
-def test_the_counts_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
-    ranks = 3
-    done = on_ranks(ranks, WORKER, scene, tmp_path / "held.json", "cages.count=3000")
+def assert_counts_are_those_of_real_ranks(scene: Path, cells: int, rel: float) -> None:
+    held = scene.with_name("held.json")
+    done = run(3, WORKER, scene, held, f"cages.count={cells}")
     assert done.returncode == 0, done.stderr
-    real = json.loads((tmp_path / "held.json").read_text())
-    found = counted(scene, 3000, ranks)
+    real = json.loads(held.read_text())
+    found = counted(scene, cells, 3)
     assert {name: getattr(found, name).tolist() for name in real} == real
-    assert min(real["ghosts"]) > 0 and sum(real["cells"]) == pytest.approx(3000, rel=0.01)
+    assert min(real["ghosts"]) > 0 and sum(real["cells"]) == pytest.approx(cells, rel=rel)
 
 
-def test_the_counts_of_several_bodies_are_those_of_real_ranks(on_ranks, scene: Path, tmp_path: Path):
+def test_the_counts_are_those_of_real_ranks(scene: Path):
+    assert_counts_are_those_of_real_ranks(scene, 3000, 0.01)
+
+
+def test_the_counts_of_several_bodies_are_those_of_real_ranks(scene: Path, tmp_path: Path):
     """Each body has slabs of its own, along its own longest side."""
     turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
     (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
     bodies = [f"{{ mesh = {{ source = 'bar.obj', prepare = [{turn}] }} }}" for turn in ("", turned)]
     text = scene.read_text().replace('mesh = { source = "ball.ply" }', f"body = [{', '.join(bodies)}]")
-    (tmp_path / "scene.toml").write_text(text)
-    done = on_ranks(3, WORKER, tmp_path / "scene.toml", tmp_path / "held.json", "cages.count=2000")
-    assert done.returncode == 0, done.stderr
-    real = json.loads((tmp_path / "held.json").read_text())
-    found = counted(tmp_path / "scene.toml", 2000, 3)
-    assert {name: getattr(found, name).tolist() for name in real} == real
-
-
-def test_one_rank_holds_all(scene: Path):
-    found, lattice = counted(scene, 300, 1), build_model(SELF, load_scene(scene)).lattice
-    assert (found.cells[0], found.nodes[0], found.inner[0]) == (len(lattice.cells), lattice.owned, len(lattice.springs))
-    assert found.ghosts[0] == found.cut[0] == found.neighbours[0] == 0
-    assert found.nonzeros[0] == lattice.owned + 2 * len(lattice.springs)
-
-
-def test_more_ranks_than_nodes(scene: Path):
-    found = counted(scene, 300, 5000)
-    assert found.nodes.sum() == counted(scene, 300, 1).nodes.sum() and found.nodes.min() == 0
+    scene.write_text(text)
+    assert_counts_are_those_of_real_ranks(scene, 2000, 0.1)
 
 
 def test_what_is_scaled_is_near_what_is_counted(scene: Path):
@@ -105,26 +83,7 @@ def test_what_is_scaled_is_near_what_is_counted(scene: Path):
     assert scaled.neighbours is coarse.neighbours
 
 
-def test_scaled_to_itself_nothing_changes(scene: Path):
-    found = counted(scene, 300, 4)
-    for name, values in vars(found.scaled(found.cells.sum())).items():
-        assert np.allclose(values, getattr(found, name)), name
-
-
 # Where integers end
-
-
-def a_cube(side: int) -> Partition:
-    nodes, cells = (side + 1) ** 3, side**3
-    springs = 3 * side * (side + 1) ** 2 + 6 * side**2 * (side + 1) + 4 * side**3
-    return Partition(*(np.array([float(value)]) for value in (cells, nodes, 0, springs, 0, 0)))
-
-
-def test_the_number_of_cells_at_which_unknowns_end():
-    """A cube of s^3 cells has 3 (s + 1)^3 unknowns."""
-    found = largest(a_cube(100), lambda s: 3 * s.nodes.sum(), 2**31 - 1)
-    assert found == pytest.approx((np.cbrt((2**31 - 1) / 3) - 1) ** 3, rel=1e-4)
-    assert a_cube(100).scaled(1e9).nonzeros.sum() == pytest.approx(a_cube(1000).nonzeros.sum(), rel=1e-3)
 
 
 def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
@@ -156,13 +115,13 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
         (["--ranks", "many"], "invalid int value"),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, own_log, words: list[str], said: str):
+def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, words: list[str], said: str):
     assert main(["inspect", str(scene), *words]) == 2
     told = capsys.readouterr()
     assert said in told.err and told.err.count("\n") == 1 and told.out == ""
 
 
-def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log):
+def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
     found = counted(scene, 300, 3)
     assert main(["inspect", str(scene), "--ranks", "3"]) == 0
     told = {line[:36].strip(): line[36:].split() for line in capsys.readouterr().out.splitlines()}
@@ -171,7 +130,7 @@ def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys, own_log):
     assert 3 * 0.29 < float(told["memory [GB]"][0]) < 3 * 0.31
 
 
-def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Path, capsys, own_log):
+def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Path, capsys):
     budget = "budget={target = 0.1, cells = 0.05, time = 0.02, step = 0.001, count = 300, time_step = 0.01}"
     words = ["inspect", str(scene), "--set", budget]
     assert main(words) == 0
@@ -182,7 +141,7 @@ def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Pat
     assert "expected of 300 cells and steps of 0.01 s, not of what the scene has now" in capsys.readouterr().out
 
 
-def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, own_log, monkeypatch):
+def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, monkeypatch):
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):

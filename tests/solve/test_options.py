@@ -11,7 +11,8 @@ from conftest import run
 from lattices import beam, swing, weight
 from mpi4py import MPI
 
-from msmpetsc.cli.arguments import COMMANDS, option_names
+from msmpetsc.cli.arguments import option_names
+from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem

@@ -6,6 +6,7 @@ What could end the process, libraries that do not fit together above all, is loa
 import argparse
 import json
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -16,7 +17,6 @@ from typing import Any
 
 import msmpetsc
 from msmpetsc.cli.ranks import world
-from msmpetsc.cli.versions import PYTHON
 from msmpetsc.errors import EXTRAS, extra_of, one_line
 
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
@@ -35,10 +35,9 @@ import json, cupy
 print(json.dumps([cupy.cuda.runtime.getDeviceProperties(i)["name"].decode()
                   for i in range(cupy.cuda.runtime.getDeviceCount())]))
 """
+HDF5 = "import h5py; print(h5py.version.hdf5_version)"
 CACHE = """
 import os
-from pathlib import Path
-import msmpetsc
 from msmpetsc.backend.compiling import cache_is_empty
 print("empty" if cache_is_empty() else "filled", os.environ["NUMBA_CACHE_DIR"])
 """
@@ -57,16 +56,13 @@ for name in {names}:
 print(json.dumps(reasons))
 """
 NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
+OPTIONAL = {f"extra {name}" for name in EXTRAS if name != "run"}
 
 Finding = tuple[str, str, str]  # what, its state, and in words
 
 
-class Failed(Exception):
-    """A probe that did not end well; the line says how."""
-
-
-class Lacking(Exception):
-    """A probe that needs a package which is not installed; the line says which extra brings it."""
+class Unsound(Exception):
+    """Raised by what examines a thing that is missing or broken: its state, and in words what brings or ails it."""
 
 
 def run(_: argparse.Namespace) -> int:
@@ -82,17 +78,13 @@ def run(_: argparse.Namespace) -> int:
     return int(states != {OK})
 
 
-OPTIONAL = {f"extra {name}" for name in EXTRAS if name != "run"}
-
-
 def examined(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """Yield the findings of an examination, whatever happens in it."""
     try:
         yield from examine()
-    except Lacking as error:
-        yield examine.__name__, MISSING, str(error)
-    except Failed as error:
-        yield examine.__name__, BROKEN, str(error)
+    except Unsound as error:
+        state, words = error.args
+        yield examine.__name__, state, words
     except Exception as error:  # whatever is broken in an installation: it must be named, not end this
         yield examine.__name__, BROKEN, one_line(error)
 
@@ -106,31 +98,29 @@ def installed(package: str) -> bool:
 
 
 def said(code: str, *launcher: str) -> str:
-    """Return what a Python of its own prints. Raises Failed, and Lacking where a package is not there."""
+    """Return what a Python of its own prints. Raises Unsound."""
     command = [*launcher, sys.executable, "-c", code]
     alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
     try:
-        done = subprocess.run(
-            command, env=alone, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=PATIENCE
-        )
+        done = subprocess.run(command, env=alone, timeout=PATIENCE, **pipes)
     except FileNotFoundError:
-        raise Failed(
-            f"there is no {command[0]}: apt install openmpi-bin, or load the module of the cluster's MPI"
-        ) from None
+        remedy = "apt install openmpi-bin, or load the module of the cluster's MPI"
+        raise Unsound(BROKEN, f"there is no {command[0]}: {remedy}") from None
     except subprocess.TimeoutExpired:
-        raise Failed(f"does not answer within {PATIENCE} s: {' '.join(launcher)}") from None
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if line.strip()]
-        last = lines[-1][:160] if lines else f"ends with status {done.returncode}"
-        gone = re.fullmatch(r"ModuleNotFoundError: No module named '([\w.]+)'", last)
-        if gone and (extra := extra_of(gone[1])) and not installed(gone[1].partition(".")[0]):
-            raise Lacking(f"{gone[1]}: pip install 'msmpetsc[{extra}]'")
-        raise Failed(last)
-    return done.stdout
+        raise Unsound(BROKEN, f"does not answer within {PATIENCE} s: {' '.join(launcher)}") from None
+    if done.returncode == 0:
+        return done.stdout
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    last = [f"ends with status {done.returncode}", *lines][-1][:160]
+    gone = re.fullmatch(r"ModuleNotFoundError: No module named '([\w.]+)'", last)
+    if gone and (extra := extra_of(gone[1])) and not installed(gone[1].partition(".")[0]):
+        raise Unsound(MISSING, f"{gone[1]}: pip install 'msmpetsc[{extra}]'")
+    raise Unsound(BROKEN, last)
 
 
 def petsc_facts() -> dict[str, Any]:
-    """Return what PETSc says of itself. Raises Failed."""
+    """Return what PETSc says of itself. Raises Unsound."""
     return json.loads(said(PETSC).splitlines()[-1])
 
 
@@ -141,10 +131,10 @@ def petsc() -> Iterator[Finding]:
         return
     facts = petsc_facts()
     words = f"{facts['version']}, {facts['bits']}-bit integers, {facts['scalar']}"
-    if facts["scalar"] != "float64":
-        yield "PETSc", BROKEN, f"{words}: a PETSc of real double numbers is needed (--with-scalar-type=real)"
-    else:
+    if facts["scalar"] == "float64":
         yield "PETSc", OK, words
+    else:
+        yield "PETSc", BROKEN, f"{words}: a PETSc of real double numbers is needed (--with-scalar-type=real)"
 
 
 def ranks() -> Iterator[Finding]:
@@ -153,8 +143,7 @@ def ranks() -> Iterator[Finding]:
         yield "MPI", MISSING, "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'"
         return
     oversubscribed = ("--oversubscribe",) if "Open MPI" in said(RANKS) else ()
-    sizes = said(RANKS, "mpiexec", *oversubscribed, "-n", "2").splitlines()
-    size, _, library = sizes[-1].partition(" ")
+    size, _, library = said(RANKS, "mpiexec", *oversubscribed, "-n", "2").splitlines()[-1].partition(" ")
     if size == "2":
         yield "MPI", OK, f"{library.partition(',')[0]}, mpiexec starts ranks that meet"
     else:
@@ -174,24 +163,24 @@ def solvers() -> Iterator[Finding]:
 
 def device() -> Iterator[Finding]:
     """A CUDA GPU, and a PETSc that uses it."""
-    if not petsc_facts()["cuda"]:
-        yield "PETSc with CUDA", MISSING, "only for --device cuda: scripts/build_petsc_cuda builds one"
-    else:
+    if petsc_facts()["cuda"]:
         yield "PETSc with CUDA", OK, "for --device cuda"
+    else:
+        yield "PETSc with CUDA", MISSING, "only for --device cuda: scripts/build_petsc_cuda builds one"
     if not installed("cupy"):
         yield "GPU", MISSING, "only for --device cuda: pip install 'msmpetsc[cuda]'"
-        return
-    names = json.loads(said(DEVICE))
-    yield "GPU", OK if names else MISSING, ", ".join(names) or "no CUDA device on this machine"
+    elif names := json.loads(said(DEVICE)):
+        yield "GPU", OK, ", ".join(names)
+    else:
+        yield "GPU", MISSING, "no CUDA device on this machine"
 
 
 def results() -> Iterator[Finding]:
     """HDF5, as h5py has it."""
-    if not installed("h5py"):
+    if installed("h5py"):
+        yield "HDF5", OK, said(HDF5).strip()
+    else:
         yield "HDF5", MISSING, "pip install h5py"
-        return
-    version, parallel = said("import h5py; print(h5py.version.hdf5_version, h5py.get_config().mpi)").split()
-    yield "HDF5", OK, f"{version}, {'with' if parallel == 'True' else 'without'} MPI (either will do)"
 
 
 def kernels() -> Iterator[Finding]:
@@ -200,13 +189,16 @@ def kernels() -> Iterator[Finding]:
     nearest = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
     if not os.access(nearest, os.W_OK):
         yield "kernels", MISSING, f"{nearest} cannot be written, each run compiles anew: export NUMBA_CACHE_DIR=FOLDER"
+    elif state == "filled":
+        yield "kernels", OK, "compiled"
     else:
-        yield "kernels", OK, "compiled" if state == "filled" else "not yet compiled: the first run takes a minute more"
+        yield "kernels", OK, "not yet compiled: the first run takes a minute more"
 
 
 def packages() -> Iterator[Finding]:
     """The packages of each extra: missing, or there but broken, so that they cannot be imported."""
-    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {Path(msmpetsc.__file__).parent}, {PYTHON}"
+    place = Path(msmpetsc.__file__).parent
+    yield "msmpetsc", OK, f"{msmpetsc.__version__} in {place}, Python {platform.python_version()}"
     found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
     reasons = json.loads(said(IMPORTS.format(names=found)).splitlines()[-1])
     for extra, names in EXTRAS.items():
@@ -221,8 +213,7 @@ def packages() -> Iterator[Finding]:
 
 def meshes() -> Iterator[Finding]:
     """Models of the registry that lie on this machine."""
-    names = said(MESHES).split()
-    if names:
+    if names := said(MESHES).split():
         yield "meshes", OK, f"{len(names)} named models: {', '.join(names)}"
     else:
         yield "meshes", MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list"

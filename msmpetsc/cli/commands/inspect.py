@@ -5,12 +5,11 @@ memory of a rank  =  PROGRAM + FACTOR (bytes of its arrays while A is assembled)
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.optimize import brentq
 
 from msmpetsc.app.checks import refuse_below_one
 from msmpetsc.app.profile import peak_memory
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
 MOST_BUILT = 200_000  # cells that are built here to count; what is more is scaled
 MOST_RANKS = 10**6
-MOST_CELLS = 1e15  # where limits are looked for
 PROGRAM, FACTOR = 0.29e9, 2.1  # [byte] of a rank without arrays, and times those, as runs of newton show it
 BYTES_OF_POINT = 14 * 64 * 8  # of the surface, while W is made of up to 64 weights each; as seen with "affine"
 GB = 1e9
@@ -57,14 +55,13 @@ def run(args: argparse.Namespace) -> int:
     surfaces = [body.surface for body in bodies if body.surface is not None] if scene.output.surface else []
     report = {
         "scene": str(args.scene), "ranks": args.ranks, "counted": counted, "counts": counts_of(scene, partition),
-        "memory": over_ranks(memory_of(partition, surfaces, mesh)), "limits": limits_of(partition),
+        "memory": over_ranks(memory_of(partition, surfaces, mesh)),
     }  # fmt: skip
     if args.json:
         print(json.dumps(report, indent=1))
         return 0
-    print_counts(args, scene, partition, report)
+    print_counts(report)
     print_budget(scene)
-    print_limits(report["limits"], partition)
     return 0
 
 
@@ -80,10 +77,8 @@ def counts_of(scene: Scene, partition: "Partition") -> dict[str, dict[str, float
     }
     counts = {name: over_ranks(values) for name, values in rows.items()}
     counts[SPRINGS]["all"] = float(partition.all_springs)
-    counts[f"positions of {scene.stored} frames, file [byte]"] = {
-        "all": float(24 * scene.stored * partition.nodes.sum())
-    }
-    return counts
+    positions = 24 * scene.stored * counts["nodes"]["all"]
+    return counts | {f"positions of {scene.stored} frames, file [byte]": {"all": positions}}
 
 
 def over_ranks(values: np.ndarray) -> dict[str, float]:
@@ -91,19 +86,20 @@ def over_ranks(values: np.ndarray) -> dict[str, float]:
     return {"all": float(values.sum()), "mean": float(values.mean()), "most": float(values.max())}
 
 
-def print_counts(args: argparse.Namespace, scene: Scene, partition: "Partition", report: dict[str, Any]) -> None:
+def print_counts(report: dict[str, Any]) -> None:
     """Print a table of what there is, and what a rank has of it."""
-    counted, counts = report["counted"], dict(report["counts"])
-    how = "counted" if counted == partition.cells.sum() else f"scaled from a lattice of {counted} cells"
-    print(f"{args.scene} on {args.ranks} rank{'s' * (args.ranks > 1)}, {how}\n")
+    counts, number = report["counts"], report["ranks"]
+    how = "counted"
+    if report["counted"] != counts["cells"]["all"]:
+        how = f"scaled from a lattice of {report['counted']} cells"
+    print(f"{report['scene']} on {number} rank{'s' * (number > 1)}, {how}\n")
     print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
-    _, file = counts.popitem()
-    for name, row in counts.items():
-        print(f"{name:{WIDTH}}{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}")
-    positions = f"positions of {scene.stored} frames, file [GB]"
-    print(f"{positions:{WIDTH}}{file['all'] / GB:15.3g}")
-    memory = report["memory"]
-    print(f"{'memory [GB]':{WIDTH}}{memory['all'] / GB:15.3g}{memory['mean'] / GB:15.3g}{memory['most'] / GB:15.3g}")
+    for name, row in (counts | {"memory [byte]": report["memory"]}).items():
+        if name.endswith("[byte]"):
+            columns = "".join(f"{value / GB:15.3g}" for value in row.values())
+        else:
+            columns = f"{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}"
+        print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
 
 
 def print_budget(scene: Scene) -> None:
@@ -136,33 +132,3 @@ def memory_of(partition: "Partition", surfaces: Sequence["Surface"], mesh: float
     needed = np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / partition.ranks)
     needed[0] = max(needed[0], mesh)
     return PROGRAM + needed
-
-
-def limits_of(partition: "Partition") -> dict[str, dict[str, Any]]:
-    """Return at how many cells of this body, on as many ranks, integers end."""
-    from msmpetsc.solve.petsc.limits import BITS, LARGEST, LARGEST_COUNT
-
-    petsc = f"{BITS}-bit PetscInt"
-    ends = {
-        "unknowns, three a node": (lambda s: 3 * s.nodes.sum(), LARGEST, petsc),
-        "nonzeros of A on a rank": (lambda s: s.nonzeros.max(), LARGEST, petsc),
-        "nodes of a rank in one MPI call": (lambda s: (s.nodes + s.ghosts).max(), LARGEST_COUNT, "MPI's int"),
-    }
-    return {
-        name: {"limit": limit, "integer": integer, "cells": largest(partition, count, limit)}
-        for name, (count, limit, integer) in ends.items()
-    }
-
-
-def print_limits(limits: dict[str, dict[str, Any]], partition: "Partition") -> None:
-    """Print where integers end, and whether that is before the cells of this scene."""
-    print()
-    for name, end in limits.items():
-        too_few = "" if end["cells"] >= partition.cells.sum() else ", fewer than here: run refuses or fails"
-        print(f"{name} end at {end['limit']} ({end['integer']}): {end['cells']:.3g} cells{too_few}")
-
-
-def largest(partition: "Partition", count: Callable[["Partition"], float], limit: int) -> float:
-    """Return the number of cells with which this body's ``count`` comes to its limit, on as many ranks."""
-    log_cells = brentq(lambda x: np.log(count(partition.scaled(np.exp(x))) / limit), 0.0, np.log(MOST_CELLS))
-    return float(np.exp(log_cells))

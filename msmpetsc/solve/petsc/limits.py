@@ -8,7 +8,6 @@ from msmpetsc.errors import InputError
 
 BITS = 8 * np.dtype(PETSc.IntType).itemsize
 LARGEST = int(np.iinfo(PETSc.IntType).max)
-LARGEST_COUNT = int(np.iinfo(np.intc).max)  # of what one rank sends or gets in one MPI call
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
 
 

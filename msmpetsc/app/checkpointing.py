@@ -1,24 +1,17 @@
-"""The observers of a run's steps: frames and checkpoints are written, progress is shown, signals are heard."""
+"""When a run writes a checkpoint, and when a signal stops it."""
 
-import logging
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mpi4py import MPI
 
-from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.fields import Frame
-from msmpetsc.results.progress import Progress
 from msmpetsc.results.writer import ResultFile
 
 if TYPE_CHECKING:  # PETSc must first be given its options
@@ -29,85 +22,23 @@ CHECKPOINT_TIME = 0.01  # part of the time that checkpoints may take
 SECONDS = {"s": 1, "min": 60, "h": 3600}
 
 
-class Observer(Protocol):
-    """What is called after each step."""
+class Interval(NamedTuple):
+    """How often a checkpoint is due: after so many frames, or seconds; without either, as takes 1% of the time."""
 
-    def after_step(self, frame: Frame | None) -> bool:
-        """See the frame of the step just taken, if it is stored; return whether the run is to stop (collective)."""
-        ...
-
-
-class FrameWriter:
-    """Write each frame that the file does not have yet."""
-
-    def __init__(self, file: ResultFile, frames: int):
-        """frames: number of those that the steps taken before gave."""
-        self.file, self.frames = file, frames
-
-    def after_step(self, frame: Frame | None) -> bool:
-        if frame is not None:
-            if self.frames >= self.file.finished:
-                self.file.append(frame)
-            self.frames += 1
-        return False
-
-
-class Callback:
-    """Call a function of the user's with each frame, once that is written."""
-
-    def __init__(self, function: Callable[[Frame], object]):
-        self.function = function
-
-    def after_step(self, frame: Frame | None) -> bool:
-        if frame is not None:
-            self.function(frame)
-        return False
-
-
-class ProgressLine:
-    """Show how far the run is, on rank 0, where notes are wanted."""
-
-    def __init__(self, progress: Progress):
-        self.progress = progress
-
-    @classmethod
-    @contextmanager
-    def shown(cls, comm: MPI.Comm, steps: int) -> Iterator["ProgressLine"]:
-        """Show it in the block, and end the line after it."""
-        progress = Progress(steps, enabled=comm.rank == 0 and log.isEnabledFor(logging.INFO))
-        try:
-            yield cls(progress)
-        finally:
-            progress.close()
-
-    def after_step(self, frame: Frame | None) -> bool:
-        if frame is not None:
-            self.progress.update(frame)
-        return False
-
-
-@dataclass(frozen=True)
-class Interval:
-    """How often a checkpoint is due: after so many frames, so many seconds, or as takes 1% of the time at the most.
-
-    frames  : None where seconds count
-    adapts  : whether the seconds follow from how long a checkpoint takes
-    """
-
-    frames: int | None
-    seconds: float
-    adapts: bool
+    frames: int | None = None
+    seconds: float | None = None
 
     @classmethod
     def parsed(cls, given: int | str | None) -> "Interval":
         """Parse 3, "3", "5min", or None. Raises InputError."""
-        text = None if given is None else str(given)
-        match = re.fullmatch(r"(\d{1,18})(s|min|h)?", text or "0s", re.ASCII)
-        if not match or (text and not int(match[1])):
-            raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {text}")
+        if given is None:
+            return cls()
+        match = re.fullmatch(r"0*([1-9]\d{0,17})(s|min|h)?", str(given), re.ASCII)
+        if match is None:
+            raise InputError(f"--checkpoint-every takes a number of frames, or 30s, 5min, 2h; not {given}")
         if match[2] is None:
-            return cls(int(match[1]), 0.0, False)
-        return cls(None, float(match[1]) * SECONDS[match[2]], text is None)
+            return cls(frames=int(match[1]))
+        return cls(seconds=float(match[1]) * SECONDS[match[2]])
 
 
 class Checkpoints:
@@ -119,11 +50,15 @@ class Checkpoints:
     def __init__(self, file: ResultFile, simulation: "Simulation", interval: Interval, signals: "Signals"):
         self.file, self.simulation, self.interval, self.signals = file, simulation, interval, signals
         self.signal, self._written = 0, -1
-        self._seconds, self._frames, self._ended = interval.seconds, 0, perf_counter()
+        self._seconds, self._frames, self._ended = interval.seconds or 0.0, 0, perf_counter()
 
-    def after_step(self, frame: Frame | None) -> bool:
+    def after_step(self, is_stored: bool) -> bool:
+        """Write a checkpoint if one is due; return whether the run is to stop (collective).
+
+        is_stored : whether the step gave a frame
+        """
         simulation = self.simulation
-        self._frames += frame is not None
+        self._frames += is_stored
         due = (self.signals.comm.rank == 0 and self._is_due()) or simulation.step in (0, simulation.steps)
         due, number = self.signals.agree(due)
         if due:
@@ -133,7 +68,7 @@ class Checkpoints:
                 self.file.write_checkpoint(saved)
                 self._written = saved.step
             self._frames, self._ended = 0, perf_counter()
-            if self.interval.adapts:
+            if self.interval == Interval():
                 self._seconds = (self._ended - began) / CHECKPOINT_TIME
         if simulation.step < simulation.steps:  # after the last step there is nothing to stop
             self.signal = number

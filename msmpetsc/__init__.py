@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from msmpetsc.extensions import register_force, register_obstacle, register_preset
     from msmpetsc.fields import Frame
     from msmpetsc.results.reader import Result
-    from msmpetsc.scene.schema import Scene
+    from msmpetsc.scene.reading import Scene
 
 __version__ = "0.2.0"
 __all__ = [
@@ -29,7 +29,7 @@ __all__ = [
 FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
     "Frame": "msmpetsc.fields",
     "Result": "msmpetsc.results.reader",
-    "Scene": "msmpetsc.scene.schema",
+    "Scene": "msmpetsc.scene.reading",
     "Simulation": "msmpetsc.app.simulation",
     "frames": "msmpetsc.app.simulation",
     "register_force": "msmpetsc.extensions",

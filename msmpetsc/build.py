@@ -31,7 +31,7 @@ from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials
 from msmpetsc.scene.motion import ForceTable
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
 PENALTY = 10.0  # stiffest springs: what pushes a node out of an obstacle

@@ -63,6 +63,8 @@ def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
         return InputError(f"there is not enough memory ({reason}): fewer cells, or ranks on more machines, need less")
     if isinstance(error, OSError) and error.errno in NO_ROOM:  # in a folder of temporary files, say
         return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
+    if isinstance(error, OSError) and error.filename:  # an mpiexec that is not there, a folder that cannot be made
+        return InputError(f"{error.filename}: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "", extra)
     return error if isinstance(error, MsmpetscError) else None

@@ -42,13 +42,6 @@ def checked_file(given: str | os.PathLike[str]) -> Path:
     return path
 
 
-def refuse_below_one(**numbers: int | None) -> None:
-    """Raise InputError for the first option that is given and below 1: ``true_error=0`` for ``--true-error 0``."""
-    for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise InputError(f"--{name.replace('_', '-')} must be at least 1, not {number}")
-
-
 def refuse_other_format(option: str, path: str | os.PathLike[str] | None, endings: tuple[str, ...]) -> None:
     """Raise InputError for the name of a file of another format than is written."""
     if path is not None and Path(path).suffix.lower() not in endings:

@@ -19,7 +19,6 @@ from msmpetsc.app.checks import (
     RESULT_NAMES,
     checked_file,
     checked_path,
-    refuse_below_one,
     refuse_other_format,
 )
 from msmpetsc.errors import InputError
@@ -28,7 +27,7 @@ from msmpetsc.solve.petsc.words import words_of
 
 if TYPE_CHECKING:  # --help, which shows the table, needs neither numpy nor a scene
     from msmpetsc.fields import Frame
-    from msmpetsc.scene.schema import Scene
+    from msmpetsc.scene.reading import Scene
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -120,11 +119,12 @@ class RunRequest:
                 option.kind(os.fspath(value))
             if option.kind is int and not isinstance(value, Integral | None):  # Python alone can give it
                 raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
+            if option.kind is int and value is not None and value < 1:
+                raise InputError(f"{flag_of(name)} must be at least 1, not {value}")
             if option.choices and value not in (None, *option.choices):
                 raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
-        refuse_below_one(true_error=self.true_error, trace=self.trace, frames=self.frames)
         other = self.output is not None and self.resume is not None and Path(self.output) != Path(self.resume)
         if self.resume and (self.overwrite or other):
             raise InputError("--resume goes on in its own file: -o and --overwrite have no place beside it")

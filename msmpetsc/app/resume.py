@@ -20,8 +20,7 @@ from msmpetsc.results.reader import refuse_deadly
 from msmpetsc.results.restart import Earlier, read_checkpoint, refuse_changed_lattice, refuse_unlike_frame
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
-from msmpetsc.scene.reading import load_scene, scene_of
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene, load_scene, scene_of
 from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options

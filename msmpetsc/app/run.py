@@ -27,8 +27,7 @@ from msmpetsc.results.progress import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.results.xdmf import write_xdmf
-from msmpetsc.scene.reading import load_scene, scene_in
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene, load_scene, scene_in
 from msmpetsc.solve.instrumentation import Probes, begin_timing
 from msmpetsc.solve.options import refuse_early
 from msmpetsc.solve.petsc.device import choose

@@ -16,7 +16,7 @@ from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.petsc.words import lent_options, start_for_runs, words_of
 
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene

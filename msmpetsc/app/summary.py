@@ -15,7 +15,7 @@ from msmpetsc.comm import log
 from msmpetsc.constraints.coverage import Reach
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.progress import duration
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.simulate import Simulation
 
 MOST_NAMED = 12  # tables whose nodes are counted one by one

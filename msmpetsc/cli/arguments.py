@@ -76,7 +76,7 @@ class Parser(argparse.ArgumentParser):
     """A parser that prints on rank 0 only, and raises InputError."""
 
     def error(self, message: str):
-        raise InputError(message)
+        raise InputError(re.sub(r"^argument (\S+): (?=must )", r"\1 ", message))
 
     def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
         if world().rank == 0:

@@ -22,6 +22,7 @@ class Command:
     """A command, which the module of its name in ``commands`` carries out.
 
     exclusive : arguments of which only one may be given
+    alone     : why it is for one process, if it is
     """
 
     help: str
@@ -29,6 +30,7 @@ class Command:
     arguments: tuple[Argument, ...] = ()
     exclusive: tuple[Argument, ...] = ()
     description: str | None = None
+    alone: str = ""
 
 
 class Shown(argparse.Action):
@@ -81,6 +83,19 @@ def arguments_of_run() -> tuple[Argument, ...]:
     return tuple(taken)
 
 
+def at_least_1(word: str) -> int:
+    """Return the whole number of a word, 1 or more (a type of arguments)."""
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {word}")
+    return int(word)
+
+
+def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
+    """Return an option whose value is a whole number, 1 or more."""
+    return argument(name, type=at_least_1, metavar=value, help=about, **keywords)
+
+
+RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 SHELLS = ("bash", "zsh", "fish")
 SCENE = argument("scene", type=checked_path, metavar="SCENE", help="scene file (TOML)")
 SET = argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scene key: cages.count=3000")
@@ -98,7 +113,7 @@ def frames(about: str) -> Argument:
 
 def ranks(about: str) -> Argument:
     """Return ``--ranks``, of what starts runs of its own."""
-    return argument("--ranks", type=int, default=1, metavar="R", help=about)
+    return whole("--ranks", "R", about, default=1)
 
 
 RENDER = (
@@ -108,9 +123,7 @@ RENDER = (
         help="*.png, *.mp4, *.gif, *.webp or *.html; default: beside what is drawn, ending in .png",
     ),
     frames("these frames; slices like 0:250:5 as Python counts"),
-    argument(
-        "--count", metavar="N", type=int, help="choose this many moments (default: the scene's picture.times, or 5)"
-    ),
+    whole("--count", "N", "choose this many moments (default: the scene's picture.times, or 5)"),
     argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)"),
     argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
     argument(
@@ -149,6 +162,7 @@ COMMANDS = {
         ),
         description="Measure a mesh and write a commented scene that runs at once, or copy one that comes with "
         "msmpetsc; beside it the schema by which editors complete its keys.",
+        alone="it measures a mesh on one process",
     ),
     "run": Command(
         "simulate a scene",
@@ -170,6 +184,7 @@ COMMANDS = {
         ("msmpetsc inspect my.toml --ranks 64", "msmpetsc inspect my.toml --json"),
         (SCENE, ranks("MPI ranks (1)"), SET, JSON),
         description="Count cells, nodes, springs, ghosts and messages of each rank, and expect its memory.",
+        alone="it counts for --ranks R on one process",
     ),
     "study": Command(
         "sweep methods over scenes",
@@ -178,7 +193,7 @@ COMMANDS = {
             argument("study", type=checked_path, metavar="FILE.toml", help="study file"),
             argument("-o", "--output", type=checked_path, metavar="FOLDER", help="default: out/FILE"),
             switch("--full", "also what is marked full = true: the long cases"),
-            argument("--jobs", type=int, metavar="N", help="cases at a time (they slow each other)"),
+            whole("--jobs", "N", "cases at a time (they slow each other)"),
             switch("--restart", "forget the cases that are done"),
         ),
         (
@@ -187,6 +202,7 @@ COMMANDS = {
         ),
         "Run the cases of a study, each in its own process, into a table and a report. "
         "Stopped, the same command goes on.",
+        alone=RUNS_ITSELF,
     ),
     "plan": Command(
         "find the cheapest options that meet an error of the surface",
@@ -200,15 +216,16 @@ COMMANDS = {
                 "--surface-error", type=float, metavar="E", required=True,
                 help="error of the surface, of its largest displacement: cells, step and solver together",
             ),
-            argument("--frames", type=int, default=20, metavar="N", help="of the scene's steps, the first N (20)"),
+            whole("--frames", "N", "of the scene's steps, the first N (20)", default=20),
             ranks("MPI ranks of the trials"),
             switch("--write", "put the answer into the scene file"),
-            argument("--cells", type=int, metavar="N", help="of the finest trial; the scene's count"),
+            whole("--cells", "N", "of the finest trial; the scene's count"),
             argument("--chart", type=checked_file, metavar="OUT.png", help="draw error over cost of all trials"),
             JSON,
         ),
         description="Try lattices, integrators, time steps and errors of a step on the first frames of a scene, and "
         "say which is the cheapest that meets the error. Exit status 3: none does.",
+        alone=RUNS_ITSELF,
     ),
     "compare": Command(
         "say whether two results agree",
@@ -228,6 +245,7 @@ COMMANDS = {
         ),
         description="Compare two results at the times that both have; of different lattices their surfaces alone. "
         "Exit status 0: they agree; 1: they differ; 2: they cannot be compared.",
+        alone="it reads two files, which one process does alone",
     ),
     "render": Command(
         "draw a result as a picture, a film or a page; or a scene or a mesh before anything is run",
@@ -241,6 +259,7 @@ COMMANDS = {
         RENDER,
         description="Draw some moments of a result side by side (*.png), a film (*.mp4, *.gif, *.webp), or a page for "
         "a browser in which the body turns and its frames play (*.html). A scene or a mesh is drawn as it lies.",
+        alone="it draws on one process",
     ),
     "export": Command(
         "write frames of a result in another format",
@@ -253,10 +272,11 @@ COMMANDS = {
             argument("-o", "--output", metavar="FILE", type=checked_file, required=True, help="what to write"),
             argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold"),
             frames("these frames, or slices like 0:250:5; default: all, or the last (-1) of one"),
-            argument("--every", metavar="N", type=int, default=1, help="every N-th of them (1)"),
+            whole("--every", "N", "every N-th of them (1)", default=1),
         ),
         description="Write frames of a result for another program; the name's ending says in which format: .glb "
         "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
+        alone="it writes on one process",
     ),
     "check": Command(
         "store a scene's numbers; say whether they still hold",
@@ -269,14 +289,15 @@ COMMANDS = {
             argument("--baseline", type=checked_file, metavar="FILE.json", help="default: SCENE.baseline.json"),
             ranks("MPI ranks of the runs (1)"),
             switch("--update", "store the numbers, in place of those stored before"),
-            argument("--cells", type=int, metavar="N", help="of --update: cages.count; the scene's if not given"),
-            argument("--frames", type=int, metavar="N", help="of --update: steps, the scene's at the most (20)"),
+            whole("--cells", "N", "of --update: cages.count; the scene's if not given"),
+            whole("--frames", "N", "of --update: steps, the scene's at the most (20)"),
             SET,
             argument("--junit", type=checked_file, metavar="OUT.xml", help="write what was checked as JUnit XML"),
             JSON,
         ),
         description="Run the first steps of scenes, each solved to 1e-9, and hold counts, energies, momentum and "
         "places against those that --update stored. Exit status 0: all are as stored; 1: something differs.",
+        alone=RUNS_ITSELF,
     ),
     "fetch": Command(
         "download named meshes, or list them",
@@ -285,14 +306,17 @@ COMMANDS = {
             argument("names", nargs="*", metavar="NAME", help="a model, see --list"),
             switch("--list", "list the models and where they lie"),
         ),
+        alone="it downloads on one process",
     ),
     "keys": Command(
         "list the keys of a scene, or of one of its tables: unit, default, range, meaning",
         ("msmpetsc keys", "msmpetsc keys material", "msmpetsc keys pin.region"),
         (argument("table", nargs="?", metavar="TABLE", help="a table or a key: material, pin.region, time.step"),),
+        alone="it prints on one process",
     ),
     "schema": Command(
-        "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",)
+        "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",),
+        alone="it prints on one process",
     ),
     "doctor": Command(
         "say what is installed, and how to get what is not",

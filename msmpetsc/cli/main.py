@@ -5,12 +5,17 @@ import signal
 import sys
 import traceback
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from msmpetsc.app.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
 from msmpetsc.app.log import logged_on_root
 from msmpetsc.cli.arguments import parsed
+from msmpetsc.cli.command_table import COMMANDS, RUNS_ITSELF
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, MsmpetscError, as_expected
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 DRAWING = ("render", "export", "compare")  # which the extra "render" is enough for
 
@@ -30,6 +35,8 @@ def main(arguments: list[str] | None = None) -> int:
             with ending_together(comm, "render" if refused is None and args.command in DRAWING else "run"):
                 if refused is not None:
                     raise refused
+                if COMMANDS[args.command].alone:
+                    start_alone(comm, args.command)
                 return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
         except MsmpetscError as error:
             if comm.rank == 0:
@@ -43,6 +50,18 @@ def main(arguments: list[str] | None = None) -> int:
         except Exception:
             print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
             return STATUS_BUG
+
+
+def start_alone(comm: "MPI.Comm", command: str) -> None:
+    """Raise InputError where mpiexec has started more than one of a command that is for one process.
+
+    SIGTERM to one that runs others ends those, too, as Ctrl-C does.
+    """
+    why = COMMANDS[command].alone
+    if comm.size > 1:
+        raise InputError(f"{command} is started without mpiexec: {why}")
+    if why == RUNS_ITSELF:
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
 
 
 def entry_point() -> None:

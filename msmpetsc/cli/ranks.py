@@ -1,9 +1,7 @@
 """The ranks that a command runs on; most are for one process, and need MPI only to see that there is but one."""
 
 import os
-from typing import TYPE_CHECKING, Any, cast
-
-from msmpetsc.errors import InputError
+from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -12,8 +10,6 @@ LAUNCHED = {  # variables that Open MPI, MPICH, PMIx, Slurm, Flux and the launch
     "OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID", "FLUX_TASK_RANK", "ALPS_APP_PE", "PALS_RANKID",
     "JSM_NAMESPACE_RANK", "MPI_LOCALRANKID", "MV2_COMM_WORLD_RANK",
 }  # fmt: skip
-
-RUNS_ITSELF = "it starts its runs on as many ranks as they need"
 
 
 class Alone:
@@ -37,14 +33,3 @@ def world(started: bool = False) -> "MPI.Comm":
             raise
         return cast("MPI.Comm", Alone())
     return MPI.COMM_WORLD
-
-
-def refuse_ranks(command: str, why: str) -> None:
-    """Raise InputError where mpiexec has started more than one of a command that is for one process alone."""
-    if world().size > 1:
-        raise InputError(f"{command} is started without mpiexec: {why}")
-
-
-def interrupt(*_: Any) -> None:
-    """Treat a signal to end as Ctrl-C: the runs under way end with this process."""
-    raise KeyboardInterrupt

@@ -17,7 +17,7 @@ from msmpetsc.backend.arrays import Floats, Mask, Positions
 from msmpetsc.constraints.coverage import Regions
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 
 LEAST = 0.1  # free part of a spring: what is stiffer costs iterations, and short explicit steps
 HALVINGS = 20  # of the way to the edge

@@ -18,9 +18,10 @@ from msmpetsc.constraints.loads import SAME, Anchor, within
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
-from msmpetsc.scene.motion import Force, Time
-from msmpetsc.scene.obstacle import ObstacleTable
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.motion import Force
+from msmpetsc.scene.obstacles import ObstacleTable
+from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.time import Time
 
 NODES = ("pin", "anchor", "force")  # tables whose regions mean nodes
 Regions = Mapping[str, Mask]  # the table's key in the scene, "pin.0" -> its local nodes (l,) bool

@@ -21,7 +21,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Material, Region
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.constraints.loads import Motion, within
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.scene.obstacle import ObstacleTable
+from msmpetsc.scene.obstacles import ObstacleTable
 
 USUAL = 0.99  # share of the triangles whose size says how far off the middle of one may be that is near
 CROSSED = 0.1  # of the reach: surfaces that crossed by less are taken for touching

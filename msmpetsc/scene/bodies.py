@@ -3,14 +3,14 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from pydantic import Field, ValidationInfo
+from pydantic import Field
 
-from msmpetsc.scene.body import MeshTable, OwnMaterial, PartTable, refuse_unlike
+from msmpetsc.scene.body import Material, MeshTable, OwnMaterial, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Pin, Start
-from msmpetsc.scene.problems import KeyPath, rule
-from msmpetsc.scene.statics import refuse_functions, refuse_motion
+from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.values import ListOf, Table
 
+MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton more than 1,200 iterations a step
 OF_REGIONS = ("part", "pin", "anchor", "force")  # tables that take a region of one body, or of all
 
 
@@ -52,34 +52,36 @@ def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
             yield OfBody(("body", body, kind, number), body, table)
 
 
-def as_the_material(cls: Any, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
-    """Refuse bodies and parts that do not go with the material (a validator of ``body`` and ``part``)."""
-    known = {**info.data, str(info.field_name): tables}
-    others: dict[str, OwnMaterial] = {f"part.{number}": part for number, part in enumerate(known.get("part", ()))}
-    for number, body in enumerate(known.get("body", ())):
-        if body.material is not None:
-            others[f"body.{number}.material"] = body.material
-        others |= {f"body.{number}.part.{which}": part for which, part in enumerate(body.part)}
-    refuse_unlike(info.data.get("material"), others)
-    return tables
+def unlike_the_material(scene: Any) -> Iterator[Broken]:
+    """Yield the rules that bodies and parts break beside the material.
 
-
-def no_moving_body(cls: Any, bodies: tuple[BodyTable, ...], info: ValidationInfo) -> tuple[BodyTable, ...]:
-    """Refuse bodies that start in motion, or whose forces go by the state, in statics (a validator of ``body``)."""
-    for number, body in enumerate(bodies):
-        refuse_motion(body.start, info, f"body.{number}.start ")
-        refuse_functions(body.force, info, f"body.{number}.")
-    return bodies
-
-
-def of_all_bodies(cls: Any, tables: tuple[Any, ...], info: ValidationInfo) -> tuple[Any, ...]:
-    """Refuse regions that are of one body in tables of all (a validator of these)."""
-    for number, table in enumerate(tables if info.data.get("body") else ()):
-        if table.region.relative or table.region.painted is not None:
-            kind = "relative" if table.region.relative else "painted"
-            raise rule(
-                f"may have no {kind} region beside [[body]], as {info.field_name}.{number} has: whose it is only "
-                f"[[body.{info.field_name}]] says",
-                "body",
+    Stiffness and Young's modulus are two ways to name all springs.
+    """
+    others: dict[str, OwnMaterial] = {part.key: part.table for part in tables_of(scene, "part")}
+    others |= {f"body.{number}.material": body.material for number, body in enumerate(scene.body) if body.material}
+    for key, other in others.items():
+        for name in Material.one_of:
+            if getattr(other, name) is not None and getattr(scene.material, name) is None:
+                words = f"may give {name} only where material does, as {key} does"
+                yield key.partition(".")[0], rule(words, "material")
+    for name in (*Material.one_of, "density"):
+        values = {key: value for key, table in others.items() if (value := getattr(table, name)) is not None}
+        given = [*values.values(), *filter(None, [getattr(scene.material, name)])]
+        if values and max(given) > MOST_CONTRAST * min(given):
+            yield (
+                next(reversed(values)).partition(".")[0],
+                rule(
+                    f"has {name} of {min(given):g} to {max(given):g} in one run: more than {MOST_CONTRAST:g} to 1, "
+                    "which is as good as rigid, is not solved; pin or lead the stiff part"
+                ),
             )
-    return tables
+
+
+def regions_of_no_body(scene: Any) -> Iterator[Broken]:
+    """Yield the rules that regions which are of one body break in tables of all bodies."""
+    for kind in OF_REGIONS:
+        for number, table in enumerate(getattr(scene, kind) if scene.body else ()):
+            if table.region.relative or table.region.painted is not None:
+                sort = "relative" if table.region.relative else "painted"
+                words = f"may have no {sort} region beside [[body]], as {kind}.{number} has: whose it is only "
+                yield kind, rule(f"{words}[[body.{kind}]] says", "body")

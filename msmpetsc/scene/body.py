@@ -1,6 +1,5 @@
 """Tables of what the body is: surface, cells, material, parts, and regions of it."""
 
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
@@ -21,7 +20,6 @@ from msmpetsc.scene.values import (
     only_for,
 )
 
-MOST_CONTRAST = 1e6  # of parts: at 1e8 a squashed body took newton more than 1,200 iterations a step
 DEFAULT_STIFFENING = 10.0
 
 
@@ -172,22 +170,3 @@ class PartTable(OwnMaterial):
     """Cells of another material; of two parts that hold a cell, the last that gives a key has its say."""
 
     region: Region = Field(description="the cells whose middles lie in it")
-
-
-def refuse_unlike(material: Material | None, others: Mapping[str, OwnMaterial]) -> None:
-    """Raise a broken rule where others, by their keys, do not go with the material; None: it is not known.
-
-    Stiffness and Young's modulus are two ways to name all springs.
-    """
-    for key, other in others.items():
-        for name in Material.one_of:
-            if material is not None and getattr(other, name) is not None and getattr(material, name) is None:
-                raise rule(f"may give {name} only where material does, as {key} does", "material")
-    for name in (*Material.one_of, "density"):
-        tables = (material, *others.values())
-        values = [value for table in tables if (value := getattr(table, name, None)) is not None]
-        if values and max(values) > MOST_CONTRAST * min(values):
-            raise rule(
-                f"has {name} of {min(values):g} to {max(values):g} in one run: more than {MOST_CONTRAST:g} to 1, "
-                "which is as good as rigid, is not solved; pin or lead the stiff part"
-            )

@@ -1,7 +1,7 @@
-"""Tables of what moves the body: time, its start, gravity, pins, anchors, forces."""
+"""Tables of what moves the body: its start, gravity, pins, anchors, forces."""
 
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import (
     AfterValidator,
@@ -10,7 +10,6 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     TypeAdapter,
-    ValidationInfo,
     WithJsonSchema,
     field_validator,
     model_validator,
@@ -18,70 +17,16 @@ from pydantic import (
 
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import rule
-from msmpetsc.scene.statics import STATIC, no_wait
 from msmpetsc.scene.values import (
     Direction,
     FunctionName,
-    IntegratorName,
     ListOf,
     NotNegative,
     Positive,
     Table,
     Vector,
     after_start,
-    only_for,
 )
-
-MOST_STEPS = 10**9
-
-
-def _wanted_in_motion(schema: dict[str, Any]) -> None:
-    """Say in the JSON schema that only statics may do without a step and a duration (``statics.one_state``)."""
-    is_static = {"properties": {"integrator": {"const": STATIC}}, "required": ["integrator"]}
-    schema.update({"if": is_static, "else": {"required": schema.pop("required")}})
-
-
-class Time(Table):
-    """Simulated time."""
-
-    model_config = ConfigDict(json_schema_extra=_wanted_in_motion)
-    step: Positive = Field(description="time step; required but of statics that stay the same if absent [s]")
-    duration: Positive = Field(description="simulated time; required but of statics that stay the same if absent [s]")
-    integrator: IntegratorName = Field(
-        "implicit-euler",
-        description="how a step is taken: solved at once, of first or second order; in explicit substeps; or as a "
-        "state of equilibrium",
-    )
-    substep: Positive | None = Field(
-        None, description='longest substep of integrator = "verlet"; under the stability limit if absent [s]'
-    )
-
-    until: Literal["duration", "rest"] = Field(
-        "duration", description="when the run ends: or as soon as all is at rest"
-    )
-    error: float | None = Field(
-        None, gt=0, lt=1, description="of the motion, relative: steps are as long as it allows, all alike if absent [-]"
-    )
-    shortest: Positive | None = Field(None, description="of the steps that error chooses; step / 1024 if absent [s]")
-    longest: Positive | None = Field(None, description="of them; 64 step if absent [s]")
-
-    _has_a_use = field_validator("substep")(only_for("integrator", "verlet"))
-    _moves = field_validator("until")(no_wait)
-
-    @field_validator("duration")
-    @classmethod
-    def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
-        step = info.data.get("step", duration)
-        if duration / step > MOST_STEPS:
-            raise rule(f"holds too many steps of {step:g} s", "step")
-        if round(duration / step) < 1:
-            raise rule(f"must hold at least one step of {step:g} s", "step")
-        return duration
-
-    @property
-    def steps(self) -> int:
-        """Number of time steps."""
-        return round(self.duration / self.step)
 
 
 class Twist(Table):
@@ -139,25 +84,7 @@ def _ascending(path: tuple[Keyframe, ...]) -> tuple[Keyframe, ...]:
 
 Path3 = Annotated[ListOf[Keyframe], AfterValidator(_ascending)]
 
-
 PATH = "from no displacement at time 0 in straight lines through these, and staying at the last"
-
-
-class SelfContactTable(Table):
-    """The surface does not cross itself, nor one part of it another."""
-
-    distance: Positive | None = Field(
-        None,
-        description="parts nearer than this push each other [m]; if absent 3e-4 of the rest bounding box's diagonal, "
-        "or the median distance of a coarser surface from the body's own if that is more",
-    )
-    friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
-    surface: int | None = Field(
-        None,
-        ge=4,
-        lt=2**63,
-        description="triangles of a coarser surface that meets itself in its place [-]; the whole surface if absent",
-    )
 
 
 class Pin(Table):

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from msmpetsc.errors import nearest, printable
 
 KeyPath = tuple[str | int, ...]
+Broken = tuple[str, PydanticCustomError]  # a key of a table, and the rule that it breaks
 
 SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
 MOST_REPORTED = 100  # problems of a file

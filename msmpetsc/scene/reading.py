@@ -3,21 +3,71 @@
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
+from html import escape
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import tomli_w
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.problems import as_given, problem_lines
-from msmpetsc.scene.schema import Scene, SceneFile
-from msmpetsc.scene.toml import DEEPEST, plain, toml_of
+from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
 OF_STUDIES = {"scene", "sweep", "map"}  # tables that a study has and a scene has not
 MESHES = (".ply", ".mz3", ".vtu", ".vtk", ".obj", ".stl", ".off", ".glb", ".gltf")  # those of geometry/readers.py
 LONGEST = 2**24  # [byte] of a scene: painted points may stand in it by their numbers
+
+
+class Scene(SceneFile):
+    """A scene as read: its tables, its TOML text as run, and the folder its paths start from.
+
+        scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
+        softer = scene.changed({"material.young_modulus": 2e4})
+
+    Changes are those of ``--set``: any key of a scene, items of lists by their numbers ("pin.0.region").
+    """
+
+    text: str = Field("", description="the TOML text, overrides included")
+    folder: Path = Field(Path(), description="folder of the file")
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], changes: Mapping[str, Any] | None = None) -> "Scene":
+        """Read a scene file. Raises InputError naming every problem, one a line."""
+        return load_scene(Path(path), overrides_of(changes or {}))
+
+    @classmethod
+    def of(
+        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Mapping[str, Any] | None = None
+    ) -> "Scene":
+        """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
+
+        folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
+
+        Raises InputError naming every problem, one a line.
+        """
+        return scene_in(Path(folder), tables, overrides_of(changes or {}))
+
+    def changed(self, changes: Mapping[str, Any]) -> "Scene":
+        """Return this scene with changes, checked as a whole. Raises InputError."""
+        return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
+
+    def __repr__(self) -> str:
+        """Return one line: title, meshes, cells, integrator and steps; ``text`` has all of it."""
+        meshes = ", ".join(mesh.source for mesh in self.meshes.values())
+        cages, time = self.cages, self.time
+        cells = f"{cages.count} cells" if cages.cell_size is None else f"cells of {cages.cell_size:g} m"
+        return f"Scene({self.title!r}: {cells} of {meshes}, {time.integrator}, {time.steps} steps)"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        """Return the scene as a notebook shows it: its title over its text."""
+        title = f"<b>{escape(self.title)}</b>" if self.title else ""
+        return f"{title}<pre>{escape(self.text)}</pre>"
 
 
 def load_scene(

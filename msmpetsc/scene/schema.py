@@ -1,29 +1,18 @@
-"""The schema of a scene: frozen, validated tables. What a key means and its unit stand in its description."""
+"""The schema of a scene file: frozen, validated tables. What a key means and its unit stand in its description."""
 
-from collections.abc import Iterator, Mapping
-from html import escape
+from collections.abc import Iterator
 from itertools import chain
-from os import PathLike
-from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from msmpetsc.scene.bodies import (
-    OF_REGIONS,
-    BodyTable,
-    OfBody,
-    as_the_material,
-    no_moving_body,
-    of_all_bodies,
-    tables_of,
-)
+from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, tables_of, unlike_the_material
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
-from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, SelfContactTable, Start, Time
-from msmpetsc.scene.obstacle import ObstacleTable
-from msmpetsc.scene.problems import KeyPath
-from msmpetsc.scene.statics import no_damping, no_functions, no_motion, obstacles_fit, one_state, only_implicit
-from msmpetsc.scene.toml import overrides_of, toml_of
+from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
+from msmpetsc.scene.obstacles import ObstacleTable, SelfContactTable
+from msmpetsc.scene.problems import Broken, KeyPath
+from msmpetsc.scene.statics import one_state, unlike_the_integrator
+from msmpetsc.scene.time import Time
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
 
 
@@ -97,19 +86,14 @@ class SceneFile(Table):
     budget: BudgetTable | None = Field(None, description="the surface error that `plan` expects; for the reader")
     picture: Picture = Field(Picture.model_validate({}), description="how the result is drawn")
 
-    _of_one_kind = field_validator("body", "part")(as_the_material)
-    _is_damped_in_motion = field_validator("time")(no_damping)
-    _of_all_bodies = field_validator(*OF_REGIONS)(of_all_bodies)
-    _starts_at_rest = field_validator("start")(no_motion)
-    _start_at_rest = field_validator("body")(no_moving_body)
-    _fits_the_integrator = field_validator("obstacle")(obstacles_fit)
-    _is_given = field_validator("force")(no_functions)
-    _meets_itself = field_validator("self_contact")(only_implicit)
-
     @model_validator(mode="before")
     @classmethod
     def _of_one_state(cls, data: Any) -> Any:
         return one_state(data)
+
+    def broken_rules(self) -> Iterator[Broken]:
+        """Yield the rules that the tables break among each other."""
+        return chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
 
     @property
     def stored(self) -> int:
@@ -145,55 +129,3 @@ class SceneFile(Table):
         for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):
             if isinstance(table.region.painted, str):
                 yield (*path, "region", "painted"), table.region.painted
-
-
-class Scene(SceneFile):
-    """A scene as read: its tables, its TOML text as run, and the folder its paths start from.
-
-        scene = msmpetsc.Scene.load("scenes/bunny_fall.toml", {"cages.count": 3000})
-        softer = scene.changed({"material.young_modulus": 2e4})
-
-    Changes are those of ``--set``: any key of a scene, items of lists by their numbers ("pin.0.region").
-    """
-
-    text: str = Field("", description="the TOML text, overrides included")
-    folder: Path = Field(Path(), description="folder of the file")
-
-    @classmethod
-    def load(cls, path: str | PathLike[str], changes: Mapping[str, Any] | None = None) -> "Scene":
-        """Read a scene file. Raises InputError naming every problem, one a line."""
-        from msmpetsc.scene.reading import load_scene  # which makes scenes
-
-        return load_scene(Path(path), overrides_of(changes or {}))
-
-    @classmethod
-    def of(
-        cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Mapping[str, Any] | None = None
-    ) -> "Scene":
-        """Make a scene of tables as its file would have them: {"mesh": {"source": "body.obj"}, ...}.
-
-        folder : where the paths that it names start; they may lead anywhere, and numpy's arrays stand for lists
-
-        Raises InputError naming every problem, one a line.
-        """
-        from msmpetsc.scene.reading import scene_in
-
-        return scene_in(Path(folder), tables, overrides_of(changes or {}))
-
-    def changed(self, changes: Mapping[str, Any]) -> "Scene":
-        """Return this scene with changes, checked as a whole. Raises InputError."""
-        return Scene.of(toml_of(self.text), self.folder, changes) if changes else self
-
-    def __repr__(self) -> str:
-        """Return one line: title, meshes, cells, integrator and steps; ``text`` has all of it."""
-        meshes = ", ".join(mesh.source for mesh in self.meshes.values())
-        cages, time = self.cages, self.time
-        cells = f"{cages.count} cells" if cages.cell_size is None else f"cells of {cages.cell_size:g} m"
-        return f"Scene({self.title!r}: {cells} of {meshes}, {time.integrator}, {time.steps} steps)"
-
-    __str__ = __repr__
-
-    def _repr_html_(self) -> str:
-        """Return the scene as a notebook shows it: its title over its text."""
-        title = f"<b>{escape(self.title)}</b>" if self.title else ""
-        return f"{title}<pre>{escape(self.text)}</pre>"

@@ -4,9 +4,7 @@ surface that meets itself want implicit steps."""
 from collections.abc import Iterator
 from typing import Any, Final
 
-from pydantic import ValidationInfo
-
-from msmpetsc.scene.problems import rule
+from msmpetsc.scene.problems import Broken, rule
 
 STATIC: Final = "static"  # time.integrator
 IMPLICIT = ("implicit-euler", "bdf2")
@@ -39,95 +37,43 @@ def _changes(load: dict[str, Any]) -> bool:
     return isinstance(load.get("total"), dict) or "function" in load or any(name in load for name in OF_TIME)
 
 
-def _is_static(info: ValidationInfo) -> bool:
-    return getattr(info.data.get("time"), "integrator", None) == STATIC
+def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
+    """Yield the rules that tables of a scene break by its integrator."""
+    integrator = scene.time.integrator
+    if integrator == STATIC:
+        yield from _moving(scene)
+    if scene.self_contact and integrator not in IMPLICIT:
+        words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
+        yield "self_contact", rule(words, "time")
+    for number, obstacle in enumerate(scene.obstacle):
+        if obstacle.response != "exchange":
+            continue
+        if integrator == "bdf2":  # a step would see that nodes were set back
+            words = f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
+            yield "obstacle", rule(f'{words}one step; "reflect" and "penalty" go', "time")
+        if scene.self_contact:
+            words = f'may not go with response = "exchange", as obstacle.{number} has it: that moves nodes past each '
+            yield "self_contact", rule(f'{words}other; "reflect" and "penalty" press', "obstacle")
 
 
-def no_wait(cls: Any, until: str, info: ValidationInfo) -> str:
-    """Refuse to wait for rest where there is nothing else (a validator of ``time.until``)."""
-    if until == "rest" and info.data.get("integrator") == STATIC:
-        raise rule(f'has no meaning for integrator = "{STATIC}": each state is at rest', "integrator")
-    return until
-
-
-def no_damping(cls: Any, time: Any, info: ValidationInfo) -> Any:
-    """Refuse damping where nothing moves (a validator of ``time``)."""
-    if time.integrator == STATIC and getattr(info.data.get("material"), "damping", 0.0):
-        raise rule(f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves', "material")
-    return time
-
-
-def no_motion(cls: Any, start: Any, info: ValidationInfo) -> Any:
-    """Refuse a start in motion (a validator of ``start``)."""
-    refuse_motion(start, info)
-    return start
-
-
-def refuse_motion(start: Any, info: ValidationInfo, whose: str = "") -> None:
-    """Raise a broken rule for a start in motion; ``whose`` it is, for the message."""
-    if start is not None and _is_static(info) and (any(start.velocity) or any(start.spin)):
-        words = f'{whose}may have no velocity or spin where time.integrator = "{STATIC}": there is no inertia'
-        raise rule(words, "time")
-
-
-def obstacles_fit(cls: Any, obstacles: Any, info: ValidationInfo) -> Any:
-    """Refuse obstacles that do not go with the integrator (a validator of ``obstacle``).
-
-    The paper's exchange sets nodes back, which a step of BDF2 would see; in statics nothing bounces or rubs.
-    """
-    integrator = getattr(info.data.get("time"), "integrator", None)
-    for number, obstacle in enumerate(obstacles):
-        if integrator == "bdf2" and obstacle.response == "exchange":
-            raise rule(
-                f'may not be "bdf2" with response = "exchange", as obstacle.{number} has it: it sets nodes back by '
-                'one step; "reflect" and "penalty" go',
-                "time",
-            )
-        if integrator == STATIC and obstacle.response != "penalty":
-            raise rule(
-                f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: nothing '
-                'strikes it; response = "penalty" presses',
-                "time",
-            )
-        if integrator == STATIC and obstacle.friction:
-            raise rule(
-                f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on the '
-                'way there; time.until = "rest" ends a run in motion there',
-                "time",
-            )
-    return obstacles
-
-
-def no_functions(cls: Any, forces: Any, info: ValidationInfo) -> Any:
-    """Refuse forces that go by the state (a validator of ``force``)."""
-    refuse_functions(forces, info)
-    return forces
-
-
-def refuse_functions(forces: Any, info: ValidationInfo, whose: str = "") -> None:
-    """Raise a broken rule for forces that go by the state; ``whose`` they are, for the message."""
-    for number, force in enumerate(forces if _is_static(info) else ()):
-        if force.function is not None:
-            raise rule(
-                f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is that of '
-                "the state before, which is not at rest under it",
-                "time",
-            )
-
-
-def only_implicit(cls: Any, table: Any, info: ValidationInfo) -> Any:
-    """Refuse integrators that take other steps than implicit ones, and obstacles that set nodes back (a validator of
-    ``self_contact``)."""
-    if table is None:
-        return table
-    integrator = getattr(info.data.get("time"), "integrator", IMPLICIT[0])
-    if integrator not in IMPLICIT:
-        raise rule(f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"', "time")
-    for number, obstacle in enumerate(info.data.get("obstacle", ())):
-        if obstacle.response == "exchange":
-            raise rule(
-                f'may not go with response = "exchange", as obstacle.{number} has it: that moves nodes past each '
-                'other; "reflect" and "penalty" press',
-                "obstacle",
-            )
-    return table
+def _moving(scene: Any) -> Iterator[Broken]:
+    """Yield the rules that a scene of statics breaks by what moves, goes by the state, bounces or rubs."""
+    if scene.material.damping:
+        words = f'may not have integrator = "{STATIC}" where material.damping is given: nothing moves'
+        yield "time", rule(words, "material")
+    bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
+    for key, whose, tables in [("", "", scene), *bodies]:
+        if tables.start is not None and (any(tables.start.velocity) or any(tables.start.spin)):
+            words = f'{key and f"{whose}start "}may have no velocity or spin where time.integrator = "{STATIC}": '
+            yield key or "start", rule(f"{words}there is no inertia", "time")
+        for number, force in enumerate(tables.force):
+            if force.function is not None:
+                words = f'may be no function where time.integrator = "{STATIC}", as {whose}force.{number} is: it is '
+                yield key or "force", rule(f"{words}that of the state before, which is not at rest under it", "time")
+    for number, obstacle in enumerate(scene.obstacle):
+        if obstacle.response != "penalty":
+            words = f'may not {obstacle.response} where time.integrator = "{STATIC}", as obstacle.{number} does: '
+            yield "obstacle", rule(f'{words}nothing strikes it; response = "penalty" presses', "time")
+        if obstacle.friction:
+            words = f'may have no friction where time.integrator = "{STATIC}", as obstacle.{number} has: it depends on '
+            yield "obstacle", rule(f'{words}the way there; time.until = "rest" ends a run in motion there', "time")

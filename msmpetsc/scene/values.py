@@ -1,7 +1,7 @@
 """Types of the values of a scene's keys, and the table that all tables are."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
@@ -15,8 +15,9 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
+from pydantic_core import InitErrorDetails
 
-from msmpetsc.scene.problems import one_of_problems, restated, rule, unknown_name
+from msmpetsc.scene.problems import Broken, one_of_problems, restated, rule, unknown_name
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -111,6 +112,10 @@ class Table(BaseModel):
     )
     one_of: ClassVar[tuple[str, ...]] = ()
 
+    def broken_rules(self) -> Iterator[Broken]:
+        """Yield the rules between its keys that a table breaks, each of which is sound by itself."""
+        return iter(())
+
     @model_validator(mode="wrap")
     @classmethod
     def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
@@ -119,6 +124,9 @@ class Table(BaseModel):
         problems = one_of_problems(data, cls.one_of, known)
         try:
             table = handler(data)
+            problems += [
+                InitErrorDetails(type=broken, loc=(key,), input=data.get(key)) for key, broken in table.broken_rules()
+            ]
         except ValidationError as error:
             problems += restated(error, known)
         if problems:

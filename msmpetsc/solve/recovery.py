@@ -6,8 +6,9 @@ from dataclasses import replace
 from msmpetsc.checkpoint import COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.scene.motion import Time
-from msmpetsc.scene.schema import Scene, Solver
+from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.protocol import Integrator
 from msmpetsc.solve.integrators.state import State

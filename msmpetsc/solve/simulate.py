@@ -16,7 +16,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import INTEGRATORS, make_integrator

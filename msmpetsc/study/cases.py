@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.study.forkserver import COLD
 from msmpetsc.study.schema import Axis, Length, Map, Method, ReferenceRun, Study, StudyScene, Sweep
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from msmpetsc.build import Model
-    from msmpetsc.scene.schema import Scene
+    from msmpetsc.scene.reading import Scene
     from msmpetsc.view.camera import Camera
 
 DRAWN = ("lattice/cells", "surface/points", "surface/triangles", "frames/kinetic", "frames/elastic", "frames/potential")

@@ -112,7 +112,7 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     [
         (["--ranks", "0"], "--ranks must be at least 1"),
         (["--set", "cages.cuont=3"], "did you mean 'count'"),
-        (["--ranks", "many"], "invalid int value"),
+        (["--ranks", "many"], "--ranks must be at least 1, not many"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, words: list[str], said: str):

@@ -9,7 +9,7 @@ import trimesh
 from msmpetsc.contact.obstacles.distance import FunctionSolid
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
-from msmpetsc.scene.obstacle import ObstacleTable
+from msmpetsc.scene.obstacles import ObstacleTable
 
 SIDE, GAP, REACH = 0.1, 0.001, 0.002  # [m]
 

@@ -6,10 +6,10 @@ import tomllib
 import pytest
 from conftest import ROOT
 
+from msmpetsc.cli.commands.new import shipped_text, shipped_titles
 from msmpetsc.errors import InputError
 from msmpetsc.scene.keys import SceneKey, json_schema, keys
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.scene.shipped import shipped_text, shipped_titles
 
 
 def key(name: str) -> SceneKey:

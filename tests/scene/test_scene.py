@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Scene, SceneFile
+from msmpetsc.scene.reading import Scene, load_scene
+from msmpetsc.scene.schema import SceneFile
 
 EXAMPLE = """\
 title = "Bunny falls and leaps"

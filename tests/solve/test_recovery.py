@@ -16,8 +16,7 @@ from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.nonlinear.failure import REASON
 from msmpetsc.solve.simulate import Simulation
 from msmpetsc.study.distances import distance_of_shapes

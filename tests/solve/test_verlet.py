@@ -17,9 +17,9 @@ from msmpetsc.fields import Frame
 from msmpetsc.lattice.initial_state import at_rest
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.results.reader import Result
-from msmpetsc.scene.motion import Time
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators import verlet
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet

@@ -9,8 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from xml.etree import ElementTree
 
-from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_below_one, refuse_other_format
-from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
+from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
@@ -41,8 +40,6 @@ class Checked:
 
 def run(args: argparse.Namespace) -> int:
     """Run each scene, and compare or store its numbers; return the exit status."""
-    refuse_ranks("check", RUNS_ITSELF)
-    refuse_below_one(ranks=args.ranks, frames=args.frames, cells=args.cells)
     refuse_other_format("--junit", args.junit, XML_NAMES)
     refuse_other_format("--baseline", args.baseline, MEASURE_NAMES)
     if args.baseline and len(args.scenes) > 1:
@@ -91,8 +88,6 @@ def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
             baseline.simulate(scene, recipe, path, ranks)
         except RuntimeError as error:
             raise InputError(f"{scene}: the run failed: {error}") from None
-        except OSError as error:  # of a full disk, of an mpiexec that is not there
-            raise InputError(f"{error.filename}: {error.strerror}") from None
         return baseline.summary(path, recipe)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.results.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.results.reader import Result, refuse_deadly
@@ -19,7 +18,6 @@ HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11}
 
 def run(args: argparse.Namespace) -> int:
     """Compare two results; return the exit status."""
-    refuse_ranks("compare", "it reads two files, which one process does alone")
     if not 0 <= args.rtol < np.inf:
         raise InputError(f"--rtol must be a number from 0 on, not {args.rtol:g}")
     names = None if args.fields is None else [name.strip() for name in args.fields.split(",")]

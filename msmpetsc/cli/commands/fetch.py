@@ -3,14 +3,12 @@
 import argparse
 import sys
 
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import MODELS, fetch, find
 
 
 def run(args: argparse.Namespace) -> int:
     """Fetch each named model and print its path and licence, or print the table."""
-    refuse_ranks("fetch", "it downloads on one process")
     if args.list:
         print("\n".join(_table()))
     elif not args.names:

@@ -11,13 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.checks import refuse_below_one
 from msmpetsc.app.profile import peak_memory
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.petsc.initialise import initialise
 
 if TYPE_CHECKING:
@@ -35,8 +32,6 @@ WIDTH = 36  # of the first column
 
 def run(args: argparse.Namespace) -> int:
     """Inspect a scene; return the exit status."""
-    refuse_ranks("inspect", "it counts for --ranks R on one process")
-    refuse_below_one(ranks=args.ranks)
     if args.ranks > MOST_RANKS:
         raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])

@@ -3,7 +3,6 @@
 import argparse
 from dataclasses import astuple
 
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.scene.keys import keys
 
 HEAD = ("key", "unit", "default", "range", "meaning")
@@ -11,7 +10,6 @@ HEAD = ("key", "unit", "default", "range", "meaning")
 
 def run(args: argparse.Namespace) -> int:
     """Print a line a key; return the exit status."""
-    refuse_ranks("keys", "it prints on one process")
     rows = [HEAD, *(astuple(key) for key in keys(args.table or ""))]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     for *columns, meaning in rows:

@@ -4,23 +4,24 @@ import argparse
 import json
 from pathlib import Path
 
+import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
-from msmpetsc.scene.shipped import shipped_text, shipped_titles
+from msmpetsc.scene.toml import toml_of
 from msmpetsc.study.drafting.draft import draft, upwards
 from msmpetsc.study.drafting.measures import MeshMeasures, measured
+
+SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the scene, or list those that come with msmpetsc; return the exit status."""
-    refuse_ranks("new", "it measures a mesh on one process")
     if args.list:
         titles = shipped_titles()
         print("\n".join(f"{name:{max(map(len, titles))}}  {title}" for name, title in titles.items()))
@@ -83,3 +84,19 @@ def write(path: Path, text: str) -> None:
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8")
         write_whole(path.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
+
+
+def shipped_titles() -> dict[str, str]:
+    """Return the title of each scene that comes with the package. Raises InputError where the package lacks them."""
+    files = sorted(SHIPPED.glob("*.toml"))
+    if not files:
+        raise InputError(f"{SHIPPED} has no scenes: this msmpetsc was installed without them")
+    return {path.stem: toml_of(path.read_text(encoding="utf-8")).get("title", "") for path in files}
+
+
+def shipped_text(name: str) -> str:
+    """Return the text of a scene that comes with the package. Raises InputError for a name that is none."""
+    titles = shipped_titles()
+    if name not in titles:
+        raise InputError(f"no scene {name!r} comes with msmpetsc{did_you_mean(name, titles)}: msmpetsc new --list")
+    return (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")

@@ -3,7 +3,6 @@
 import argparse
 import json
 import shlex
-import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -12,8 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msmpetsc.app.checks import PICTURE_NAMES, refuse_below_one, refuse_other_format
-from msmpetsc.cli.ranks import RUNS_ITSELF, interrupt, refuse_ranks
+from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
 
@@ -29,17 +27,12 @@ HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8}
 
 def run(args: argparse.Namespace) -> int:
     """Plan a scene; return the exit status."""
-    refuse_ranks("plan", RUNS_ITSELF)
     target = args.surface_error
     if not 0 < target < 1:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
-    refuse_below_one(frames=args.frames, ranks=args.ranks, cells=args.cells)
     refuse_other_format("--chart", args.chart, PICTURE_NAMES)
-    try:
-        with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
-            met, record = run_sizes(args, target)
-    except OSError as error:  # of a full disk, of an mpiexec that is not there
-        raise InputError(f"{error.filename}: {error.strerror}") from None
+    with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
+        met, record = run_sizes(args, target)
     if args.json:
         print(json.dumps({"met": met, "target": target, **record}, indent=1))
     return 0 if met else NOTHING_MEETS
@@ -51,7 +44,6 @@ def bench() -> Iterator["Bench"]:
     from msmpetsc.study.process import Processes
     from msmpetsc.study.runner import Bench
 
-    signal.signal(signal.SIGTERM, interrupt)
     processes = Processes()
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
         try:

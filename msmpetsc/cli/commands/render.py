@@ -13,10 +13,8 @@ from msmpetsc.app.checks import (
     PICTURE_NAMES,
     RESULT_NAMES,
     SCENE_NAMES,
-    refuse_below_one,
     refuse_other_format,
 )
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface
@@ -44,8 +42,6 @@ TURN_FPS = 30  # pictures a second of a body that is turned around
 
 def run(args: argparse.Namespace) -> int:
     """Draw what is asked for and print its path; return the exit status."""
-    refuse_ranks("render", "it draws on one process")
-    refuse_below_one(count=args.count)
     refuse_other_format("-o", args.output, (*PICTURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES))
     path = args.output or args.subject.with_suffix(".png")
     ending = path.suffix.lower()

@@ -3,12 +3,10 @@
 import argparse
 import json
 
-from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.scene.keys import json_schema
 
 
 def run(_: argparse.Namespace) -> int:
     """Print the schema; return the exit status."""
-    refuse_ranks("schema", "it prints on one process")
     print(json.dumps(json_schema(), indent=1))
     return 0

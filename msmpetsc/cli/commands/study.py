@@ -1,37 +1,29 @@
 """``msmpetsc study``: sweep methods over scenes, into one table and a report."""
 
 import argparse
-import signal
 from pathlib import Path
 
-from msmpetsc.app.checks import refuse_below_one, refuse_name_of_a_file
-from msmpetsc.cli.ranks import RUNS_ITSELF, interrupt, refuse_ranks
+from msmpetsc.app.checks import refuse_name_of_a_file
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; return the exit status."""
-    refuse_ranks("study", RUNS_ITSELF)
-    refuse_below_one(jobs=args.jobs)
     refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
     from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.runner import run_study
 
-    signal.signal(signal.SIGTERM, interrupt)
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
         print_cases(args, folder)
         return 0
-    try:
-        rows = run_study(
-            args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
-        )
-    except OSError as error:  # of the folder, of a full disk, of an mpiexec that is not there
-        raise InputError(f"{error.filename or folder}: {error.strerror}") from None
+    rows = run_study(
+        args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
+    )
     log_failures(rows)
     if part:
         print(part.folder(folder) / "table.csv")  # the study that joins the parts writes the report

@@ -19,8 +19,8 @@ from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.body import MeshTable
-from msmpetsc.scene.obstacle import ObstacleTable
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.obstacles import ObstacleTable
+from msmpetsc.scene.reading import Scene
 
 MOST_OFF = 0.01  # by which the gradient of a distance may differ from a unit vector in length
 

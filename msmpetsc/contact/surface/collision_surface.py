@@ -16,8 +16,8 @@ from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.scene.motion import SelfContactTable
-from msmpetsc.scene.schema import Scene
+from msmpetsc.scene.obstacles import SelfContactTable
+from msmpetsc.scene.reading import Scene
 
 NEAR = 3e-4  # of the bounding box's diagonal: the distance, if none is given
 MOST_CUT = 0.1  # of all triangles: with more of them left out, little would keep the rest apart

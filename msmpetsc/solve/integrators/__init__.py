@@ -4,8 +4,8 @@ from mpi4py import MPI
 
 from msmpetsc.build import Model
 from msmpetsc.environment import Environment
-from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.protocol import Integrator

@@ -22,8 +22,9 @@ from msmpetsc.comm import log
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.scene.motion import Time
-from msmpetsc.scene.schema import Scene, Solver
+from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
 from msmpetsc.solve.integrators.protocol import Integrator

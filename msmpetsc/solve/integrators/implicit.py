@@ -21,8 +21,8 @@ from msmpetsc.build import Model
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
-from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes, Trace
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.state import State

@@ -31,8 +31,8 @@ from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
+from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.stability_limit import HighestMode
 from msmpetsc.solve.integrators.state import State

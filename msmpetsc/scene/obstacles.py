@@ -1,4 +1,4 @@
-"""The table of what stands in the way of the body."""
+"""The tables of what stands in the way of the body, and of its surface in its own."""
 
 from typing import Literal
 
@@ -60,3 +60,20 @@ class ObstacleTable(Table):
             if getattr(self, name) is not None and not {self.shape, self.response} & set(use):
                 raise rule(f"has {name}, which is for {' or '.join(map(repr, use))} only")
         return self
+
+
+class SelfContactTable(Table):
+    """The surface does not cross itself, nor one part of it another."""
+
+    distance: Positive | None = Field(
+        None,
+        description="parts nearer than this push each other [m]; if absent 3e-4 of the rest bounding box's diagonal, "
+        "or the median distance of a coarser surface from the body's own if that is more",
+    )
+    friction: NotNegative = Field(0.0, description="Coulomb's coefficient [-]")
+    surface: int | None = Field(
+        None,
+        ge=4,
+        lt=2**63,
+        description="triangles of a coarser surface that meets itself in its place [-]; the whole surface if absent",
+    )

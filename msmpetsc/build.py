@@ -1,6 +1,6 @@
 """From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
@@ -11,7 +11,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Row
 from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.clamp import clamped
 from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
-from msmpetsc.constraints.loads import Anchor, Load, LoadTable, Motion, OwnForce, spread_by_mass
+from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
 from msmpetsc.contact.obstacles.obstacle import Obstacle
@@ -30,7 +30,9 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_e
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials
-from msmpetsc.scene.motion import ForceTable
+from msmpetsc.scene.bodies import OfBody
+from msmpetsc.scene.motion import ForceTable, Gravity
+from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
 
 SIDES = 1e-60, 1e60  # [m]: the fourth power of a length still is a double
@@ -133,21 +135,22 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
     points = shape.nearest(lattice) if has_regions else lattice.nodes
     masks = regions(scene, lattice, finder, points)
     lattice = lattice.pin(reduce(np.logical_or, (masks[pin.key] for pin in scene.tables("pin")), lattice.pinned))
-    anchors = _anchors(scene, lattice, masks)
+    anchors = _anchors(scene.tables("anchor"), lattice, masks)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.pinned)
     _check_that_something_moves(comm, lattice, fixed, anchors)
     reaches = reach_of(comm, scene, lattice, anchors, masks, finder)
     outside = shape.outside(lattice) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene, lattice, outside)
+    exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     return Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
         lattice=clamped(scene, lattice, masks, finder, points),
         embedding=shape.embedding if scene.output.surface else None,
-        loads=_loads(comm, scene, lattice, masks),
-        own_forces=_own_forces(scene, lattice, masks),
+        loads=_loads(comm, scene.gravity, scene.tables("force"), lattice, masks),
+        own_forces=_own_forces(scene.tables("force"), lattice, masks),
         anchors=anchors,
-        exchanges=_exchanges(scene, obstacles),
-        penalties=_penalties(comm, scene, lattice, finder.bounds, obstacles),
+        exchanges=exchanges,
+        penalties=penalties,
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
         collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
@@ -258,10 +261,11 @@ def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
     )
 
 
-def _anchors(scene: Scene, lattice: Lattice, masks: Regions) -> list[Anchor]:
+def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> list[Anchor]:
     """Return the anchors: a pin is stronger than an anchor, and of two anchors on a node the first."""
-    anchors, taken = [], lattice.pinned
-    for anchor in scene.tables("anchor"):
+    anchors = []
+    taken = lattice.pinned
+    for anchor in tables:
         where = masks[anchor.key] & ~taken
         anchors.append(Anchor(where, Motion.through(anchor.table.path), anchor.table.stop))
         taken = taken | where
@@ -274,26 +278,27 @@ def _check_that_something_moves(comm: MPI.Comm, lattice: Lattice, fixed: Mask, a
         raise InputError(f"{what}: every node of the lattice is held, nothing is left to move")
 
 
-def _loads(comm: MPI.Comm, scene: Scene, lattice: Lattice, masks: Regions) -> list[Load]:
+def _loads(
+    comm: MPI.Comm, gravity: Gravity | None, forces: Iterable[OfBody], lattice: Lattice, masks: Regions
+) -> list[Load]:
     loads = []
-    if scene.gravity is not None:
-        loads.append(Load(lattice.mass[:, None] * np.array(scene.gravity.acceleration), 0.0, None))
-    for table in scene.tables("force"):
-        if table.table.total is None:
-            continue
-        where, force = masks[table.key][: lattice.owned], table.table
+    if gravity is not None:
+        loads.append(Load(lattice.mass[:, None] * np.array(gravity.acceleration), 0.0, None))
+    for table in forces:
+        force = table.table
+        where = masks[table.key][: lattice.owned]
         if isinstance(force.total, ForceTable):
             share = spread_by_mass(comm, (1.0,), where, lattice.mass)
-            loads.append(Load(share, force.start, force.stop, LoadTable.of_scene(force.total)))
-        else:
+            loads.append(Load(share, force.start, force.stop, total_of(force.total)))
+        elif force.total is not None:
             loads.append(Load(spread_by_mass(comm, force.total, where, lattice.mass), force.start, force.stop))
     return loads
 
 
-def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
+def _own_forces(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> tuple[OwnForce, ...]:
     """Return the forces that are functions. Raises InputError for a name that is neither registered nor installed."""
     forces = []
-    for table in scene.tables("force"):
+    for table in tables:
         force = table.table
         if force.function is not None:
             rows = np.flatnonzero(masks[table.key][: lattice.owned])
@@ -302,29 +307,22 @@ def _own_forces(scene: Scene, lattice: Lattice, masks: Regions) -> tuple[OwnForc
     return tuple(forces)
 
 
-def _exchanges(scene: Scene, obstacles: list[Obstacle]) -> list[Exchange]:
-    pairs = zip(obstacles, scene.obstacle, strict=True)
-    return [
-        Exchange(obstacle, 1.0 if table.restitution is None else table.restitution)
-        for obstacle, table in pairs
-        if table.response == "exchange"
-    ]
+def _contacts(
+    comm: MPI.Comm, tables: Sequence[ObstacleTable], lattice: Lattice, bounds: Rows, obstacles: list[Obstacle]
+) -> tuple[list[Exchange], list[Penalty]]:
+    """Return how nodes meet the obstacles, by their tables (collective).
 
-
-def _penalties(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, bounds: Rows, obstacles: list[Obstacle]
-) -> list[Penalty]:
-    pressing = [pair for pair in zip(obstacles, scene.obstacle, strict=True) if pair[1].response != "exchange"]
-    if not pressing:
-        return []
-    usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
-    return [
-        Penalty(
-            obstacle,
-            o.stiffness or usual,
-            o.friction or 0.0,
-            stick,
-            None if o.restitution == 1 else o.restitution,
-        )
-        for obstacle, o in pressing
-    ]
+    bounds : (b, 2, 3) of the bodies at rest [m]
+    """
+    exchanges, penalties = [], []
+    if tables:
+        usual, stick = PENALTY * lattice.stiffest(comm), STICK * (bounds[:, 1] - bounds[:, 0]).max()
+    for obstacle, table in zip(obstacles, tables, strict=True):
+        restitution = 1.0 if table.restitution is None else table.restitution
+        if table.response == "exchange":
+            exchanges.append(Exchange(obstacle, restitution))
+            continue
+        stiffness, friction = table.stiffness or usual, table.friction or 0.0
+        slows = None if restitution == 1 else restitution
+        penalties.append(Penalty(obstacle, stiffness, friction, stick, slows))
+    return exchanges, penalties

@@ -70,10 +70,6 @@ DRAWN = [
 ]
 
 
-def test_what_runs_alone_need_is_named():
-    assert {"mpi4py", "petsc4py", "numba"} <= set(OF_RUNS)
-
-
 @pytest.mark.parametrize("command", DRAWN)
 def test_drawing_exporting_and_comparing_need_neither_mpi_nor_petsc_nor_a_compiler(
     command: str, tmp_path: Path, ball: Path, monkeypatch
@@ -92,11 +88,6 @@ def test_exporting_and_comparing_need_the_core_alone(command: str, tmp_path: Pat
     small_result.write(tmp_path / "x.h5")
     done = without(tuple(package for packages in EXTRAS.values() for package in packages), *command.split())
     assert done.returncode == 0, done.stderr
-
-
-def test_drawing_names_the_extra_that_draws_where_runs_need_the_package_too(tmp_path: Path):
-    done = without(("pydantic",), "render", small_result.write(tmp_path / "x.h5"))
-    assert (done.returncode, "msmpetsc[render]" in done.stderr) == (2, True), done.stderr
 
 
 def in_the_clean(python: Path, *words: object, folder: Path) -> subprocess.CompletedProcess:
@@ -129,30 +120,21 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
     assert refused.returncode == 2 and "msmpetsc[run]" in refused.stderr
 
 
-@pytest.mark.parametrize("package", ["mpi4py", "petsc4py", "numba", "trimesh"])
-def test_a_run_without_what_it_needs_names_the_extra(package: str, tmp_path: Path):
-    done = without((package,), "run", ROOT / "scenes" / "studies" / "beam_soft.toml", "-o", tmp_path / "x.h5")
-    assert done.returncode == 2, done.stderr
-    assert done.stderr == f"msmpetsc: error: {package} is not installed: pip install 'msmpetsc[run]' brings it\n"
+BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
+NEEDED = {  # a package that is missing -> the extra that brings it, and a command that needs it
+    **{name: ("run", ["run", BEAM, "-o", "y.h5"]) for name in ("mpi4py", "petsc4py", "numba", "trimesh")},
+    "pydantic": ("render", ["render", "x.h5"]),
+    "pyvista": ("render", ["render", "x.h5", "-o", "x.png"]),
+    "manifold3d": ("mesh", ["run", BEAM, "-o", "y.h5", "--set", 'mesh.prepare=["union"]']),
+    "ipctk": ("contact", ["run", BEAM, "-o", "y.h5", "--set", "self_contact.distance=1e-3"]),
+}
 
 
-def test_a_picture_without_its_packages_names_the_extra(tmp_path: Path):
+@pytest.mark.parametrize("package", NEEDED)
+def test_what_needs_a_package_names_the_extra_that_brings_it(package: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     small_result.write(tmp_path / "x.h5")
-    done = without(("pyvista",), "render", tmp_path / "x.h5", "-o", tmp_path / "x.png")
-    assert done.returncode == 2 and done.stderr.startswith("msmpetsc: error: pyvista"), done.stderr
-    assert done.stderr.count("\n") == 1 and "msmpetsc[render]" in done.stderr
-
-
-def test_a_mesh_without_its_package_names_the_extra(tmp_path: Path):
-    beam = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
-    done = without(("manifold3d",), "run", beam, "-o", tmp_path / "x.h5", "--set", 'mesh.prepare=["union"]')
-    assert done.returncode == 2 and "manifold3d is not installed" in done.stderr, done.stderr
-    assert "msmpetsc[mesh]" in done.stderr
-
-
-def test_self_contact_without_its_package_names_the_extra(tmp_path: Path):
-    beam, touching = ROOT / "scenes" / "studies" / "atlas" / "beam.toml", ("--set", "self_contact.distance=1e-3")
-    done = without(("ipctk",), "run", beam, "-o", tmp_path / "x.h5", *touching)
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.endswith("ipctk is not installed: pip install 'msmpetsc[contact]' brings it\n"), done.stderr
-    assert without(("ipctk",), "run", beam, "-o", tmp_path / "x.h5", "--frames", "1").returncode == 0
+    extra, command = NEEDED[package]
+    done = without((package,), *command)
+    assert done.returncode == 2 and done.stderr.count("error") == 1, done.stderr
+    assert done.stderr.endswith(f"{package} is not installed: pip install 'msmpetsc[{extra}]' brings it\n"), done.stderr

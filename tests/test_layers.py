@@ -4,7 +4,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from house import HEIGHT
 
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
@@ -56,26 +55,3 @@ def test_every_file_keeps_to_its_layer():
     assert set(layers.values()) <= set(HEIGHT), "a file or folder that LAYERS does not know"
     found = {str(path.relative_to(PACKAGE)): violations(layers[path], path.read_text()) for path in files}
     assert {path: wrong for path, wrong in found.items() if wrong} == {}
-
-
-@pytest.mark.parametrize(
-    ("layer", "source", "expected"),
-    [
-        ("geometry", "from msmpetsc.lattice.lattice import Lattice", "geometry imports lattice"),
-        ("scene", "import msmpetsc.geometry.surface", "scene imports geometry"),
-        ("errors", "from msmpetsc import comm", "errors imports comm"),
-        ("results", "def late():\n    from msmpetsc.solve.nonlinear.step import Stepper", "results imports solve"),
-        ("lattice", "from ..solve import step", "relative import ..solve.step"),
-        ("lattice", "from petsc4py import PETSc", "petsc4py in lattice"),
-        ("study", "import petsc4py", "petsc4py in study"),
-        ("solve", "import argparse", "argparse in solve"),
-        ("solve", "def f(x):\n    print(x)", "print in solve"),
-    ],
-)
-def test_a_planted_violation_is_found(layer: str, source: str, expected: str):
-    assert violations(layer, source) == [expected]
-
-
-def test_what_is_allowed_is_not_reported():
-    assert violations("cli", "import argparse\nimport petsc4py\nfrom msmpetsc.solve import step\nprint(1)") == []
-    assert violations("results", "from msmpetsc import __version__\nfrom msmpetsc.fields import Frame") == []

@@ -217,22 +217,6 @@ def test_the_heart_follows_the_pull_and_returns(result):
     assert run.inverted(held - 1) == 0
 
 
-@pytest.mark.slow
-def test_on_two_ranks_the_heart_is_led_and_let_go_alike(result):
-    """Past the time when the anchored nodes become unknowns."""
-    options = ["--set", "cages.count=300", "--set", "time.step=0.08", "--frames", "12", "--error", "1e-8"]
-    one, two = result("heart_pull", *options), result("heart_pull", *options, ranks=2)
-    assert np.abs(one.q - two.q).max() < 1e-6 * one.height
-
-
-@pytest.mark.slow
-def test_on_two_ranks_the_lung_is_pressed_alike(result):
-    options = ["--set", "cages.count=300", "--set", "time.step=0.05", "--frames", "8", "--error", "1e-6"]
-    one, two = result("lung_press", *options), result("lung_press", *options, ranks=2)
-    assert one.q[-1][:, 2].max() < 0.34  # the plate has come down to this
-    assert np.abs(one.q - two.q).max() < 1e-4 * one.height
-
-
 # ---- Figure 11
 
 

@@ -49,8 +49,11 @@ class Checkpoints:
 
     def __init__(self, file: ResultFile, simulation: "Simulation", interval: Interval, signals: "Signals"):
         self.file, self.simulation, self.interval, self.signals = file, simulation, interval, signals
-        self.signal, self._written = 0, -1
-        self._seconds, self._frames, self._ended = interval.seconds or 0.0, 0, perf_counter()
+        self.signal = 0
+        self._written = -1  # step of the last checkpoint
+        self._seconds = interval.seconds or 0.0
+        self._frames = 0
+        self._ended = perf_counter()
 
     def after_step(self, is_stored: bool) -> bool:
         """Write a checkpoint if one is due; return whether the run is to stop (collective).

@@ -9,10 +9,6 @@ from msmpetsc.errors import InputError, printable
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
 SCENE_NAMES, XML_NAMES = (".toml",), (".xml",)
-NO_FOLDERS = (
-    *RESULT_NAMES, *PICTURE_NAMES, *MEASURE_NAMES, *MOVIE_NAMES, *PAGE_NAMES,
-    ".csv", ".jpeg", ".jpg", ".pdf", ".svg", ".toml", ".txt", ".vtk", ".vtu", ".xdmf", ".zip"
-)  # fmt: skip
 NO_PART_OF_A_LINE = ("Cc", "Cs", "Zl", "Zp")  # categories: controls, bytes that are no UTF-8, ends of lines
 
 
@@ -46,9 +42,3 @@ def refuse_other_format(option: str, path: str | os.PathLike[str] | None, ending
     """Raise InputError for the name of a file of another format than is written."""
     if path is not None and Path(path).suffix.lower() not in endings:
         raise InputError(f"{option} {path}: what is written there is named {' or '.join(f'*{end}' for end in endings)}")
-
-
-def refuse_name_of_a_file(option: str, folder: Path | None) -> None:
-    """Raise InputError for a folder that is to be made under the name of a file."""
-    if folder is not None and folder.suffix.lower() in NO_FOLDERS and not folder.is_dir():
-        raise InputError(f"{option} {folder}: what is written there is a folder, no {folder.suffix} file")

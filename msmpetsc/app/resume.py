@@ -37,8 +37,6 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
     """Return what is to be resumed, None for a run from the start (collective). Raises InputError."""
     if request.resume is None:
-        if request.scene is None:
-            raise InputError("a SCENE is needed, or --resume OUT.h5")
         return None
     path = Path(request.resume)
     if request.scene is not None and not comm.bcast(on_root(comm, path.exists)):
@@ -56,7 +54,8 @@ def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
     """
     if earlier is None:
         return request
-    given, kept = request.petsc_words, []
+    given = request.petsc_words
+    kept: list[str] = []
     for name, value in _stored(earlier).items():
         words = [f"-{name}", *filter(None, [value])]
         if name in options_of(given) or OF_NO_EFFECT.search(name):
@@ -114,7 +113,8 @@ class Resumed:
 
     def __init__(self, earlier: Earlier, scene: Scene, options: dict[str, str], force: bool):
         """options: PETSc's, of this run. Raises InputError for what may not differ."""
-        self.earlier, self.force = earlier, force
+        self.earlier = earlier
+        self.force = force
         self.stored = scene.stored
         self.differs = list(self._differences(scene, options))
         if self.differs and not force:
@@ -133,7 +133,8 @@ class Resumed:
 
     def _differences(self, scene: Scene, options: dict[str, str]) -> Iterator[str]:
         earlier = self.earlier
-        was, now = _with_an_effect(_stored(earlier)), _with_an_effect(options)
+        was = _with_an_effect(_stored(earlier))
+        now = _with_an_effect(options)
         if "scene" in earlier.texts:
             was |= flat(scene_of(earlier.path, earlier.texts["scene"], to_read=False))
             now |= flat(scene)
@@ -161,7 +162,8 @@ class Resumed:
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
-        path, saved = self.earlier.path, read_checkpoint(comm, self.earlier.path, simulation.model.lattice.owned)
+        path = self.earlier.path
+        saved = read_checkpoint(comm, path, simulation.model.lattice.owned)
         kept = 0
         if saved is not None:
             if saved.step >= simulation.steps:

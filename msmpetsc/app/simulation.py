@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.failure import ending_together
+from msmpetsc.app.ending import ending_together
 from msmpetsc.app.log import logged_on_root
 from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model

@@ -1,19 +1,20 @@
 """The start of a run: PETSc gets its options, and only then what needs them is imported."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.failure import STATUS_INTERRUPTED, ending_together
+from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together
 from msmpetsc.app.log import logged_on_root
-from msmpetsc.app.request import FLAGS, RunRequest, asked_by
-from msmpetsc.comm import on_root
-from msmpetsc.errors import InputError
+from msmpetsc.app.request import RunRequest, asked_by
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+    from msmpetsc.results.restart import Earlier
 
 
 @asked_by(RunRequest)
@@ -42,49 +43,33 @@ def run(ask: Callable[[], RunRequest]) -> Path:
 
 def carry_out(comm: "MPI.Intracomm", request: RunRequest) -> int:
     """Carry out a run; return its exit status (collective)."""
-    import numpy as np
-
-    from msmpetsc.app.resume import as_before, earlier_run
-    from msmpetsc.solve.petsc.words import lent_options
-
     started = perf_counter()
-    earlier = earlier_run(comm, request)
-    request = as_before(request, earlier)
-    with lent_options(comm, request.petsc_words), np.errstate(all="ignore"):  # a step tells of what overflows
-        from msmpetsc.app.run import finish, prepare, take_steps, tell_done  # PETSc, which has its options now
+    with options_given(comm, request) as (asked, earlier):
+        from msmpetsc.app.running import finish, prepare, take_steps, tell_done  # PETSc, which has its options now
 
-        plan = prepare(comm, request, earlier)
+        plan = prepare(comm, asked, earlier)
         if plan.resumed and plan.resumed.is_done:
-            return tell_done(comm, request, plan.resumed)
+            return tell_done(comm, asked, plan.resumed)
         return finish(comm, plan, take_steps(comm, plan), started)
 
 
 def options_shown(comm: "MPI.Intracomm", request: RunRequest) -> list[str]:
     """Return what a run would have in PETSc's options database as lines of a file; no mesh is read (collective)."""
+    with options_given(comm, request) as (asked, earlier):
+        from msmpetsc.app.running import lines_of_options
+
+        return lines_of_options(comm, asked, earlier)
+
+
+@contextmanager
+def options_given(comm: "MPI.Intracomm", request: RunRequest) -> Iterator[tuple[RunRequest, "Earlier | None"]]:
+    """Give PETSc the options of a request, and those of the run that it goes on from, for the block (collective)."""
+    import numpy as np
+
     from msmpetsc.app.resume import as_before, earlier_run
-    from msmpetsc.scene.schema import Solver
     from msmpetsc.solve.petsc.words import lent_options
 
-    earlier = earlier_run(comm, request) if request.scene or request.resume else None
-    request = as_before(request, earlier)
-    with lent_options(comm, request.petsc_words):
-        from msmpetsc.app.run import read_scene
-        from msmpetsc.solve.instrumentation import Probes
-        from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
-        from msmpetsc.solve.petsc.device import choose
-        from msmpetsc.solve.presets import find_preset, shown_options
-        from msmpetsc.solve.simulate import solvers_of
-
-        refuse_early(comm, FLAGS)
-        choose(comm, request.device)
-        if request.scene or earlier:
-            scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
-            solvers = solvers_of(scene, Probes(request.true_error, request.trace))
-        elif request.set or request.frames:
-            raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
-        else:
-            solvers = {"": (find_preset(request.preset or Solver.model_fields["preset"].default), 0)}
-        on_root(comm, lambda: refuse_bad_values(solvers))
-        lines = shown_options(solvers)
-        silence_options_left()
-    return lines
+    earlier = earlier_run(comm, request)
+    asked = as_before(request, earlier)
+    with lent_options(comm, asked.petsc_words), np.errstate(all="ignore"):  # a step tells of what overflows
+        yield asked, earlier

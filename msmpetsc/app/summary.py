@@ -57,16 +57,16 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
 
 def log_bodies(comm: MPI.Comm, model: Model) -> None:
     """Log size, volume and mass of each body and its part of the lattice (collective)."""
-    lattice, bodies = model.lattice, model.bodies
-    masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(bodies))
-    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(bodies))
+    lattice = model.lattice
+    masses = np.bincount(lattice.body[: lattice.owned], lattice.mass, len(model.bodies))
+    shares = np.bincount(lattice.body_of(lattice.cells[:, 0]), lattice.cell_share, len(model.bodies))
     sums = comm.allreduce(np.array([masses, shares * lattice.cell_size**3]))
-    for number, (body, (mass, volume)) in enumerate(zip(bodies, sums.T, strict=True)):
+    for number, (body, (mass, volume)) in enumerate(zip(model.bodies, sums.T, strict=True)):
         mesh = f"open mesh ({body.report.boundary_edges} boundary edges), its volume unknown"
         if body.report.closed:
             enclosed = abs(body.report.volume)
             mesh = f"closed mesh of {enclosed:.4g} m^3, {mass / volume * enclosed:.4g} kg"
-        name = f"body.{number}" if len(bodies) > 1 else "body"
+        name = f"body.{number}" if len(model.bodies) > 1 else "body"
         size = sides(body.bounds[1] - body.bounds[0])
         log.info("%s of %s m; %s; lattice of %.4g m^3, %.4g kg", name, size, mesh, volume, mass)
 

@@ -1,5 +1,6 @@
 """The command line, whose failures are one line and an exit status."""
 
+import argparse
 import logging
 import signal
 import sys
@@ -7,7 +8,7 @@ import traceback
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.failure import STATUS_BUG, STATUS_INTERRUPTED, ending_together
+from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together
 from msmpetsc.app.log import logged_on_root
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.command_table import COMMANDS, RUNS_ITSELF
@@ -23,16 +24,17 @@ DRAWING = ("render", "export", "compare")  # which the extra "render" is enough 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return 0, 2 for bad input, 3 for a step that failed (collective)."""
     words = sys.argv[1:] if arguments is None else arguments
-    refused, verbose, level = None, False, logging.INFO
+    refused = None
+    args = argparse.Namespace(command="", quiet=False, verbose=False)
     try:
         args = parsed(words)  # --help and --version leave from here
-        verbose, level = args.verbose, logging.WARNING if args.quiet else logging.INFO
     except InputError as error:
         refused = error
-    comm = world(started=refused is None and args.command == "run")  # the other commands are for one process
-    with logged_on_root(comm, level, verbose):
+    comm = world(started=args.command == "run")  # the other commands are for one process
+    level = logging.WARNING if args.quiet else logging.INFO
+    with logged_on_root(comm, level, args.verbose):
         try:
-            with ending_together(comm, "render" if refused is None and args.command in DRAWING else "run"):
+            with ending_together(comm, "render" if args.command in DRAWING else "run"):
                 if refused is not None:
                     raise refused
                 if COMMANDS[args.command].alone:
@@ -40,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
                 return import_module(f"msmpetsc.cli.commands.{args.command}").run(args)
         except MsmpetscError as error:
             if comm.rank == 0:
-                if verbose:
+                if args.verbose:
                     traceback.print_exc()
                 print(f"msmpetsc: error: {error}", file=sys.stderr)
             return error.exit_status
@@ -61,7 +63,7 @@ def start_alone(comm: "MPI.Comm", command: str) -> None:
     if comm.size > 1:
         raise InputError(f"{command} is started without mpiexec: {why}")
     if why == RUNS_ITSELF:
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def entry_point() -> None:

@@ -93,7 +93,7 @@ def reach_of(
 def _leads_alike(a: Anchor, b: Anchor) -> bool:
     """Return whether two anchors have the same path and stop: on a node of both it does not matter which has it."""
     same = np.array_equal(a.path.times, b.path.times)
-    return same and np.array_equal(a.path.displacements, b.path.displacements) and a.stop == b.stop
+    return same and np.array_equal(a.path.vectors, b.path.vectors) and a.stop == b.stop
 
 
 def _warn_of_overruled(reach: Reach, pinned: int, prescribed: int) -> None:

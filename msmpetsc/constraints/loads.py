@@ -23,17 +23,20 @@ def within(time: float, start: float, stop: float | None) -> bool:
     return time >= start * (1 - SAME) and (stop is None or time < stop * (1 - SAME))
 
 
-def interpolated(time: float, times: Floats, vectors: Rows) -> Floats:
-    """Return the vector (3,) at a time on straight lines through vectors (k, 3) at ascending times (k,)."""
-    return np.array([np.interp(time, times, along) for along in vectors.T])
-
-
 @dataclass(frozen=True)
-class Motion:
-    """Displacements (k, 3) [m] at ascending times (k,) [s], straight lines between them; none at time 0, the first."""
+class Lines:
+    """Vectors (k, 3) at ascending times (k,) [s], straight lines between them; before and after, the first and last."""
 
     times: Floats
-    displacements: Rows
+    vectors: Rows
+
+    def value_at(self, time: float) -> Floats:
+        """Return the vector (3,) at a time [s]."""
+        return np.array([np.interp(time, self.times, along) for along in self.vectors.T])
+
+
+class Motion(Lines):
+    """Displacements [m], none at time 0, the first."""
 
     @classmethod
     def through(cls, keyframes: Iterable[Keyframe]) -> "Motion":
@@ -47,12 +50,19 @@ class Motion:
         return len(self.times) > 1
 
     def displacement_at(self, time: float) -> Floats:
-        """Return the displacement (3,) [m] at a time [s]; after the last time it is that of the last."""
-        return interpolated(time, self.times, self.displacements)
+        """Return the displacement (3,) [m] at a time [s]."""
+        return self.value_at(time)
 
     def displacement_between(self, begin: float, end: float) -> Floats:
         """Return the way (3,) [m] that the motion makes good from one time [s] to another."""
-        return self.displacement_at(end) - self.displacement_at(begin)
+        return self.value_at(end) - self.value_at(begin)
+
+
+def total_of(total: Vector | ForceTable) -> Lines:
+    """Return the total [N] of a scene's force over time; of one that is always the same a table of one time."""
+    if isinstance(total, ForceTable):
+        return Lines(np.array(total.times), np.array(total.values))
+    return Lines(np.zeros(1), np.array([total]))
 
 
 @dataclass(frozen=True)
@@ -72,28 +82,29 @@ class Anchor:
         return within(time, 0.0, self.stop)
 
 
+class Timed:
+    """What acts while start <= time < stop [s]; a stop of None never comes."""
+
+    start: float
+    stop: float | None
+
+    def acts_at(self, time: float) -> bool:
+        """Return whether it acts at a time [s]."""
+        return within(time, self.start, self.stop)
+
+    @property
+    def events(self) -> list[float]:
+        """Times [s] at which it begins, ends or turns."""
+        return [self.start, *([] if self.stop is None else [self.stop])]
+
+    def state_at(self, time: float) -> bool | tuple[float, ...]:
+        """Return what tells the force at a time from that at another."""
+        return self.acts_at(time)
+
+
 @dataclass(frozen=True)
-class LoadTable:
-    """Total forces (k, 3) [N] at ascending times (k,) [s], straight lines between them."""
-
-    times: Floats
-    totals: Rows
-
-    @classmethod
-    def of_scene(cls, total: Vector | ForceTable) -> "LoadTable":
-        """Return the table of a scene's force; of one that is always the same a table of one time."""
-        if isinstance(total, ForceTable):
-            return cls(np.array(total.times), np.array(total.values))
-        return cls(np.zeros(1), np.array([total]))
-
-    def total_at(self, time: float) -> Floats:
-        """Return the total force (3,) [N] at a time [s]; before the first and after the last time that of those."""
-        return interpolated(time, self.times, self.totals)
-
-
-@dataclass(frozen=True)
-class Load:
-    """A force of nodes, acting while start <= time < stop [s]; None: to the end.
+class Load(Timed):
+    """A force of nodes.
 
     force : (owned, 3) [N]; with a table each node's share (owned, 1) [-] of its total
     """
@@ -101,31 +112,26 @@ class Load:
     force: Rows
     start: float
     stop: float | None
-    table: LoadTable | None = None
-
-    def acts_at(self, time: float) -> bool:
-        """Return whether the force acts at a time [s]."""
-        return within(time, self.start, self.stop)
+    table: Lines | None = None
 
     def force_at(self, time: float) -> Rows:
         """Return the force (owned, 3) [N] that acts at a time [s]."""
-        return self.force if self.table is None else self.force * like(self.force, self.table.total_at(time))
+        return self.force if self.table is None else self.force * like(self.force, self.table.value_at(time))
 
     def state_at(self, time: float) -> bool | tuple[float, ...]:
-        """Return what tells the force at a time from that at another: whether it acts, and of a table the total."""
+        """Return whether it acts, and of a table the total."""
         acts = self.acts_at(time)
-        return tuple(self.table.total_at(time).tolist()) if acts and self.table is not None else acts
+        return tuple(self.table.value_at(time).tolist()) if acts and self.table is not None else acts
 
     @property
     def events(self) -> list[float]:
         """Times [s] at which the force begins, ends or turns."""
-        turns = [] if self.table is None else self.table.times.tolist()
-        return [self.start, *([] if self.stop is None else [self.stop]), *turns]
+        return [*super().events, *([] if self.table is None else self.table.times.tolist())]
 
 
 @dataclass(frozen=True)
-class OwnForce:
-    """A force that is a function of the user's (extensions.register_force), acting as a Load does.
+class OwnForce(Timed):
+    """A force that is a function of the user's (extensions.register_force).
 
     key      : of its table in the scene, for messages
     function : of positions (k, 3) [m], velocities (k, 3) [m/s] and time [s]; returns (k, 3) [N/kg]
@@ -140,19 +146,6 @@ class OwnForce:
     start: float
     stop: float | None
 
-    def acts_at(self, time: float) -> bool:
-        """Return whether the force acts at a time [s]."""
-        return within(time, self.start, self.stop)
-
-    def state_at(self, time: float) -> bool:
-        """Return whether the force acts at a time, by which it is told from that at another."""
-        return self.acts_at(time)
-
-    @property
-    def events(self) -> list[float]:
-        """Times [s] at which the force begins or ends."""
-        return [self.start, *([] if self.stop is None else [self.stop])]
-
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions and velocities (owned, 3). Raises InputError for no numbers."""
         force = np.zeros((len(q), 3))
@@ -163,9 +156,8 @@ class OwnForce:
         try:
             force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
         except ValueError:
-            raise InputError(
-                f"{self.key}.function: returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
-            ) from None
+            told = f"returned numbers of shape {per_mass.shape}, not {(len(self.rows), 3)}"
+            raise InputError(f"{self.key}.function: {told}") from None
         if not np.isfinite(force).all():
             raise InputError(f"{self.key}.function: returned numbers that are not finite (t = {time:.6g} s)")
         return force

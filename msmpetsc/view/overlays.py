@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from msmpetsc.constraints.loads import LoadTable, Motion, within
+from msmpetsc.constraints.loads import Motion, total_of, within
 from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, bounds_of
 from msmpetsc.scene.bodies import OfBody
@@ -279,7 +279,7 @@ def _arrows(scene: SceneFile, time: float, rest: Rest, position: np.ndarray) -> 
     arrows = []
     for table in scene.tables("force"):
         force = table.table
-        total = LoadTable.of_scene(force.total or (0.0, 0.0, 0.0)).total_at(time)  # a function has no one direction
+        total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(time)  # a function has no one direction
         if within(time, force.start, force.stop) and any(total) and (where := rest.find(table)).any():
             tail = position[where].mean(axis=0)
             arrows.append(np.array([tail, tail + length * unit(total)]))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import G, block_scene
-from conftest import ENVIRONMENT, run
+from block_scene import block_scene
+from conftest import ENVIRONMENT
 
 import msmpetsc as msm
 from msmpetsc.cli.main import main
@@ -45,22 +45,6 @@ def test_drag_is_that_of_the_velocity_that_starts_a_step(tmp_path: Path):
     msm.register_force("drag", lambda x, v, t: -RATE * v)
     velocities = SPEED * (1 - RATE * STEP) ** np.arange(1, 11)  # v_(n+1) = v_n - t c v_n
     assert np.allclose(heights(flying(tmp_path, "drag")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9)
-
-
-def test_the_time_is_that_which_starts_a_step(tmp_path: Path):
-    msm.register_force("ramp", lambda x, v, t: [0, 0, 1000 * t])  # one for all nodes will do
-    velocities = SPEED + STEP * np.cumsum(1000 * STEP * np.arange(10))
-    assert np.allclose(heights(flying(tmp_path, "ramp")), np.append(0, STEP * np.cumsum(velocities)), rtol=1e-9)
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_constant_function_is_gravity(tmp_path: Path, integrator: str):
-    msm.register_force("gravity", lambda x, v, t: np.tile([0, 0, -G], (len(x), 1)))
-    held = {"pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}], "time": {"integrator": integrator}}
-    own = [frame.position for frame in msm.frames(flying(tmp_path, "gravity", 5, **held))]
-    scene = flying(tmp_path, "gravity", 5, gravity={"acceleration": [0, 0, -G]}, **held)
-    known = [frame.position for frame in msm.frames(scene, set={"force": []})]
-    assert np.allclose(own, known, atol=1e-9) and np.ptp(own[-1] - own[0]) > 1e-4
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -120,12 +104,6 @@ def test_what_is_no_force_is_said_in_one_line(tmp_path: Path, words: str):
     assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_statics_have_no_functions(tmp_path: Path):
-    msm.register_force("drag", lambda x, v, t: -v)
-    with pytest.raises(InputError, match="may be no function where"):
-        msm.frames(flying(tmp_path, "drag", start={}), set={"time.integrator": "static"})
-
-
 def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     msm.register_preset("tight", {"ksp_rtol": 1e-8, "ksp_max_it": 400}, about="a narrow one")
     msm.register_force("drag", lambda x, v, t: -RATE * v * x[:, :1])  # it bends the block
@@ -179,24 +157,3 @@ def test_a_scene_file_names_what_is_installed(tmp_path: Path):
     broken = command("--overwrite", "--set", "force.0.function=broken")
     assert broken.returncode == 2 and "the force 'broken' that is installed cannot be imported" in broken.stderr
     assert broken.stderr.count("\n") == 1
-
-
-ON_RANKS = """
-import sys
-import numpy as np
-import msmpetsc as msm
-from mpi4py import MPI
-msm.register_force("drag", lambda x, v, t: -8.0 * v * x[:, :1])
-*_, last = msm.frames(sys.argv[1])
-rows = MPI.COMM_WORLD.gather(last.position)
-if rows:
-    np.save(sys.argv[2], np.concatenate(rows))
-"""
-
-
-def test_ranks_agree(tmp_path: Path):
-    scene = flying(tmp_path, "drag", 5)
-    for ranks in (1, 3):
-        done = run(ranks, "-c", ON_RANKS, scene, tmp_path / f"{ranks}.npy", timeout=60)
-        assert done.returncode == 0, done.stderr
-    assert np.allclose(np.load(tmp_path / "1.npy"), np.load(tmp_path / "3.npy"), atol=1e-9)

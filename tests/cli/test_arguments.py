@@ -67,19 +67,9 @@ def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, 
     assert {name: (folder / name).lstat().st_mtime_ns for name in os.listdir(folder) if name != "out"} == before
 
 
-def test_a_device_is_not_replaced(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    main(["run", "scene.toml", "-o", "device", "--overwrite"])
-    assert not (folder / "device").is_file()
-
-
 TOO_MUCH = {
     "cells": (
         ["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"],
-        "GB a rank or more",
-    ),
-    "tiny cells": (
-        ["run", "scene.toml", "--set", "cages={cell_size = 1e-5, max_cells = 1000000000000000}"],
         "GB a rank or more",
     ),
     "ranks": (["inspect", "scene.toml", "--ranks", "9999999999"], "--ranks must be at most 1000000"),

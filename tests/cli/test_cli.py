@@ -53,15 +53,12 @@ def folder(tmp_path_factory) -> Path:
     """scene.toml and its ball, and meshes and scenes with something wrong."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "scene.toml").write_text(SCENE)
-    (folder / "broken.toml").write_text("[mesh\n")
     (folder / "text.ply").write_text("a shopping list\n")
-    (folder / "empty.ply").write_text("")
-    nan, infinite = ball.vertices.copy(), ball.vertices.copy()
-    nan[3], infinite[5, 0] = np.nan, np.inf
+    nan = ball.vertices.copy()
+    nan[3] = np.nan
     both_sides = np.vstack([ball.faces, ball.faces[:, ::-1]])
     write_ply(folder / "ball.ply", ball.vertices, ball.faces)
     write_ply(folder / "nan.ply", nan, ball.faces)
-    write_ply(folder / "infinite.ply", infinite, ball.faces)
     write_ply(folder / "flat.ply", ball.vertices * [1, 1, 0], ball.faces)
     write_ply(folder / "folded.ply", ball.vertices, both_sides)
     write_ply(folder / "points.ply", ball.vertices, ball.faces[:0])
@@ -138,10 +135,7 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("preset", "options", "seen"),
     [
-        ("anderson", "", ""),
-        ("newton", "", ""),
         ("newton-multigrid", "-ksp_view", "type: mg"),
-        ("fast-msm", "", ""),
         ("fast-msm-kronecker", "", ""),
         ("paper", "", ""),
         ("anderson", "-snes_type ngmres -snes_view", "SNES Object"),
@@ -156,14 +150,6 @@ def test_no_option_is_left_unused_and_the_users_wins(scene: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert "There are no unused options." in done.stdout
     assert seen in done.stdout
-
-
-def test_the_presets_are_listed_once(msmpetsc):
-    done = msmpetsc(2, "run", "--list-presets", timeout=60)
-    assert done.returncode == 0
-    names = [line.split()[0] for line in done.stdout.splitlines()]
-    presets = {"anderson", "lbfgs", "chebyshev", "newton", "newton-multigrid", "fast-msm", "paper"}
-    assert presets <= set(names) and len(names) == len(set(names))
 
 
 @pytest.mark.parametrize(
@@ -216,43 +202,26 @@ def sets(*pairs: str) -> list[str]:
 BAD = {  # what is wrong: arguments after the scene, and what the one line must say
     "mesh missing": (mesh("gone.ply"), ["gone.ply"]),
     "mesh is text": (mesh("text.ply"), ["text.ply", "not a readable PLY mesh"]),
-    "mesh empty": (mesh("empty.ply"), ["empty.ply", "is empty"]),
     "mesh without triangles": (mesh("points.ply"), ["holds no triangles"]),
     "mesh NaN": (mesh("nan.ply"), ["nan.ply", "NaN"]),
-    "mesh infinite": (mesh("infinite.ply"), ["infinite.ply", "infinite"]),
     "mesh flat": (mesh("flat.ply"), ["no volume", "flat"]),
     "mesh folded": (mesh("folded.ply"), ["no volume", "folded"]),
     "mesh thin for its cells": (mesh("foil.ply", "cages={cell_size=1e-5}"), ["cages.max_cells"]),
-    "mesh of size 0": (sets("mesh.size=0"), ["mesh.size", "> 0"]),
-    "mesh of negative size": (sets("mesh.size=-1"), ["mesh.size", "> 0"]),
-    "mesh huge": (sets("mesh.size=1e300"), ["mesh.size: must be < 1e+60"]),
     "mesh tiny": (sets("mesh.size=1e-300"), ["1e-300 m", "too small"]),
     "mesh far away": (sets("mesh.base=[1e300, 0, 0]"), ["1e+300 m", "too far away"]),
     "cells too many": (sets("cages={cell_size=0.001}"), ["0.001 m", "cages.max_cells = 5000000"]),
-    "cells of size 0": (sets("cages={cell_size=0}"), ["cages.cell_size", "> 0"]),
     "cells too small": (sets("cages={cell_size=1e-300}"), ["cages.cell_size", "1e-300"]),
-    "count beyond max_cells": (sets("cages.max_cells=10"), ["150", "max_cells = 10"]),
     "preset unknown": (["--preset", "andersen"], ["'anderson'"]),
-    "error not a number": (["--error", "small"], ["--error", "float"]),
-    "no frames": (["--frames", "0"], ["--frames", "at least 1"]),
     "frames not a number": (["--frames", "many"], ["--frames", "many"]),
-    "key unknown": (sets("mehs.size=1"), ["mehs", "'mesh'"]),
-    "density negative": (sets("material.density=-1"), ["material.density", "> 0"]),
     "pin without a node": (sets("pin.0.region.box=[[5, 5, 5], [6, 6, 6]]"), ["pin.0.region", "no node"]),
     "all pinned": (sets("pin.0.region.box=[[-1, -1, -1], [2, 2, 2]]"), ["every node", "held"]),
     "disk too small": (sets("time.duration=9e6"), ["GB"]),
-    "two scenes": (["another.toml"], ["unknown argument another.toml"]),
     "option of another letter": (["-ksp_tpye", "cg"], ["-ksp_tpye", "'ksp_type'"]),
-    "option without its end": (["-pc_typ", "jacobi"], ["-pc_typ", "'pc_type'"]),
     "no such KSP": (["-ksp_type", "nonsense"], ["KSP type nonsense"]),
     "no such PC": (["-pc_type", "nonsense"], ["PC type nonsense"]),
-    "no such Mat": (["-mat_type", "nonsense"], ["Mat type", "nonsense"]),
     "tolerance not a number": (["-ksp_rtol", "abc"], ["abc has no numeric value"]),
     "option of ours misspelt": (["--presett", "anderson"], ["--presett", "'--preset'"]),
-    "scene missing": ([], ["gone.toml", "no such scene"]),
-    "scene broken": ([], ["broken.toml", "is not TOML"]),
 }
-SCENES = {"scene missing": "gone.toml", "scene broken": "broken.toml"}  # the others have scene.toml
 REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2])]
 
 
@@ -263,9 +232,7 @@ def refusals(folder: Path) -> dict:
     for ranks in (1, 2):
         names = [name for number, name in REFUSALS if number == ranks]
         out = folder / f"refused{ranks}" / "o.h5"
-        commands = [
-            ["run", str(folder / SCENES.get(name, "scene.toml")), "-o", str(out), *BAD[name][0]] for name in names
-        ]
+        commands = [["run", str(folder / "scene.toml"), "-o", str(out), *BAD[name][0]] for name in names]
         done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=120)
         assert done.returncode == 0, done.stderr
         assert done.stderr.strip() == "", "not even the C libraries speak"
@@ -288,22 +255,17 @@ def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
     assert left == []
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("open.ply", ["open (14 boundary edges)", "winding number will decide what is inside"]), ("foil.ply", [])],
-)
-def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path, name: str, words: list[str]):
-    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh(name, "pin=[]"))
+def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
+    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"))
     assert done.returncode == 0, done.stderr
-    warnings = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")]
-    assert len(warnings) == (1 if words else 0)
-    assert all(word in warnings[0] for word in words)
+    (warning,) = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")]
+    assert "open (14 boundary edges)" in warning and "winding number will decide what is inside" in warning
 
 
 # What fails on the way
 
 
-@pytest.mark.parametrize(("ranks", "preset"), [(1, "newton"), (1, "anderson"), (2, "anderson")])
+@pytest.mark.parametrize(("ranks", "preset"), [(1, "newton"), (2, "anderson")])
 def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     scene: Path, tmp_path: Path, ranks: int, preset: str
 ):

@@ -17,25 +17,13 @@ from conftest import ROOT
 import msmpetsc
 from msmpetsc.cli.main import main
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
+from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.drafting.measures import measured, unit_of
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
-
-
-def bottle(axis: int) -> trimesh.Trimesh:
-    """A cone that stands on its base, its tip along this axis."""
-    cone = trimesh.creation.cone(radius=1, height=2)
-    turn = {1: trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]), 2: np.eye(4)}[axis]
-    return cone.apply_transform(turn)
-
-
-@pytest.mark.parametrize("axis", [1, 2])
-def test_the_upward_axis_is_the_one_on_which_the_body_stands(axis: int):
-    assert measured(surface(bottle(axis))).y_up == (axis == 1)
 
 
 def chair(upwards: int, back: int) -> trimesh.Trimesh:

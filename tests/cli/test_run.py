@@ -92,16 +92,6 @@ def test_the_energies_and_momentum_of_the_file_are_those_of_its_frames(fall: h5p
     np.testing.assert_allclose(fall["frames/momentum"][n], m @ velocity, atol=1e-9)
 
 
-def test_the_surface_is_W_times_the_positions(fall: h5py.File):
-    from scipy.sparse import csr_array
-
-    W = csr_array(tuple(fall["embedding"][name][:] for name in ("weights", "indices", "indptr")))
-    rest, last = fall["lattice/nodes"][:], fall["frames/position"][-1]
-    np.testing.assert_allclose(W.sum(axis=1), 1, atol=1e-12)
-    np.testing.assert_allclose(W @ rest, fall["surface/points"][:], atol=1e-12)
-    np.testing.assert_allclose(W @ last, fall["frames/surface"][-1], atol=1e-6)  # stored in single precision
-
-
 HANG = (  # the bunny hangs by its ears and swings: pins, a force that ends, no contact
     "--set", "pin.0.region={box=[[0,0,0.85],[1,1,1]],relative=true}",
     "--set", "force.0={region={half_space={point=[0,0,0.1],normal=[0,0,-1]},relative=true},total=[2,0,0],stop=0.025}",

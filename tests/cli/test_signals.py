@@ -129,13 +129,3 @@ def test_a_signal_to_one_rank_stops_all_together(tmp_path):
     with h5py.File(path) as file:
         # step may be 0: on busy cores the signal comes before the first
         assert max(file["checkpoint/step"]) == step // 20 * 20 and finished(file) == 1 + step
-
-
-def test_mpiexec_hands_on_what_it_is_sent(tmp_path):
-    path = tmp_path / "x.h5"
-    with start(hanging(tmp_path, 3000, output={"surface": False}), "-o", path, ranks=2) as process:
-        process.send_signal(signal.SIGUSR1)
-        told = process.stderr.read()
-    assert "stopped by SIGUSR1" in told and process.returncode == 0
-    with h5py.File(path) as file:
-        assert max(file["checkpoint/step"]) == (finished(file) - 1) // 20 * 20

@@ -12,7 +12,7 @@ from conftest import run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS, errors
 
-from msmpetsc.build import build_model, fill_cages, read_bodies
+from msmpetsc.build import build_model, read_bodies
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import Simulation
@@ -78,32 +78,6 @@ def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
     for frame in frames[7:]:
         np.testing.assert_allclose(frame.momentum, held.momentum, rtol=1e-6)
     assert (np.linalg.norm(free.position[prescribed] - rest[prescribed] - place(UP, free.time), axis=1) > 1e-5).all()
-
-
-def test_let_go_at_the_path_s_velocity_an_unstrained_body_flies_on(tmp_path: Path):
-    """All nodes but one led at a constant velocity, the last one pulled along; free fall after that is exact."""
-    most = {"half_space": {"point": [0.3, 0, 0], "normal": [-1, 0, 0]}}
-    rising = [{"time": 1.0, "by": [0, 0, 1.0]}]
-    gravity = {"acceleration": [0, 0, -G]}
-    stop = 0.2 + 0.5 * T
-    model, frames = play(led_scene(tmp_path, 30, [{"region": most, "path": rising, "stop": stop}], gravity=gravity))
-    before = [frame for frame in frames if frame.time < stop][-1]
-    after = frames[-1]
-    n = after.index - before.index
-    fall = before.momentum - [0, 0, model.lattice.mass.sum() * G * T * n]
-    np.testing.assert_allclose(after.momentum, fall, rtol=1e-6, atol=1e-6)
-
-
-def test_anchors_are_let_go_one_after_the_other(tmp_path: Path):
-    stops = (0.03 + 0.5 * T, 0.07 + 0.5 * T)
-    anchors = [{"region": r, "path": UP, "stop": stop} for r, stop in zip((LEFT, RIGHT), stops, strict=True)]
-    model, frames = play(led_scene(tmp_path, 12, anchors))
-    rest = model.lattice.nodes
-    for x, stop in zip((0, 0.5), stops, strict=True):
-        prescribed = rest[:, 0] == x
-        on_path = [np.abs(f.position[prescribed] - rest[prescribed] - place(UP, f.time)).max() < 1e-14 for f in frames]
-        assert on_path == [f.time < stop for f in frames]
-    np.testing.assert_allclose(frames[-1].momentum, frames[8].momentum, rtol=1e-6)
 
 
 def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
@@ -201,16 +175,6 @@ def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
     assert last.sum() == 8
 
 
-def test_painted_cells_are_cells_of_the_body(balls: Path):
-    """Every point of the surface lies in a valid cell, whose eight corners are nodes."""
-    scene = load_scene(balls / "scene.toml")
-    bodies = read_bodies(MPI.COMM_SELF, scene)
-    cages = fill_cages(bodies, scene)
-    valid = {tuple(cell) for cell in cages.ijk.tolist()}
-    points = cages.grids.grids[0].to_cells(bodies[0].surface.points)
-    assert {tuple(cell) for cell in points.astype(int).tolist()} <= valid
-
-
 WRONG = {
     "[3, 162]": ["pin.0.region.painted", "there is no point 162", "162"],
     "gone.txt": ["gone.txt cannot be read"],
@@ -220,10 +184,6 @@ WRONG = {
     "binary.txt": ["binary.txt is no list of whole numbers"],
     "[3, -1]": ["pin.0.region.painted", "point numbers, from 0"],
 }
-
-
-def test_the_ball_has_the_points_the_cases_think(balls: Path):
-    assert len(trimesh.load(balls / "ball.ply").vertices) == 162
 
 
 # ---- on one rank and on two, by the command line

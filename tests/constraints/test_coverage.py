@@ -8,18 +8,17 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from block_scene import CELL, G, block_scene
+from block_scene import CELL, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
 
 from msmpetsc.app.summary import log_model, taken
 from msmpetsc.build import Model, build_model, read_bodies
-from msmpetsc.cli.main import main
 from msmpetsc.constraints.coverage import Reach
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
+from msmpetsc.scene.toml import toml_value
 
 TIME = {"step": 0.01, "duration": 0.1}
 LEFT, LEFT_HALF = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}, {"box": [[0, 0, 0], [0.26, 0.5, 0.25]]}  # 15, 45 of 75 nodes
@@ -221,25 +220,6 @@ def test_an_open_mesh_has_no_volume_to_say(tmp_path):
     assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
 
 
-def test_a_run_that_fails_says_what_it_left(tmp_path, monkeypatch, capsys):
-    scene = block_scene(
-        tmp_path, time={"step": 0.01, "duration": 0.04}, gravity={"acceleration": [0, 0, -G]}, pin=[{"region": LEFT}]
-    )
-    path = tmp_path / "x.h5"
-    advance = ImplicitEuler.advance
-
-    def failing(integrator, state, time):
-        if time > 0.025:
-            raise StepFailed("planted")
-        return advance(integrator, state, time)
-
-    monkeypatch.setattr(ImplicitEuler, "advance", failing)
-    assert main(["run", str(scene), "-o", str(path)]) == 3
-    *_, took, left, error = capsys.readouterr().err.splitlines()
-    assert "took " in took and f"left 3 frames in {path} (" in left
-    assert error == "msmpetsc: error: frame 3 (t = 0.03 s) planted"
-
-
 COMPILES = """
 import logging, sys
 import numpy as np
@@ -275,7 +255,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
     }
     commands = [
         ["run", str(tmp_path / "scene.toml"), "-o", str(tmp_path / f"{number}.h5"), "--frames", "1"]
-        + [word for key, value in given.items() for word in ("--set", f"{key}={toml(value)}")]
+        + [word for key, value in given.items() for word in ("--set", f"{key}={toml_value(value)}")]
         for number, given in enumerate(tables.values())
     ]
     done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands))
@@ -284,10 +264,3 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
         answers = json.loads(line)
         assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers
         assert answers[0][1].count(words) == 1
-
-
-def toml(value) -> str:
-    """Inline."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + "}"
-    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list) else str(value)

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from block_scene import DENSITY, SIDES, block_scene, play
 
-from msmpetsc.app.resume import flat
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
-from msmpetsc.scene.keys import keys
 from msmpetsc.scene.reading import load_scene
 
 STEP = 1 / 64  # [s]: a binary fraction, so that steps end just at the table's times
@@ -73,15 +71,6 @@ def test_its_times_are_events_for_adaptive_steps_rest_and_statics(tmp_path: Path
     assert not environment.is_same(3 * STEP, 4 * STEP)
 
 
-def test_adaptive_steps_end_where_the_force_turns(tmp_path: Path):
-    scene = pulled(tmp_path, pin=[{"region": FOOT}], time={"error": 1e-2})
-    _, frames = play(scene)
-    _, fine = play(pulled(tmp_path, pin=[{"region": FOOT}], time={"error": 1e-4}))
-    a, b = frames[-1].position, fine[-1].position
-    farthest = max(np.abs(frame.position - fine[0].position).max() for frame in fine)
-    assert np.abs(a - b).max() < 0.05 * farthest
-
-
 WRONG = {
     "must have ascending times": {"times": [0, 0], "values": [[0, 0, 0], [0, 0, 1]]},
     "2 times and 1 values": {"times": [0, 1], "values": [[0, 0, 0]]},
@@ -98,13 +87,6 @@ def test_a_mistake_in_it_is_one_line(words: str, tmp_path: Path):
     with pytest.raises(InputError) as error:
         load_scene(pulled(tmp_path, WRONG[words]))
     assert words in str(error.value) and len(str(error.value).splitlines()) == 1, error.value
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_table_is_among_the_keys_and_a_resumed_run_compares_it(tmp_path: Path):
-    assert "times" in next(key.about for key in keys("force.total"))
-    stored = flat(load_scene(pulled(tmp_path)))
-    assert stored["force.0.total.times"] == tuple(TABLE["times"])
 
 
 def test_a_table_of_nothing_on_held_nodes_is_no_mistake_and_one_of_something_is(tmp_path: Path):

@@ -1,14 +1,14 @@
 """The keys of a scene as ``msmpetsc keys`` and editors have them: each with its unit, default and range."""
 
-import re
 import tomllib
 
 import pytest
 from conftest import ROOT
+from jsonschema import Draft202012Validator
 
 from msmpetsc.cli.commands.new import shipped_text, shipped_titles
 from msmpetsc.errors import InputError
-from msmpetsc.scene.keys import SceneKey, json_schema, keys
+from msmpetsc.scene.key_table import SceneKey, json_schema, keys
 from msmpetsc.scene.schema import SceneFile
 
 
@@ -49,47 +49,16 @@ def test_a_table_or_a_key_is_chosen_by_its_name_and_a_number_does_not_matter():
         keys("material.desnity")
 
 
-def accepts(schema: dict, node: dict, value: object) -> bool:
-    """Whether a value is as the schema says, as far as an editor looks."""
-    if "$ref" in node:
-        node = schema["$defs"][node["$ref"].rpartition("/")[2]]
-    if "anyOf" in node:
-        return any(accepts(schema, choice, value) for choice in node["anyOf"])
-    if "oneOf" in node and sum(set(choice["required"]) <= set(value) for choice in node["oneOf"]) != 1:
-        return False
-    if "enum" in node and value not in node["enum"]:
-        return False
-    kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "number": (int, float), "integer": int}
-    types = node.get("type", list(kinds))
-    if not any(isinstance(value, kinds[kind]) for kind in ([types] if isinstance(types, str) else types)):
-        return False
-    if isinstance(value, str) and not re.search(node.get("pattern", ""), value):
-        return False
-    if isinstance(value, dict):
-        inner = node.get("properties", {})
-        known = set(value) <= set(inner) or node.get("additionalProperties", True)
-        needed = set(node.get("required", ())) <= set(value)
-        return (
-            known
-            and needed
-            and all(accepts(schema, inner[name], each) for name, each in value.items() if name in inner)
-        )
-    if isinstance(value, list):
-        inner = node.get("prefixItems") or [node["items"]] * len(value)
-        return len(inner) == len(value) and all(map(accepts, [schema] * len(value), inner, value))
-    return not value <= node.get("exclusiveMinimum", -1e99) if isinstance(value, float) else True
-
-
 @pytest.mark.parametrize("name", [path.stem for path in (ROOT / "scenes").glob("*.toml")])
 def test_the_json_schema_takes_every_shipped_scene_and_no_mistake(name: str):
-    schema, scene = json_schema(), tomllib.loads(shipped_text(name))
-    assert accepts(schema, schema, scene)
-    assert not accepts(schema, schema, scene | {"obstacles": []})
-    assert not accepts(schema, schema, scene | {"material": {"density": 1000.0}})
-    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": -1.0}})
-    assert not accepts(schema, schema, scene | {"time": scene["time"] | {"step": "2.5e-1 ms"}})
-    assert accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, -9.81]}})
-    assert not accepts(schema, schema, scene | {"gravity": {"acceleration": [0, 0, "1 m"]}})
+    valid, scene = Draft202012Validator(json_schema()).is_valid, tomllib.loads(shipped_text(name))
+    assert valid(scene)
+    assert not valid(scene | {"obstacles": []})
+    assert not valid(scene | {"material": {"density": 1000.0}})
+    assert not valid(scene | {"time": scene["time"] | {"step": -1.0}})
+    assert not valid(scene | {"time": scene["time"] | {"step": "2.5e-1 ms"}})
+    assert valid(scene | {"gravity": {"acceleration": [0, 0, -9.81]}})
+    assert not valid(scene | {"gravity": {"acceleration": [0, 0, "1 m"]}})
 
 
 def test_the_json_schema_has_no_null_which_toml_has_not():

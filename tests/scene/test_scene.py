@@ -2,7 +2,6 @@
 
 import json
 import math
-import string
 import tempfile
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
@@ -125,11 +123,6 @@ def test_defaults(tmp_path):
     assert scene.output.surface
 
 
-def test_a_scene_is_frozen(tmp_path):
-    with pytest.raises(ValidationError):
-        load(tmp_path).time.step = 1.0
-
-
 def test_line_ends_and_byte_order_mark_of_windows_editors(tmp_path):
     text = "\ufeff" + EXAMPLE.replace("\n", "\r\n")
     assert load(tmp_path, text).cages.count == 9946
@@ -170,23 +163,15 @@ MISTAKES = [
         "count = 9946\ncell_size = 1",
         "cages: must give exactly one of count, cell_size; has count and cell_size (line 8)",
     ),
-    ("count = 9946", "cell_size = inf", "cages.cell_size: must be a finite number, got inf (line 9)"),
     ('"affine"', '"afine"', "cages.embedding: unknown value \"afine\", did you mean 'affine'? (line 10)"),
-    (
-        '"affine"',
-        '"none"',
-        'cages.embedding: unknown value "none", valid: affine, cages, mvc (line 10)',
-    ),
     ('"affine"', '"mvc"\nsmoothing = 0.5', 'cages.smoothing: is for embedding = "cages" only, got 0.5 (line 11)'),
     ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing: must be <= 1, got 1.5 (line 11)"),
-    ('"affine"', '"cages"\nsmoothing = 0', "cages.smoothing: must be > 0, got 0 (line 11)"),
     (
         "young_modulus = 5e4",
         "young_modulus = 5e4\nstiffness = 1",
         "material: must give exactly one of young_modulus, stiffness; has young_modulus and stiffness (line 12)",
     ),
     ("density = 1000", "", "material.density: required, but missing (line 12)"),
-    ("density = 1000", "density = true", "material.density: must be a number, got true (line 14)"),
     (
         "density = 1000",
         "density = 1000\npoisson_ratio = 0.3",
@@ -194,32 +179,21 @@ MISTAKES = [
     ),
     ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
     ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),
-    ("step = 0.0166667", "step = 1e300", "time.step: must be < 1e+60, got 1e+300 (line 17)"),
     ("duration = 2.0", "duration = 0.001", "time.duration: must hold at least one step of 0.0166667 s, got 0.001"),
-    ("duration = 2.0", "duration = nan", "time.duration: must be a finite number, got nan (line 18)"),
     ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration: must have 3 items, got [0, -9.81] (line 21)"),
-    ("[0, 0, -9.81]", "[-9.81]", "gravity.acceleration: must have 3 items, got [-9.81] (line 21)"),
-    ("[0, 0, -9.81]", "[0, 0, 0, 1]", "gravity.acceleration: must have 3 items, got [0, 0, 0, 1] (line 21)"),
     ("[0, 0, -9.81]", "[0,\n 0,\n nan]", "gravity.acceleration.2: must be a finite number, got nan (line 21)"),
     ("[0, 0, -9.81]", '"down"', 'gravity.acceleration: must be a list, got "down" (line 21)'),
     ("[0, 3, 4]", "[0, 0.0, -0.0]", "obstacle.0.normal: must not be the zero vector, got [0, 0.0, -0.0] (line 26)"),
-    ('"plane"', '"plain"', "obstacle.0.shape: unknown value \"plain\", did you mean 'plane'? (line 24)"),
-    ('"reflect"', '"reflect"\nrestitution = 1.1', "obstacle.0.restitution: must be <= 1, got 1.1 (line 28)"),
-    ("0.9], [1, 1, 1]", "0.9], [1, 1]", "pin.0.region.box.1: must have 3 items, got [1, 1] (line 30)"),
-    ("[1, 1, 1]]", "[1, 1, 1], [2, 2, 2]]", "pin.0.region.box: must have 2 items, got [[0, 0, 0.9], [1, 1, 1], [2"),
     (
         "0.9], [1, 1, 1]",
         "0.9], [1, 1, 0.9]",
         "pin.0.region.box: must have each coordinate of the first corner below that of the second, got",
     ),
-    ("relative = true", "relative = 1", "pin.0.region.relative: must be true or false, got 1 (line 30)"),
-    ("radius = 0.5", "radius = 0", "pin.1.region.sphere.radius: must be > 0, got 0 (line 33)"),
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
         "{}",
         "pin.1.region: must give exactly one of box, sphere, half_space, painted; has none (line 33)",
     ),
-    ("{ sphere = { center = [0, 0, 1], radius = 0.5 } }", "3", "pin.1.region: must be a table, got 3 (line 33)"),
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
         "{ painted = [1, -2] }",
@@ -231,16 +205,9 @@ MISTAKES = [
         "{ painted = [1], relative = true }",
         "pin.1.region.relative: has no meaning for painted points, got true (line 33)",
     ),
-    ("density = 1000", "density = 1000\nlaw = 'soft'", 'material.law: unknown value "soft", valid: linear, stiffening'),
     ("density = 1000", "density = 1000\nstiffening = 3", 'material.stiffening: is for law = "stiffening" only, got 3'),
-    ('shape = "plane"', 'shape = "box"', 'obstacle.0: needs box for shape = "box"'),
     ("normal = [0, 3, 4]", "", 'obstacle.0: needs normal for shape = "plane"'),
     ('"reflect"', '"reflect"\nfriction = 0.3', "obstacle.0: has friction, which is for 'penalty' only"),
-    (
-        '"reflect"',
-        '"penalty"\nrestitution = 0.3',
-        "obstacle.0: has restitution, which is for 'reflect' or 'exchange' only",
-    ),
     ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop: must be > start = 2, got 1.0 (line 29)"),
     (
         '"reflect"',
@@ -252,19 +219,11 @@ MISTAKES = [
         "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]",
         "anchor.0.path: must have at least 1 item",
     ),
-    ("stop = 0.5", "start = 1.0\nstop = 1.0", "force.0.stop: must be > start = 1, got 1.0 (line 39)"),
-    ("error = 1e-3", "error = 1.0", "solver.error: must be < 1, got 1.0 (line 42)"),
-    ("error = 1e-3", "max_iterations = 0", "solver.max_iterations: must be > 0, got 0 (line 42)"),
     ('"anderson"', '""', "solver.preset: must not be empty (line 41)"),
     ('"bunny"', '""', "mesh.source: must not be empty (line 4)"),
-    ('"bunny"', "1", "mesh.source: must be a string, got 1 (line 4)"),
-    ('"orient"', '"ORIENT"', "mesh.prepare.1: unknown value \"ORIENT\", did you mean 'orient'? (line 5)"),
     ('"orient"', '"simplify"', 'mesh.prepare.1: needs a value: { simplify = ... }, got "simplify" (line 5)'),
-    ('"orient"', "7", "mesh.prepare.1: must be a step name or a table such as { simplify = 5000 }, got 7 (line 5)"),
     ('"orient"', "{}", "mesh.prepare.1: must give exactly one of simplify, rotate; has none (line 5)"),
     ("simplify = 5000", "simplify = 3", "mesh.prepare.2.simplify: must be >= 4, got 3 (line 5)"),
-    ("simplify = 5000", "simplfy = 9", "mesh.prepare.2.simplfy: unknown key, did you mean 'simplify'? (line 5)"),
-    ("[0, 0, 2]", "[0, 0, 0]", "mesh.prepare.3.rotate.axis: must not be the zero vector, got [0, 0, 0] (line 5)"),
     ("degrees = 90", "angle = 90", "mesh.prepare.3.rotate.degrees: required, but missing (line 5)"),
 ]
 
@@ -350,16 +309,12 @@ def test_no_file_a_folder_and_no_utf8(tmp_path):
     ("override", "look", "value"),
     [
         ("time.step=1e-2", lambda s: s.time.steps, 200),
-        ("cages.count = 7", lambda s: s.cages.count, 7),
         ("mesh.source=models/my bunny.obj", lambda s: s.mesh.source, "models/my bunny.obj"),
-        ("title='a = b'", lambda s: s.title, "a = b"),
         ("obstacle.0.restitution=0.5", lambda s: s.obstacle[0].restitution, 0.5),
         ("gravity.acceleration.2=1.62", lambda s: s.gravity.acceleration, (0, 0, 1.62)),
         ("mesh.prepare.4=union", lambda s: s.mesh.prepare[4:], ("union",)),
-        ("mesh.prepare.2.simplify=4", lambda s: s.mesh.prepare[2], {"simplify": 4}),
         ("pin.2.region.sphere={center=[0,0,0], radius=2}", lambda s: [p.region.sphere.radius for p in s.pin[2:]], [2]),
         ("pin=[]", lambda s: s.pin, ()),
-        ("solver.max_iterations=5", lambda s: s.solver.max_iterations, 5),
     ],
 )
 def test_override(tmp_path, override, look, value):
@@ -467,12 +422,6 @@ PATHS = [
 @settings(max_examples=150, deadline=None)
 def test_any_value_anywhere_loads_or_is_an_input_error(path, value):
     only_input_errors(EXAMPLE, f"{path}={_inline(value)}")
-
-
-@given(st.text(string.printable, max_size=20))
-@settings(max_examples=100, deadline=None)
-def test_any_override_loads_or_is_an_input_error(override):
-    only_input_errors(SMALLEST, override, f"mesh.{override}", f"title={override}")
 
 
 def _inline(value) -> str:

@@ -4,6 +4,7 @@ import argparse
 import json
 import tempfile
 from collections.abc import Mapping
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -44,27 +45,32 @@ def run(args: argparse.Namespace) -> int:
     refuse_other_format("--baseline", args.baseline, MEASURE_NAMES)
     if args.baseline and len(args.scenes) > 1:
         raise InputError("--baseline names the numbers of one scene: of several, each has its own beside it")
-    files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
-    if args.update:
-        if args.junit or args.json:
-            raise InputError("--update checks nothing: --junit and --json have no place beside it")
-        for scene, file in files.items():
-            update(scene, file, args)
-        return SAME
+    asked = None
     if args.frames or args.cells or args.set:
-        raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")
-    return check(files, args)
+        asked = Recipe(args.cells, args.frames or STEPS, tuple(args.set))
+    files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
+    if not args.update:
+        if asked:
+            raise InputError("--cells, --frames and --set are for --update: the numbers stored say how they were made")
+        outcomes = check(files, args.ranks, args.json)
+        if args.junit:
+            write_junit(args.junit, outcomes)
+        return DIFFERENT if any(outcome.wrong for outcome in outcomes) else SAME
+    if args.junit or args.json:
+        raise InputError("--update checks nothing: --junit and --json have no place beside it")
+    for scene, file in files.items():
+        update(scene, file, asked, args.ranks)
+    return SAME
 
 
 # Storing
 
 
-def update(scene: Path, file: Path, args: argparse.Namespace) -> None:
+def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
     """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
-    if file.is_file() and not (args.frames or args.cells or args.set):
+    recipe = asked or Recipe(None, STEPS, ())
+    if file.is_file() and not asked:
         recipe = Recipe.of(baseline.read(file))
-    else:
-        recipe = Recipe(args.cells, args.frames or STEPS, tuple(args.set))
     time = load_scene(scene, recipe.changes, by_user=False).time
     if time.error is not None:
         raise InputError(
@@ -72,7 +78,7 @@ def update(scene: Path, file: Path, args: argparse.Namespace) -> None:
             "--set time={step=..., duration=...} takes steps of one length"
         )
     recipe = Recipe(recipe.cells, min(recipe.steps, time.steps), recipe.changes)
-    numbers = found(scene, recipe, args.ranks)
+    numbers = found(scene, recipe, ranks)
     baseline.write(file, numbers)
     count = len(numbers["counts"]) + len(numbers["numbers"])
     accuracy = baseline.allowed(recipe.steps, "m")
@@ -94,35 +100,29 @@ def found(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
 # Comparing
 
 
-def check(files: Mapping[Path, Path], args: argparse.Namespace) -> int:
-    """Hold the scenes against the files of their numbers; return the exit status."""
+def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> list[Checked]:
+    """Hold the scenes against the files of their numbers, and print what is not as stored."""
     for scene, file in files.items():
         if not file.is_file():
             raise InputError(f"nothing is stored of {scene}: msmpetsc check --update {scene} stores {file}")
     stored = {scene: baseline.read(file) for scene, file in files.items()}
-    if not args.json:
+    with redirect_stdout(None) if as_json else nullcontext():
         print(HEAD, flush=True)
-    outcomes = [checked(scene, numbers, args) for scene, numbers in stored.items()]
-    wrong = [f"{outcome.scene}: {line}" for outcome in outcomes for line in outcome.wrong]
-    if args.json:
+        outcomes = [checked(scene, numbers, ranks) for scene, numbers in stored.items()]
+        print("".join(f"{outcome.scene}: {line}\n" for outcome in outcomes for line in outcome.wrong), end="")
+    if as_json:
         lines = {str(outcome.scene): outcome.wrong for outcome in outcomes}
-        print(json.dumps({"same": not wrong, "differences": lines}, indent=1))
-    else:
-        print("".join(f"{line}\n" for line in wrong), end="")
-    if args.junit:
-        write_junit(args.junit, outcomes)
-    return DIFFERENT if wrong else SAME
+        print(json.dumps({"same": not any(lines.values()), "differences": lines}, indent=1))
+    return outcomes
 
 
-def checked(scene: Path, stored: Numbers, args: argparse.Namespace) -> Checked:
+def checked(scene: Path, stored: Numbers, ranks: int) -> Checked:
     """Run a scene as its stored numbers were made, and print its line."""
     began = perf_counter()
-    numbers = found(scene, Recipe.of(stored), args.ranks)
+    numbers = found(scene, Recipe.of(stored), ranks)
     outcome = Checked(scene, judged(numbers, stored), perf_counter() - began)
-    if not args.json:
-        verdict = "DIFFERS" if outcome.wrong else "same"
-        limit = nearest_to_limit(numbers, stored)
-        print(row(scene.stem, numbers["counts"], limit, outcome.seconds, verdict), flush=True)
+    verdict = "DIFFERS" if outcome.wrong else "same"
+    print(row(scene.stem, numbers["counts"], nearest_to_limit(numbers, stored), outcome.seconds, verdict), flush=True)
     return outcome
 
 

@@ -76,7 +76,8 @@ def record(comparison: Comparison, rtol: float) -> dict[str, Any]:
 
 def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterator[str]:
     """Yield which frames and fields one run alone has."""
-    counts, shared = [len(result.frames.time) for result in (first, second)], len(comparison.pairs)
+    counts = [len(result.frames.time) for result in (first, second)]
+    shared = len(comparison.pairs)
     if counts != [shared, shared]:
         span = f"from {comparison.times[0]:g} s to {comparison.times[-1]:g} s"
         yield f"{counts[0]} and {counts[1]} frames, of which {shared} have the same time, {span}: these are compared"

@@ -83,11 +83,11 @@ def over_ranks(values: np.ndarray) -> dict[str, float]:
 
 def print_counts(report: dict[str, Any]) -> None:
     """Print a table of what there is, and what a rank has of it."""
-    counts, number = report["counts"], report["ranks"]
+    counts = report["counts"]
     how = "counted"
     if report["counted"] != counts["cells"]["all"]:
         how = f"scaled from a lattice of {report['counted']} cells"
-    print(f"{report['scene']} on {number} rank{'s' * (number > 1)}, {how}\n")
+    print(f"{report['scene']} on {report['ranks']} rank{'s' * (report['ranks'] > 1)}, {how}\n")
     print(f"{'':{WIDTH}}{'all':>15}{'a rank, mean':>15}{'most':>15}")
     for name, row in (counts | {"memory [byte]": report["memory"]}).items():
         if name.endswith("[byte]"):

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import astuple
 
-from msmpetsc.scene.keys import keys
+from msmpetsc.scene.key_table import keys
 
 HEAD = ("key", "unit", "default", "range", "meaning")
 

@@ -11,7 +11,7 @@ from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.results.disk import whole_file, write_whole
-from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
+from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
 from msmpetsc.study.drafting.draft import draft, upwards

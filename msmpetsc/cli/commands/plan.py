@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from msmpetsc.study.runner import Bench
     from msmpetsc.study.scene_lines import Tables
     from msmpetsc.study.sizing.answer import SizePlan, SizeTrial
-    from msmpetsc.study.sizing.choice import Candidate
+    from msmpetsc.study.sizing.choice import Choice
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -32,10 +32,18 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"the error must lie between 0 and 1, not {target:g}")
     refuse_other_format("--chart", args.chart, PICTURE_NAMES)
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
-        met, record = run_sizes(args, target)
+        plan = size_all(args, target)
+        if args.chart:
+            draw(plan, args.chart, target)
+        print_size(plan, target)
+        command = print_command(args, plan.choice, target) if plan.met else None
+    record = {
+        "met": plan.met, "target": target, "choice": asdict(plan.choice), "error": plan.choice.budget.total,
+        "bounds": plan.bounds, "tried": [each._asdict() for each in plan.tried], "command": command,
+    }  # fmt: skip
     if args.json:
-        print(json.dumps({"met": met, "target": target, **record}, indent=1))
-    return 0 if met else NOTHING_MEETS
+        print(json.dumps(record, indent=1, default=str))  # of paths the names
+    return 0 if plan.met else NOTHING_MEETS
 
 
 @contextmanager
@@ -52,41 +60,22 @@ def bench() -> Iterator["Bench"]:
             processes.stop()
 
 
-def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables") -> str:
+def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> str:
     """Print lines to paste and a command that says the same, or change the file; return the command."""
     from msmpetsc.study.cases import launcher
     from msmpetsc.study.scene_lines import lines, overrides, put_into
 
-    print(f"\n{lines(method, more)}\n")
-    changes = [word for change in overrides(args.scene, method, more) for word in ("--set", change)]
+    errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
+    budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
+    more: Tables = {"cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
+    print(f"\n{lines(choice.method, more)}\n")
+    changes = [word for change in overrides(args.scene, choice.method, more) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
     print(command, flush=True)
     if args.write:
-        put_into(args.scene, method, more)
+        put_into(args.scene, choice.method, more)
         print(f"\nwritten into {args.scene}")
     return command
-
-
-def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, Any]]:
-    """Try lattices and steps; return whether the choice meets the error, and all as a record."""
-    plan = size_all(args, target)
-    if args.chart:
-        draw(plan, args.chart, target)
-    print_size(plan, target)
-    choice, budget = plan.choice, plan.choice.budget
-    more: Tables = {
-        "cages": {"count": choice.cells, "cell_size": None},
-        "budget": {
-            "target": target, **{name: float(f"{value:.2g}") for name, value in vars(budget).items()},
-            "count": choice.cells, "time_step": choice.method.time_step,
-        },
-    }  # fmt: skip
-    command = print_command(args, choice.method, more) if plan.met else None
-    tried = [each._asdict() for each in plan.tried]
-    record = {
-        "choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "tried": tried, "command": command,
-    }  # fmt: skip
-    return plan.met, json.loads(json.dumps(record, default=str))  # of paths the names
 
 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":

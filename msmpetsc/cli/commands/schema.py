@@ -3,7 +3,7 @@
 import argparse
 import json
 
-from msmpetsc.scene.keys import json_schema
+from msmpetsc.scene.key_table import json_schema
 
 
 def run(_: argparse.Namespace) -> int:

@@ -3,14 +3,12 @@
 import argparse
 from pathlib import Path
 
-from msmpetsc.app.checks import refuse_name_of_a_file
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; return the exit status."""
-    refuse_name_of_a_file("-o", args.output)
     part = part_of(args.part)
     from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.runner import run_study
@@ -19,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
-        print_cases(args, folder)
+        print_cases(args.study, folder, args.full)
         return 0
     rows = run_study(
         args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
@@ -47,13 +45,13 @@ def part_of(text: str | None):
     return StudyPart(int(index), int(count))
 
 
-def print_cases(args: argparse.Namespace, folder: Path) -> None:
+def print_cases(study: Path, folder: Path, full: bool) -> None:
     """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
     from msmpetsc.solve.presets import preset_names
     from msmpetsc.study.cases import shown_command
     from msmpetsc.study.runner import list_study
 
-    listed = list_study(args.study, folder, preset_names(), args.full)
+    listed = list_study(study, folder, preset_names(), full)
     for number, (case, done) in enumerate(listed, 1):
         print(f"{number:4} {'done' if done else 'open'}  {case.scene}: {case.label}  {shown_command(case)}")
     print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.scene.keys import SCHEMA_FILE
+from msmpetsc.scene.key_table import SCHEMA_FILE
 from msmpetsc.study.drafting.measures import MeshMeasures
 
 G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]

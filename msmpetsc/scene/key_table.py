@@ -13,7 +13,8 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 IF_ABSENT = re.compile(r"[;,] ([^;,]+) if absent")
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 UNREACHED = 1e18  # a bound beyond it only keeps numbers within a double or a 64-bit integer
-BRACES, BRACKETS = re.compile(r"\{.*?\}"), re.compile(r"\[([^]]+)\]")  # units; those within braces are of an example
+BRACES = re.compile(r"\{.*?\}")  # of an example: units within are not the key's own
+UNIT = re.compile(r"\[([^]]+)\]")
 NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")  # the number of a [[table]]
 
 
@@ -74,7 +75,7 @@ def _default(found: dict[str, Any], text: str) -> str:
 
 def _units(text: str) -> str:
     """Return the units that a description names in brackets, each once."""
-    return " or ".join(dict.fromkeys(BRACKETS.findall(BRACES.sub("", text))))
+    return " or ".join(dict.fromkeys(UNIT.findall(BRACES.sub("", text))))
 
 
 def _bounds(found: dict[str, Any]) -> str:

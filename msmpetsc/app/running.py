@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from msmpetsc import __version__
 from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
-from msmpetsc.app.failure import ending_together
+from msmpetsc.app.ending import ending_together
 from msmpetsc.app.profile import Cost, refuse_unwritable, versions
 from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
@@ -28,12 +28,13 @@ from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene, scene_in
+from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes, begin_timing
-from msmpetsc.solve.options import refuse_early
+from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
-from msmpetsc.solve.presets import preset_names
-from msmpetsc.solve.simulate import Simulation, refuse_bad_options
+from msmpetsc.solve.presets import find_preset, preset_names, shown_options
+from msmpetsc.solve.simulate import Simulation, refuse_bad_options, solvers_of
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,9 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
                             if frame is not None and next(numbers) >= file.finished:  # a run that goes on has some
                                 file.append(frame)
                             stops = checkpoints.after_step(frame is not None)
-                            for see in observers if frame is not None else ():
-                                see(frame)
+                            if frame is not None:
+                                for see in observers:
+                                    see(frame)
                         if stops:
                             break
         except StepFailed as error:
@@ -129,7 +131,7 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
 
     Raises the StepFailed that ended the run.
     """
-    request, simulation = plan.request, ended.simulation
+    request = plan.request
     if request.measured:
         ended.cost.write(request.measured, request.command, ended.failure)
     left = write_companions(comm, request, ended.is_whole)
@@ -137,8 +139,8 @@ def finish(comm: MPI.Intracomm, plan: RunPlan, ended: RunEnd, started: float) ->
     if ended.failure:
         raise ended.failure
     if ended.signal:
-        return tell_stop(ended.signal, request.path, simulation)
-    simulation.refuse_unused_options(at_end=True)
+        return tell_stop(ended.signal, request.path, ended.simulation)
+    ended.simulation.refuse_unused_options(at_end=True)
     return 0
 
 
@@ -153,6 +155,23 @@ def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int
     return 0
 
 
+def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> list[str]:
+    """Return what PETSc's options database holds for the solvers of a run, or of a preset alone (collective)."""
+    refuse_early(comm, FLAGS)
+    choose(comm, request.device)
+    if request.scene or earlier:
+        scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
+        solvers = solvers_of(scene, Probes(request.true_error, request.trace))
+    elif request.set or request.frames:
+        raise InputError("--set and --frames change a scene: name the SCENE; --preset alone needs none")
+    else:
+        solvers = {"": (find_preset(request.preset or Solver.model_fields["preset"].default), 0)}
+    on_root(comm, lambda: refuse_bad_values(solvers))
+    lines = shown_options(solvers)
+    silence_options_left()
+    return lines
+
+
 # Before the steps
 
 
@@ -163,9 +182,10 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
         scene = scene_in(*request.made, changes)
     elif request.file is not None:
         scene = load_scene(request.file, changes, preset_names())
-    else:
-        assert earlier is not None  # as earlier_run sees to
+    elif earlier is not None:
         scene = stored_scene(earlier, changes, preset_names())
+    else:
+        raise InputError("a SCENE is needed, or --resume OUT.h5")
     return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
 
 
@@ -223,9 +243,8 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
     write_model(comm, file, model)
     if plan.resumed:
         plan.resumed.restore(comm, file, simulation)
-    lattice, embedding = model.lattice, model.embedding
-    points = embedding.points if embedding else None
-    file.start_frames(simulation.stored, lattice.owned, points, saved=simulation.saved())
+    points = model.embedding.points if model.embedding else None
+    file.start_frames(simulation.stored, model.lattice.owned, points, saved=simulation.saved())
     return simulation.stored_until(simulation.step) if simulation.step else 0
 
 

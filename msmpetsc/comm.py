@@ -119,19 +119,14 @@ class SortedKeys:
     def __init__(self, comm: MPI.Comm, keys: np.ndarray):
         self.comm = comm
         keys = np.unique(np.asarray(keys, np.int64))
-        self.splitters = self._split(keys)
+        sample = sample_of(keys, comm.allreduce(len(keys)), comm.size)
+        self.splitters = splitters_of(np.concatenate(comm.allgather(sample)), comm.size)
         route = Route(comm, self.owner(keys))
         self.keys = np.unique(route.send(keys))
         counts = np.array(comm.allgather(len(self.keys)), np.int64)
         self.first_of_rank = starts(counts)
         self.first = int(self.first_of_rank[comm.rank])
         self.total = int(counts.sum())
-
-    def _split(self, keys: np.ndarray) -> np.ndarray:
-        """Return the splitters (size - 1,) of a sample sort."""
-        size = self.comm.size
-        sample = sample_of(keys, self.comm.allreduce(len(keys)), size)
-        return splitters_of(np.concatenate(self.comm.allgather(sample)), size)
 
     def owner(self, keys: np.ndarray) -> np.ndarray:
         """Return the rank that holds each key, or would hold it."""

@@ -17,7 +17,8 @@ from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.schema import Scene
-from msmpetsc.solve.petsc.words import lent_options, start_for_runs, words_of
+from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
+from msmpetsc.solve.petsc.words import words_of
 
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
 

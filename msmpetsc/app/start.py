@@ -27,7 +27,7 @@ def run(ask: Callable[[], RunRequest]) -> Path:
     """
     from mpi4py import MPI
 
-    from msmpetsc.solve.petsc.words import start_for_runs
+    from msmpetsc.solve.petsc.initialise import start_for_runs
 
     comm = MPI.COMM_WORLD
     with ending_together(comm):
@@ -46,7 +46,7 @@ def carry_out(comm: "MPI.Intracomm", request: RunRequest) -> int:
 
     from msmpetsc.app.resume import as_before, earlier_run
     from msmpetsc.backend.compiling import cache_is_empty
-    from msmpetsc.solve.petsc.words import lent_options
+    from msmpetsc.solve.petsc.initialise import lent_options
 
     started = perf_counter()
     earlier = earlier_run(comm, request)
@@ -65,7 +65,7 @@ def options_shown(comm: "MPI.Intracomm", request: RunRequest) -> list[str]:
     """Return what a run would have in PETSc's options database as lines of a file; no mesh is read (collective)."""
     from msmpetsc.app.resume import as_before, earlier_run
     from msmpetsc.scene.schema import Solver
-    from msmpetsc.solve.petsc.words import lent_options
+    from msmpetsc.solve.petsc.initialise import lent_options
 
     earlier = earlier_run(comm, request) if request.scene or request.resume else None
     request = as_before(request, earlier)

@@ -29,9 +29,9 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import Ledger, State
+from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
 MOST = 3.0  # times all that the body ever had: explicit substeps near their limit let energy swing by nearly two
@@ -63,6 +63,7 @@ class Energies:
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
+@dataclass(eq=False)
 class EnergyBalance:
     """Examiner of a run's steps; states keep the ledger.
 
@@ -70,23 +71,19 @@ class EnergyBalance:
     checks : whether steps are balanced; if not only numbers that are not finite are found
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        environment: Environment,
-        elasticity: Elasticity,
-        swings: bool = False,
-        checks: bool = True,
-    ):
-        self.credit, self.checks = CREDIT if swings else 0.0, checks
-        self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
+    comm: MPI.Comm
+    environment: Environment
+    elasticity: Elasticity
+    swings: bool = False
+    checks: bool = True
+
+    def __post_init__(self) -> None:
+        self.lattice = self.environment.lattice
+        self.credit = CREDIT * self.swings
         self._now: Energies | Callable[[], Energies] = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
-        self.known: tuple[np.ndarray, float] | None = (
-            None  # positions that the last step ended at, their elastic energy [J]
-        )
-        springs = slice(lattice.springs_owned)
-        self.floor = FLOOR * comm.allreduce(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
+        # positions that the last step ended at, their elastic energy [J]
+        self.known: tuple[np.ndarray, float] | None = None
+        self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     @property
     def energies(self) -> Energies:
@@ -94,10 +91,6 @@ class EnergyBalance:
         if not isinstance(self._now, Energies):
             self._now = self._now()
         return self._now
-
-    def start(self, state: State, time_step: float) -> None:
-        """Show the state that a run begins with."""
-        self.show(state.q, state.velocity(time_step), 0.0, state.sides)
 
     def show(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> None:
         """Have the energies of a moment within a step, or at the end of one taken before."""

@@ -125,12 +125,6 @@ PRESETS = {
         inexact=True,
         chooses=True,
     ),
-    "newton-jacobi": Preset(
-        "The same with Jacobi's preconditioner, what newton itself takes for short steps of soft bodies",
-        NEWTON,
-        true_hessian=True,
-        inexact=True,
-    ),
     "newton-multigrid": Preset(
         "The same with multigrid on the lattice, what newton itself takes for all others",
         {**NEWTON, "pc_type": "mg"},

@@ -9,7 +9,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work

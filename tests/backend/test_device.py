@@ -50,23 +50,6 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
     assert done.returncode == 2 and "--device cuda and -mat_type aij contradict each other" in done.stderr
 
 
-def test_the_cpu_may_be_named(tmp_path: Path, msmpetsc):
-    done = msmpetsc(
-        1, "run", block_scene(tmp_path, **FALL), "-o", tmp_path / "out.h5", "--device", "cpu", "-mat_type", "aij"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize(
-    ("count", "says"),
-    [(lambda: 0, "no GPU is seen"), (lambda: 1 / 0, "no GPU is seen: division by zero"), (lambda: 2, None)],
-)
-def test_the_runtime_is_asked_for_a_gpu(count, says: str | None):
-    cupy = type("cupy", (), {"cuda": type("cuda", (), {"runtime": type("runtime", (), {"getDeviceCount": count})})})
-    with patch.dict("sys.modules", cupy=cupy):
-        assert cuda.missing() == says
-
-
 def test_a_package_that_is_not_there_is_named():
     with patch.dict("sys.modules", cupy=None):
         assert cuda.missing() == "cupy cannot be imported; pip install 'msmpetsc[cuda]' brings it"

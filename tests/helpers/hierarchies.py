@@ -168,7 +168,7 @@ class Case:
         self.comm, self.lattice, self.q, self.time_step = comm, lattice, q, time_step
         self.unknowns = Unknowns(comm, lattice)
         self.elasticity = Elasticity(comm, lattice)
-        self.multigrid = Multigrid(comm, self.unknowns, self.elasticity, time_step, "")
+        self.multigrid = Multigrid(self.unknowns, self.elasticity, time_step, "")
         self.blocks = contact_blocks(lattice) if contact else np.empty((0, 9))
         self.multigrid.update(q, self.blocks)
         self.x, self.y = self.multigrid.operator.createVecs()

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from msmpetsc.build import build_model
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
+from msmpetsc.solve.nonlinear.jacobian import FrictionKinks
 from msmpetsc.solve.simulate import Simulation
 
 PRESSING = {

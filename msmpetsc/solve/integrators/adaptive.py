@@ -1,10 +1,17 @@
 """Steps as long as the motion allows: an integrator of steps of many lengths, powers of two apart.
 
-What a step adds to the error of the trajectory is its local error (local_error), and of nodes that bounce off in it,
-which do so at its end and not when they touch, a step times the velocity that they changed by, as the mean by mass:
-they push the rest of the body late. A penalty whose push on a node changes in a step may have done so early or late in
-it: that is counted just so, as a step times the change over the mass times a step. step_control adds all up and chooses
-the next step.
+What a step adds to the error of the trajectory is its local error: from positions q and velocities v at its two ends,
+
+    implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
+    BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
+
+Waves as short as a cell have the most of it and move next to nothing: an impact's would have each step resolve them,
+and so keep them, where longer steps damp them. So local errors are means over neighbours, taken a few times.
+
+Of nodes that bounce off in a step, which do so at its end and not when they touch, a step times the velocity that they
+changed by is added, as the mean by mass: they push the rest of the body late. A penalty whose push on a node changes in
+a step may have done so early or late in it: that is counted just so, as a step times the change over the mass times a
+step. step_control adds all up and chooses the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
 that BDF2 needs where the length changes. All methods are collective.
@@ -16,25 +23,64 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
+from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.checkpoint import MOST_COUNT, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Scene, Solver
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
+from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
 JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
+SWEEPS = 4
+
+
+def euler_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
+    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
+    return 0.5 * time_step * (w - v)
+
+
+def bdf2_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
+    """The same of BDF2."""
+    return 1.6 * (x - q - 0.5 * time_step * (v + w))
+
+
+METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
+
+
+class NeighbourMean:
+    """Means over a node and all that springs join it to, ``SWEEPS`` times. All methods are collective."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.owned, self.field = lattice.owned, Ghosted(comm, lattice)
+        ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
+        rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
+        own = rows < lattice.owned  # all springs at them are known here
+        shape = lattice.owned, len(nodes)
+        joined = csr_array((np.ones(own.sum()), (rows[own], columns[own])), shape=shape)
+        self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
+
+    def __call__(self, vectors: np.ndarray) -> np.ndarray:
+        """Of (owned, 3)."""
+        for _ in range(SWEEPS):
+            self.field.values[: self.owned] = vectors
+            self.field.update()
+            vectors = like(vectors, self.weights @ to_host(self.field.values))
+        return vectors
+
+    def destroy(self) -> None:
+        self.field.destroy()
 
 
 def refuse_bad_steps(time: Time) -> None:
@@ -85,8 +131,8 @@ class Taken:
         self.shortest, self.longest = min(self.shortest, level), max(self.longest, level)
 
 
-class Adaptive:
-    """Takes the scene's steps (an Integrator) in steps of its own, shorter or longer ones.
+class Adaptive(Integrator):
+    """Takes the scene's steps in steps of its own, shorter or longer ones.
 
     States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time: the end of a step
     longer than the scene's. Their history is where the last step began.
@@ -99,27 +145,20 @@ class Adaptive:
 
     looks_back = True
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        environment: Environment,
-        scene: Scene,
-        make: Callable[[Time, Solver], Integrator],
-        balance: EnergyBalance,
-    ):
+    def __init__(self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance):
         refuse_bad_steps(scene.time)
         assert scene.time.error is not None
-        self.comm, self.lattice, self.environment, self.balance = comm, lattice, environment, balance
+        self.balance, self.comm = balance, balance.comm
+        self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
         self.order, self.local_error = METHODS[scene.time.integrator]
         self.levels, steps = levels_of(scene.time), scene.time.steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
-        self.ticks = Ticks(self.time_step, steps, self.levels[0], environment.events())
-        self.mean = NeighbourMean(comm, lattice)
+        self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
+        self.mean = NeighbourMean(self.comm, self.lattice)
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
         self.tick, self.last, self.taken = 0, 0, Taken()
-        self.mass = comm.allreduce(float(lattice.mass.sum()))
+        self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
 
     @property
     def unknowns(self) -> int:
@@ -252,13 +291,6 @@ class Adaptive:
         previous = result.position - T / t * (result.position - result.previous)
         result = replace(result, previous=previous)
         return result, replace(after, q_previous=after.q - T * after.velocity(t), history=history)
-
-    def follow(self) -> None:
-        """Refused before."""
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
-        """Unknown (NaN): a frame is no single step."""
-        return np.full(2, np.nan), None
 
     @property
     def state(self) -> dict[str, Range]:

@@ -1,5 +1,7 @@
 """Contact faces of an implicit step: by which face each node is pushed out of an obstacle."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 
@@ -11,6 +13,7 @@ from msmpetsc.solve.petsc.events import CONTACT
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 
 
+@dataclass
 class ContactFaces:
     """Search for the faces of one step, from q to its end. All methods are collective.
 
@@ -26,24 +29,20 @@ class ContactFaces:
     is_settled : the problem solved last was the right one
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        environment: Environment,
-        q: np.ndarray,
-        y: np.ndarray,
-        *,
-        time: float,
-        time_step: float,
-        before: np.ndarray | None,
-        fixed: np.ndarray,
-        q_before: np.ndarray | None = None,
-    ):
-        self.comm, self.environment, self.q, self.y = comm, environment, q, y
-        self.time, self.time_step, self.before, self.fixed = time, time_step, before, fixed
-        self.q_before = q_before
-        self.solves, self.is_settled = 0, False
-        self.sides = self._crossed(y)
+    comm: MPI.Comm
+    environment: Environment
+    q: np.ndarray
+    y: np.ndarray
+    time: float
+    time_step: float
+    before: np.ndarray | None
+    fixed: np.ndarray
+    q_before: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        self.solves = 0
+        self.is_settled = False
+        self.sides = self._crossed(self.y)
 
     def _crossed(self, end: np.ndarray) -> np.ndarray:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""

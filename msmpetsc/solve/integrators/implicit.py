@@ -17,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.build import Model
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
@@ -25,6 +24,7 @@ from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes, Trace
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
@@ -34,8 +34,8 @@ from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
 
-class ImplicitEuler:
-    """Implicit Euler's method (an Integrator); another solver takes over where an anchor lets go.
+class ImplicitEuler(Integrator):
+    """Implicit Euler's method; another solver takes over where an anchor lets go.
 
         v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1)
 
@@ -44,23 +44,14 @@ class ImplicitEuler:
 
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
-    looks_back = False
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        model: Model,
-        environment: Environment,
-        time: Time,
-        solver: Solver,
-        probes: Probes = Probes(),
-        prefix: str = "",
+        self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, probes: Probes, prefix: str
     ):
-        self.comm, self.model, self.environment, self.prefix = comm, model, environment, prefix
+        self.comm, self.environment, self.solver, self.probes, self.prefix = comm, environment, solver, probes, prefix
         self.time_step = time.step
-        self.damping = model.damping
+        self.damping = environment.damping
         self.tau = self._first_tau()
-        self.solver, self.probes = solver, probes
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
         self.problem: StepProblem | None = None  # of the step taken last
@@ -108,17 +99,7 @@ class ImplicitEuler:
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
         """
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(
-            self.comm,
-            self.environment,
-            state.q,
-            y,
-            time=time,
-            time_step=time_step,
-            before=state.sides,
-            fixed=fixed,
-            q_before=q_before,
-        )
+        faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun = self.stepper.work_so_far()
         while not faces.is_settled:
             self.problem = faces.problem()
@@ -148,7 +129,7 @@ class ImplicitEuler:
         solver = self.solver
         return Stepper(
             self.comm,
-            self.model.lattice.pin(self.environment.fixed_at(time)),
+            self.environment.lattice.pin(self.environment.fixed_at(time)),
             self.damped_tau,
             find_preset(solver.preset),
             solver.error,

@@ -8,25 +8,33 @@ that of a step, its F
 M only weighs errors. tau scales F, so that M^(-1) tau^2 (Hessian of E) has no eigenvalue below about 1 where the body
 is at rest: as a step's Hessian has none for its M, from which bounds on errors follow.
 
-Where the whole load cannot be brought on at once it comes on in load steps (solve.integrators.load_steps).
+Where the whole load cannot be brought on at once it comes on in load steps. A share s of it, 0 to 1, is the
+equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is; obstacles
+press as they will, and anchors have gone a share s of their way. So it does not matter what has changed: a force, an
+anchor that lets go, an obstacle. Without inertia, what nothing holds has no equilibrium, and is refused.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.errors import StepFailed
+from msmpetsc.elasticity.locate import of_body, worst_inverted
+from msmpetsc.environment import Environment
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
-from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.integrators.support import refuse_free_bodies
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.bodies import Bodies, bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.work import Work
 
@@ -34,10 +42,129 @@ SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked fo
 LOWEST = 10.0  # eigenvalue of M^(-1) tau^2 (Hessian of E) at rest
 WILL_DO = 1.0, 1e3  # eigenvalues for which no other tau is taken, for that takes another solver
 SOON = 30  # iterations of a load step that may still be halved
+SMALLEST = 2.0**-10  # of the load: the smallest load step
+MOST_FAILURES = 50  # of the load steps of one state
+SMALL = 2.0**-4  # of the load: a step no larger is not refused for what a smaller one may avoid
+FLAT = 1e-6  # cells: nodes no farther than that from a line are on it
+WAYS = ("by nothing", "at a point, about which it turns", "along a line, about which it turns")  # by dimensions
+
+
+class LoadSteps:
+    """Shares of a load that are tried one after another.
+
+    reached : share of the equilibrium found last
+    count   : load steps that were taken
+    """
+
+    def __init__(self) -> None:
+        self.reached, self.size, self.count, self.failures = 0.0, 1.0, 0, 0
+
+    @property
+    def share(self) -> float:
+        """The share to try next."""
+        return min(self.reached + self.size, 1.0)
+
+    @property
+    def is_done(self) -> bool:
+        return self.reached == 1.0
+
+    @property
+    def may_be_refused(self) -> bool:
+        """Whether the next step is so large that smaller ones may well end better."""
+        return self.size > SMALL
+
+    def take(self) -> None:
+        """Know that the share has its equilibrium: the next step is twice as large."""
+        self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
+
+    def halve(self, failure: StepFailed) -> None:
+        """Know that the share failed. Raises StepFailed where it was of the smallest, or one of very many."""
+        self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
+        if self.size < SMALLEST or self.failures > MOST_FAILURES:
+            raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None
+
+
+@dataclass
+class LoadPath:
+    """Equilibria between a state and the next one. All methods are collective.
+
+    problem    : of the share taken last
+    sides      : (o, l) contact faces that it has
+    """
+
+    comm: MPI.Comm
+    stepper: Stepper
+    environment: Environment
+    state: State
+    time: float
+    time_step: float
+
+    def __post_init__(self) -> None:
+        self.base = self.state.q
+        self.target = self.environment.prescribed(self.base, self.time)
+        self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
+        self.sides = self.state.sides
+        self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
+        self.holding: np.ndarray | None = None  # r (owned, 3) [N], once it is asked for
+        self.problem: StepProblem | None = None
+
+    def try_share(self, steps: LoadSteps) -> StepResult:
+        """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one with cells turned
+        inside out, which smaller steps may avoid."""
+        share, q = steps.share, self.known[-1][1]
+        obstacles_move = 0.0 if len(self.known) > 1 else self.time_step  # [s]: in the first load step alone
+        fixed = self.stepper.lattice.pinned
+        faces = ContactFaces(self.comm, self.environment, q, q, self.time, obstacles_move, self.sides, fixed)
+        while not faces.is_settled:
+            problem = self._problem(faces.problem(), share)
+            result = self.stepper.step(problem, self._guess(problem, share))
+            faces.compare(result.position)
+        if steps.may_be_refused:
+            self._refuse_folds(result.position)
+        self.known = [self.known[-1], (share, result.position)]
+        self.problem, self.sides = problem, faces.sides
+        return result
+
+    def _problem(self, whole: StepProblem, share: float) -> StepProblem:
+        """A share of the problem of the whole load."""
+        load, prescribed = whole.load, self.target
+        if share < 1:
+            if self.holding is None:
+                self.holding = self._holding(whole)
+            load = load + (1 - share) * self.holding
+            prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
+        return replace(whole, y=self.base, load=load, prescribed=prescribed)
+
+    def _holding(self, whole: StepProblem) -> np.ndarray:
+        """The force (owned, 3) [N] that would keep the free nodes where they are."""
+        stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
+        functional.begin(replace(whole, y=self.base, prescribed=None))
+        stepper.unknowns.from_nodes(self.base, stepper.x)
+        f = functional.evaluate(stepper.x, stepper.work).f
+        holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
+        holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
+        return holding
+
+    def _guess(self, problem: StepProblem, share: float) -> np.ndarray:
+        """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""
+        (share_before, before), (reached, q) = self.known[0], self.known[-1]
+        if reached == share_before:
+            return q
+        pinned, functional = self.stepper.lattice.pinned[:, None], self.stepper.functional
+        ahead = q + (share - reached) / (reached - share_before) * (q - before)
+        functional.begin(problem)
+        values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
+        return ahead if values[1] < values[0] else q
+
+    def _refuse_folds(self, q: np.ndarray) -> None:
+        """Raise StepFailed where more cells are inside out at q (l, 3) [m] than before."""
+        count, where = worst_inverted(self.comm, self.stepper.lattice, q)
+        if count > self.inverted:
+            raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
 
 
 class Static(ImplicitEuler):
-    """States of equilibrium (an Integrator): that at ``time``, from the one a step before.
+    """States of equilibrium at the times of steps: that at ``time``, from the one a step before.
 
     Forces, anchors and obstacles are taken as they are then.
 
@@ -52,7 +179,7 @@ class Static(ImplicitEuler):
         super().__init__(*arguments, **settings)
 
     def _first_tau(self) -> float:
-        return SLENDER * transit_time(self.comm, self.model.lattice)
+        return SLENDER * transit_time(self.comm, self.environment.lattice)
 
     def _new_stepper(self, time: float) -> Stepper:
         self.made_for = time
@@ -60,7 +187,7 @@ class Static(ImplicitEuler):
 
     def set_up(self) -> None:
         """Make ready, and settle tau. Raises InputError for a body that is not held."""
-        refuse_free_bodies(self.comm, self.stepper.unknowns)
+        refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
         lowest = self._lowest()
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
@@ -135,3 +262,58 @@ def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
     sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
     mass, stiffness = comm.allreduce(sums)
     return float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
+
+
+def refuse_free_bodies(unknowns: Unknowns) -> None:
+    """Raise InputError where rigid motions are left to the free nodes, or to a part of them that no spring joins with
+    the rest (collective).
+
+    A part is held by the nodes at the other ends of its springs, of which three must not be on a line.
+    """
+    bodies = bodies_of(unknowns)
+    spans = _spans(unknowns, bodies)
+    loose = np.flatnonzero(spans < len(WAYS))
+    if not len(loose):
+        return
+    nodes, positions, first = _nodes(unknowns, bodies, int(loose[0]))
+    place, whose = ", ".join(f"{x:.4g}" for x in positions), of_body(unknowns.lattice, first)
+    what = "the body" if len(spans) == 1 else f"a part {whose}of {nodes} nodes about ({place}) m at rest"
+    more = f", and so are {len(loose) - 1} more parts" if len(loose) > 1 else ""
+    raise InputError(
+        f'time.integrator = "static": {what} is held {WAYS[spans[loose[0]]]}{more}: it has no equilibrium without '
+        "inertia; pin it or lead it by an anchor (contact does not count), or choose another integrator"
+    )
+
+
+def _spans(unknowns: Unknowns, bodies: Bodies) -> np.ndarray:
+    """Return of each body (b,) by what it is held: 0 nothing, 1 a point, 2 points on a line, 3 others."""
+    comm, lattice = unknowns.comm, unknowns.lattice
+    springs, number = lattice.springs[: lattice.springs_owned], bodies.number
+    nodes = (to_host(lattice.nodes) - _middle(comm, to_host(lattice.nodes))) / lattice.cell_size
+    sums = np.zeros((len(bodies.free), 13))  # count, sum of p, sum of p p^T
+    for free, held in (springs.T, springs[:, ::-1].T):
+        joins = (number[free] >= 0) & (number[held] < 0)
+        p = nodes[held[joins]]
+        moments = np.concatenate([np.ones((len(p), 1)), p, (p[:, :, None] * p[:, None, :]).reshape(-1, 9)], axis=1)
+        np.add.at(sums, number[free[joins]], moments)
+    comm.Allreduce(MPI.IN_PLACE, sums, MPI.SUM)
+    count, mean = sums[:, 0], sums[:, 1:4] / np.maximum(sums[:, :1], 1)
+    spread = sums[:, 4:].reshape(-1, 3, 3) - count[:, None, None] * mean[:, :, None] * mean[:, None, :]
+    apart = np.linalg.eigvalsh(spread)[:, 1:] > FLAT * np.maximum(count, 1)[:, None]
+    return np.where(count > 0, 1 + apart.sum(axis=1), 0)
+
+
+def _middle(comm: MPI.Comm, nodes: np.ndarray) -> np.ndarray:
+    """Return a point (3,) [m] amid the nodes (l, 3) of all ranks."""
+    sums = comm.allreduce(np.append(nodes.sum(axis=0), len(nodes)))
+    return sums[:3] / sums[3]
+
+
+def _nodes(unknowns: Unknowns, bodies: Bodies, body: int) -> tuple[int, np.ndarray, int]:
+    """Return how many nodes a body has, their mean (3,) [m] at rest, and the least of their global numbers."""
+    comm, lattice = unknowns.comm, unknowns.lattice
+    rows = np.flatnonzero(bodies.number[: lattice.owned] == body)
+    own = to_host(lattice.nodes[: lattice.owned])[rows]
+    sums = comm.allreduce(np.append(own.sum(axis=0), len(own)))
+    least = comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
+    return int(sums[3]), sums[:3] / sums[3], least

@@ -21,9 +21,8 @@ from itertools import pairwise
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import greatest, like
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.build import Model
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.friction import Movers
@@ -31,10 +30,11 @@ from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.motion import Time
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.stability_limit import HighestMode
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -49,27 +49,18 @@ EASED = 1 / 32  # of that: twice the substep, which gains from 4 to 16 times as 
 HALVINGS = 5  # of substeps, for what they gain
 MOST_SUBSTEPS = 1e6  # of a step
 ROUNDING = 1e-14  # of the energy below, that a step may gain
+SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
+MOST_ITERATIONS = 100  # of it
 TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
 
 
-class Verlet:
-    """Velocity Verlet's method (an Integrator). ``time.substep`` may only shorten its substeps."""
+class Verlet(Integrator):
+    """Velocity Verlet's method. ``time.substep`` may only shorten its substeps."""
 
-    looks_back = False
-
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        model: Model,
-        environment: Environment,
-        time: Time,
-        _: Solver,
-        probes: Probes = Probes(),
-        _prefix: str = "",
-    ):
+    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, probes: Probes, _prefix: str):
         if probes != Probes():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
-        self.comm, self.lattice, self.environment = comm, model.lattice, environment
+        self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
@@ -80,7 +71,7 @@ class Verlet:
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]  # grad E without what obstacles push
         self.sides = environment.no_sides[:, :owned]
-        self.damping = model.damping
+        self.damping = environment.damping
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
         self.springs_work = 0.0  # [J] in a step, that the springs of this rank's nodes took in
         self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
@@ -90,28 +81,16 @@ class Verlet:
         self.anchors: int | None = None  # how many hold
         self.fixed = environment.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
-        springs = slice(self.lattice.springs_owned)
-        crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
-        self.most = TORN * comm.allreduce(crushed)  # [J]
+        self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
 
     @property
     def unknowns(self) -> int:
         """Free nodes of this rank: pinned ones and led ones aside."""
         return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
 
-    def set_up(self) -> None:
-        """There is no matrix to make ready."""
-
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
-
-    def follow(self) -> None:
-        """Do nothing: an explicit step has no iterates."""
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
-        """Unknown (NaN): an explicit step solves nothing."""
-        return np.full(2, np.nan), None
 
     @property
     def state(self) -> dict[str, Range]:
@@ -327,6 +306,72 @@ class Verlet:
         """Collective."""
         for field in (self.position, self.velocity, self.highest):
             field.destroy()
+
+
+class HighestMode:
+    """The mode of the greatest eigenvalue omega^2 [1/s^2] of M^(-1) (Hessian of E), by power iterations that go on
+    from the mode found last. ``squared`` is that omega^2, 0 while it is not known."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
+        self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
+        self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
+        self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
+
+    def hold(self, fixed: np.ndarray) -> None:
+        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
+        ranks."""
+        self.fixed = fixed
+        numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
+        self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
+        self.mode.values[: self.lattice.owned][fixed] = 0
+        self._normalise()
+        self.squared = 0.0
+
+    def squared_at(self, q: np.ndarray) -> float:
+        """omega^2 of the springs at q (l, 3) [m] (collective).
+
+        Without the negative curvature across pressed springs, which is no oscillation and has no bound.
+        """
+        x, owned = self.mode.values, self.lattice.owned
+        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
+        for _ in range(MOST_ITERATIONS):
+            before = self.squared
+            product[:] = 0
+            hessian.add_product(x, product)
+            np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
+            x[:owned][self.fixed] = 0
+            self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
+            if not abs(self.squared - before) > SETTLED * self.squared:
+                break
+        return self.squared
+
+    def _normalise(self) -> float:
+        """Make |x|_M = 1; returns what it was (collective)."""
+        x = self.mode.values[: self.lattice.owned]
+        size = np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
+        if size > 0:
+            x /= size
+        self.mode.update()
+        return size
+
+    def destroy(self) -> None:
+        """Collective."""
+        self.mode.destroy()
+
+
+def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
+    """2 / omega [s] at rest: explicit steps are stable below it (collective)."""
+    highest = HighestMode(comm, lattice, elasticity)
+    highest.hold(lattice.pinned[: lattice.owned])
+    squared = highest.squared_at(lattice.nodes)
+    highest.destroy()
+    return 2 / np.sqrt(squared) if squared > 0 else np.inf
+
+
+def crushing_energy(lattice: Lattice) -> float:
+    """Return the energy [J] that presses every spring of this rank to a point."""
+    springs = slice(lattice.springs_owned)
+    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
 @kernel

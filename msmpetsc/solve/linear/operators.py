@@ -10,10 +10,12 @@ from msmpetsc.backend.arrays import like, to_host
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
-from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
+from msmpetsc.solve.petsc.library import view_entries
 from msmpetsc.solve.petsc.memory import Memory
+
+SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)  # in a line, without entries
 
 
 class Block:
@@ -63,17 +65,9 @@ class ContactBlocks:
 class Viewable:
     """A MATPYTHON context that can be written to a file: an empty one would be all that PETSc could make of it."""
 
-    unknowns: Unknowns
-
     def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        if asks_for_entries(viewer):
-            matrix = explicit(operator, self.unknowns, self.coupled())
-            matrix.view(viewer)
-            matrix.destroy()
-
-    def coupled(self) -> np.ndarray | None:
-        """The free nodes (m,) bool that it couples with others than those that springs join them with; None of none."""
-        return None
+        if viewer.getType() != PETSc.Viewer.Type.ASCII or viewer.getFormat() not in SUMMARIES:
+            view_entries(operator, viewer)
 
 
 class ThreeColumns(Viewable):
@@ -124,9 +118,6 @@ class TrueHessian(Viewable):
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
             self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
-
-    def coupled(self) -> np.ndarray | None:
-        return self.surface.blocks[self.unknowns.free].any(axis=1) if self.surface else None
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"

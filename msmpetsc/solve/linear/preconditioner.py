@@ -20,14 +20,11 @@ class Preconditioner:
     preconditioned with.
 
     matrix  : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
-    columns : 3, or 1 for A (x) I_3
     contact : what is added to its diagonal, if anything
     """
 
-    def __init__(
-        self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str, contact: "ContactDiagonal | None" = None
-    ):
-        self.matrix, self.memory, self.columns, self.contact = matrix, memory, columns, contact
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, prefix: str, contact: "ContactDiagonal | None" = None):
+        self.matrix, self.memory, self.contact = matrix, memory, contact
         self.blocks: list[Block] = []
         self.pc = PETSc.PC().create(matrix.comm)
         self.pc.setOptionsPrefix(prefix)
@@ -44,7 +41,7 @@ class Preconditioner:
         self.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self.columns == 1:
+        if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
             self.pc.apply(x, y)
             return
         right, solution = self.blocks = self.blocks or self._create_blocks()

@@ -37,8 +37,7 @@ class Unknowns:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, static: bool = False):
-        self.lattice, self.memory = lattice, memory_of(lattice.nodes)
-        self.static = static
+        self.comm, self.lattice, self.memory, self.static = comm, lattice, memory_of(lattice.nodes), static
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
@@ -56,24 +55,21 @@ class Unknowns:
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        self.ghost_values, self.scatter = self._scatter_to(comm, self.indices[free_ghosts].ravel())
-
-    def _scatter_to(self, comm: MPI.Comm, sources: np.ndarray) -> tuple[PETSc.Vec, PETSc.Scatter]:
-        """Vector of this rank's ghosts, and the scatter that fills it from the ``sources`` in a vector of unknowns."""
-        values = PETSc.Vec().create(PETSc.COMM_SELF)
-        values.setSizes(len(sources))
-        values.setType(self.memory.vec_type)
-        vector = self.create_vector(comm)
+        sources = self.indices[free_ghosts].ravel()  # in a vector of unknowns
+        self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
+        vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
-        scatter = PETSc.Scatter().create(vector, index, values, None)
+        self.scatter = PETSc.Scatter().create(vector, index, self.ghost_values, None)
         index.destroy()
         vector.destroy()
-        return values, scatter
 
-    def create_vector(self, comm: MPI.Comm) -> PETSc.Vec:
-        """A new vector of unknowns (collective)."""
+    def create_vector(self) -> PETSc.Vec:
+        """Return a new vector of unknowns (collective)."""
+        return self._vector(self.comm, (3 * self.size, 3 * self.total))
+
+    def _vector(self, comm: MPI.Comm, sizes: int | tuple[int, int]) -> PETSc.Vec:
         vector = PETSc.Vec().create(comm)
-        vector.setSizes((3 * self.size, 3 * self.total))
+        vector.setSizes(sizes)
         vector.setType(self.memory.vec_type)
         return vector
 

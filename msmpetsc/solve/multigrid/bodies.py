@@ -43,15 +43,15 @@ class Bodies:
         return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
 
 
-def bodies_of(comm: MPI.Comm, unknowns: Unknowns) -> Bodies:
+def bodies_of(unknowns: Unknowns) -> Bodies:
     """Return the bodies of a lattice (collective)."""
-    lattice = unknowns.lattice
+    comm, lattice = unknowns.comm, unknowns.lattice
     moves, springs = ~to_host(lattice.pinned), lattice.springs
     both, either = moves[springs].all(axis=1), moves[springs].any(axis=1)
     joined = springs[both]
     graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2)
     part = connected_components(graph, directed=False)[1]
-    name = _names(comm, unknowns, part)
+    name = _names(unknowns, part)
     table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
     number = np.where(moves, table.find(np.where(moves, name, -1)), -1)
     held = np.zeros(table.total, bool)
@@ -61,12 +61,12 @@ def bodies_of(comm: MPI.Comm, unknowns: Unknowns) -> Bodies:
     return Bodies(number, ~held)
 
 
-def _names(comm: MPI.Comm, unknowns: Unknowns, part: np.ndarray) -> np.ndarray:
+def _names(unknowns: Unknowns, part: np.ndarray) -> np.ndarray:
     """The least global number (l,) in the body of each node; ``part`` (l,) that of this rank it belongs to.
 
     Ranks that have parts of one body tell each other until none learns of a lesser number.
     """
-    lattice = unknowns.lattice
+    comm, lattice = unknowns.comm, unknowns.lattice
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     name, is_new = lattice.global_numbers, True
@@ -88,8 +88,8 @@ class Translations:
     of_body : (b,) of each free body [kg]
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, bodies: Bodies):
-        self.comm, self.unknowns, self.count = comm, unknowns, int(bodies.free.sum())
+    def __init__(self, unknowns: Unknowns, bodies: Bodies):
+        self.unknowns, self.count = unknowns, int(bodies.free.sum())
         rank = np.where(bodies.free, np.cumsum(bodies.free) - 1, self.count)
         self.body = like(unknowns.lattice.nodes, rank[bodies.number[to_host(unknowns.free)]])
         self.mass = unknowns.lattice.mass[unknowns.free]
@@ -114,4 +114,4 @@ class Translations:
     def _sums(self, rows: np.ndarray) -> np.ndarray:
         """Sums (r, b) over each free body's nodes of rows (r, m)."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
-        return self.comm.allreduce(np.array(own).reshape(len(rows), self.count))
+        return self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import like, on_host, to_host
@@ -93,7 +92,6 @@ class GalerkinSum:
 
     def __init__(
         self,
-        comm: MPI.Comm,
         unknowns: Unknowns,
         elasticity: Elasticity,
         t2: float,
@@ -112,7 +110,7 @@ class GalerkinSum:
         diagonal = np.flatnonzero((first == second) & (first >= 0))
         upper = np.flatnonzero(first != second)
         self.diagonal, self.upper = (like(lattice.nodes, a) for a in (diagonal, upper))
-        self.matrix = self._create_matrix(comm, grid, first, second, upper)
+        self.matrix = self._create_matrix(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Global numbers (b,), (b,) of the pairs of nodes that have a block; which a cell adds to, (c, 36), -1 none."""
@@ -126,9 +124,8 @@ class GalerkinSum:
             places[exists] = shared
         return pairs // grid.table.total, pairs % grid.table.total, places
 
-    def _create_matrix(
-        self, comm: MPI.Comm, grid: CoarseGrid, first: np.ndarray, second: np.ndarray, upper: np.ndarray
-    ) -> PETSc.Mat:
+    def _create_matrix(self, grid: CoarseGrid, first: np.ndarray, second: np.ndarray, upper: np.ndarray) -> PETSc.Mat:
+        comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)
         matrix.setSizes((grid.sizes, grid.sizes))

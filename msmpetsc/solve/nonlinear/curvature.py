@@ -257,7 +257,7 @@ class LowestCurvature:
 
     def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
         if self.vectors is None:
-            self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
+            self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):

@@ -55,7 +55,8 @@ class StepFunctional:
     """
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
-        self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
+        self.comm, self.unknowns, self.elasticity = comm, unknowns, elasticity
+        self.time_step, self.t2 = time_step, time_step**2
         self.lattice, self.memory = unknowns.lattice, unknowns.memory
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
         self.per_mass = 1 / self.mass

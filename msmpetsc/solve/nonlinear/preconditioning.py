@@ -8,20 +8,135 @@ hundred iterations for, has multigrid of its own meanwhile.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.preconditioner import Preconditioner
-from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.bodies import Translations
+from msmpetsc.solve.multigrid.cycle import Multigrid
+from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
+USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
+WORTH = 10.0  # iterations that a new hierarchy takes the time of
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
+
+
+class LatticePreconditioner:
+    """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
+
+    translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
+    is_first : there is none yet
+    pace     : iterations a digit of the first solve with it; None before that
+    wasted   : iterations since then that were more than that
+    is_stale : a new one is due
+    """
+
+    def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
+        self.unknowns = unknowns
+        with GRIDS:
+            self.multigrid = Multigrid(unknowns, elasticity, time_step, prefix)
+        bodies = self.multigrid.bodies
+        self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
+        self.is_first = True
+        self.pace: float | None = None
+        self.wasted = 0.0
+        self.is_stale, self.is_free = True, False
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """The projected Hessian."""
+        return self.multigrid.operator
+
+    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
+        due = self.is_stale
+        self.is_free = self._is_free(q, contact)
+        if due:
+            self._build(q.copy(), self._blocks(q, contact))
+        return due
+
+    def build_anew(self, q: np.ndarray, contact: Contact | None) -> None:
+        """Build the hierarchy at positions q (l, 3) [m], whatever there was."""
+        self.is_stale = True
+        self.prepare(q, contact)
+
+    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
+        their forces balance: linear solves leave them there."""
+        if self.translations and self._is_free(q, contact):
+            columns = self.unknowns.columns_to_write(x)
+            columns -= self.translations.of(self.unknowns.columns(f))
+
+    def learn(self, its: int, rtol: float) -> None:
+        """A linear solve took so many iterations to a relative tolerance; none say nothing.
+
+        A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
+        """
+        if its == 0:
+            return
+        digits = max(-np.log10(rtol), 0.1)
+        if self.pace is None:
+            self.pace = its / digits
+        self.wasted += max(its - self.pace * digits, 0.0)
+        self.is_stale |= self.wasted > WORTH
+
+    def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
+        with HIERARCHY:
+            self.multigrid.update(q, contact)
+        self.pace, self.wasted = USUAL_PACE if self.is_first else None, 0.0
+        self.is_first = self.is_stale = False
+
+    def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
+        """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
+        if self.translations is None or contact is None:
+            return self.translations is not None
+        if contact.surface and len(self.multigrid.bodies.free) > 1 and contact.surface.presses(q):
+            return False  # of one body alone it moves the middle no more than springs do
+        pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
+        return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
+
+    def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
+        lattice = self.unknowns.lattice
+        blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
+        for nodes, added in contact.hessian(q, False) if contact else ():
+            blocks[nodes] += added.reshape(-1, 9)
+        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+        return blocks + surface.blocks if surface else blocks
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        """The options are read when the levels are there."""
+
+    def setUp(self, _: PETSc.PC) -> None:
+        self.multigrid.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        with CYCLE:
+            if self.translations and self.is_free:
+                self.translations.around(self.multigrid.pc, x, y)
+            else:
+                self.multigrid.pc.apply(x, y)
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.multigrid.pc.view(viewer)
+
+    def forget(self) -> None:
+        """Know nothing of the steps before: a new hierarchy is due."""
+        self.is_stale = self.is_first = True
+
+    def destroy(self) -> None:
+        self.multigrid.destroy()
 
 
 def expected_iterations(ratio: float) -> float:
@@ -39,6 +154,7 @@ class Preconditioned:
         self.preconditioner.in_use.matrix.view(viewer)
 
 
+@dataclass(eq=False)
 class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
@@ -48,28 +164,26 @@ class StepPreconditioner:
     nodes   : free ones, on all ranks
     """
 
-    def __init__(
-        self,
-        make_of_matrix: Callable[[], Preconditioner],
-        make_multigrid: Callable[[], LatticePreconditioner],
-        kind: str,
-        chooses: bool,
-        ratio: float,
-        nodes: int,
-    ):
-        self.make_multigrid, self.chooses = make_multigrid, chooses
-        self.is_large, self.is_searching = nodes >= LARGE, False
+    make_of_matrix: Callable[[], Preconditioner]
+    make_multigrid: Callable[[], LatticePreconditioner]
+    kind: str
+    chooses: bool
+    ratio: float
+    nodes: int
+
+    def __post_init__(self) -> None:
+        self.is_searching = False
         self.for_searches: LatticePreconditioner | None = None
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
-        self.is_chosen = kind == MULTIGRID  # multigrid, for the steps
-        expected = expected_iterations(ratio)
-        if kind == MULTIGRID:
-            self.multigrid = make_multigrid()
-        elif chooses and expected > LONG:
-            self._choose(f"t^2 k / m = {ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
+        self.is_chosen = self.kind == MULTIGRID  # multigrid, for the steps
+        expected = expected_iterations(self.ratio)
+        if self.is_chosen:
+            self.multigrid = self.make_multigrid()
+        elif self.chooses and expected > LONG:
+            self._choose(f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
         else:
-            self.of_matrix = make_of_matrix()
+            self.of_matrix = self.make_of_matrix()
 
     @property
     def in_use(self) -> Preconditioner | LatticePreconditioner:
@@ -91,7 +205,7 @@ class StepPreconditioner:
     def searching(self, q: np.ndarray, contact: Contact | None) -> Iterator[None]:
         """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
         smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
-        if self.is_chosen or not (self.chooses and self.is_large):
+        if self.is_chosen or not self.chooses or self.nodes < LARGE:
             yield
             return
         self.for_searches = self.for_searches or self.make_multigrid()

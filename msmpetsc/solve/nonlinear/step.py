@@ -4,7 +4,7 @@
 import ctypes
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -15,18 +15,23 @@ from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl, Outcome
+from msmpetsc.solve.nonlinear.error_control import (
+    DEFAULT_ERROR,
+    NOT_FINITE,
+    ErrorControl,
+    Outcome,
+    no_minimum,
+    not_converged,
+    where_worst,
+)  # fmt: skip
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.failure import NOT_FINITE, no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
-from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
-from msmpetsc.solve.nonlinear.jacobian import Jacobian
+from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.rounding import Rounding
-from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.events import LOCAL
-from msmpetsc.solve.petsc.library import total_iterations
+from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
@@ -59,6 +64,7 @@ class StepResult:
     time_error: float = np.nan
 
 
+@dataclass(eq=False)
 class Stepper:
     """Solver of the steps of one lattice and time step; all PETSc objects it makes are destroyed by ``destroy``.
 
@@ -72,40 +78,39 @@ class Stepper:
     Raises InputError for PETSc options that do not go together (collective).
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        time_step: float,
-        preset: Preset,
-        error: float | None = None,
-        max_iterations: int | None = None,
-        touches: bool = False,
-        prefix: str = "",
-        static: bool = False,
-    ):
-        self.lattice, self.preset = lattice, preset
-        self.budget = max_iterations or (preset.iterations if error is None else None) or 0
-        if error is None and not self.budget:
-            error = DEFAULT_ERROR
-        self.observer: Callable[[np.ndarray], None] | None = None
+    comm: MPI.Comm
+    lattice: Lattice
+    time_step: float
+    preset: Preset
+    error: float | None = None
+    max_iterations: int | None = None
+    touches: bool = False
+    prefix: str = ""
+    static: bool = False
+    observer: Callable[[np.ndarray], None] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.budget = self.max_iterations or 0
+        if self.error is None and not self.budget:
+            self.budget = self.preset.iterations or 0
         self.projected = False  # whether newton's Hessian is, at the moment
         self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
         self.iterations = 0  # of all steps so far
-        self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
+        self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
         self.kinks, self.owned = FrictionKinks(), ExitStack()
-        self.unknowns = Unknowns(comm, lattice, static)
+        self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
-        self.functional = StepFunctional(comm, self.unknowns, Elasticity(comm, lattice), time_step)
-        self.first_guess = FirstGuess(self.functional, preset.extrapolate)
-        self.options = SolverOptions(preset, prefix, self.budget)
+        elasticity = Elasticity(self.comm, self.lattice)
+        self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
+        self.first_guess = FirstGuess(self.functional, self.preset.extrapolate)
+        self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
             with petsc_errors("PETSc refuses its options"):
-                self.jacobian = self._create_jacobian(comm, time_step, touches)
+                self.jacobian = Jacobian(self.functional, self.preset, self.options, self.touches, self.owned)
                 self.x, self.work = (self._keep(self.jacobian.operator.createVecRight()) for _ in range(2))
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
-                self.snes, self.ksp = self._create_solvers(comm, touches)
-                self.control, self.minimum = self._create_control(error)
+                self.snes, self.ksp = self._create_solvers()
+                self.control, self.minimum = self._create_control()
         except InputError:
             self.destroy()
             raise
@@ -114,17 +119,9 @@ class Stepper:
         self.owned.callback(owned.destroy)
         return owned
 
-    def _create_jacobian(self, comm: MPI.Comm, time_step: float, touches: bool) -> Jacobian:
-        preset = self.preset
-        flags = {"true_hessian": preset.true_hessian, "kronecker": preset.kronecker, "chooses": preset.chooses}
-        elasticity = self.functional.elasticity
-        return Jacobian(
-            comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options
-        )
-
-    def _create_solvers(self, comm: MPI.Comm, touches: bool) -> tuple[PETSc.SNES, PETSc.KSP]:
+    def _create_solvers(self) -> tuple[PETSc.SNES, PETSc.KSP]:
         """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
-        snes, prefix = self._keep(PETSc.SNES().create(comm)), self.options.prefix
+        snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
         inner = self._keep(snes.getNPC()) if self.has_npc else snes
         ksp = self._keep(inner.getKSP())
@@ -136,7 +133,7 @@ class Stepper:
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
         snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
         snes.setObjective(self._objective)
-        if touches:
+        if self.touches:
             snes.setLineSearchPreCheck(self._shorten)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -144,15 +141,18 @@ class Stepper:
         snes.setFromOptions()
         return snes, ksp
 
-    def _create_control(self, error: float | None) -> tuple[ErrorControl, Minimum]:
+    def _create_control(self) -> tuple[ErrorControl, Minimum]:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
-        estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.options.prefix))
+        estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
         curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
         rounding = Rounding(functional, jacobian.diagonal)
         minimum = self._keep(Minimum(functional, estimate, curvature, rounding))
+        error = self.error
+        if error is None and not self.budget:
+            error = DEFAULT_ERROR
         tightest = self.ksp.getTolerances()[0]
-        return ErrorControl(functional, estimate, curvature, rounding, error, tightest), minimum
+        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest), minimum
 
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.

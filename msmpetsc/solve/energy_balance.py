@@ -42,20 +42,15 @@ FLOOR = 1e-10  # of the energy that presses every spring to a point: what roundi
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies at one time [J].
+    """Energies at one time [J]."""
 
-    kinetic  : of all nodes; ``free`` of those that nothing prescribes
-    momentum : (3,) [kg m/s]
-    touch    : contacts of the surface with itself
-    """
-
-    kinetic: float
+    kinetic: float  # of all nodes; ``free`` of those that nothing prescribes
     free: float
     elastic: float
     contact: float
     potential: float
-    momentum: np.ndarray
-    touch: Touch
+    momentum: np.ndarray  # (3,) [kg m/s]
+    touch: Touch  # contacts of the surface with itself
 
     @property
     def inner(self) -> float:
@@ -67,14 +62,13 @@ class Energies:
 class EnergyBalance:
     """Examiner of a run's steps; states keep the ledger.
 
-    swings : whether the integrator's energy does
     checks : whether steps are balanced; if not only numbers that are not finite are found
     """
 
     comm: MPI.Comm
     environment: Environment
     elasticity: Elasticity
-    swings: bool = False
+    swings: bool = False  # whether the integrator's energy does
     checks: bool = True
 
     def __post_init__(self) -> None:
@@ -125,7 +119,6 @@ class EnergyBalance:
         return result, replace(after, ledger=self._examine(before, result, after, time, time_step))
 
     def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Ledger:
-        """The ledger with a step from ``before`` to ``after``."""
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         if not self.checks:
@@ -156,7 +149,6 @@ class EnergyBalance:
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
 
     def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
-        """The ledger with a step; sums (5,) of _start."""
         start, pushed, work, struck, swing = sums
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
@@ -210,7 +202,6 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: float) -> np.ndarray:
-        """Sums over all ranks; the values may be on a GPU."""
         return self.comm.allreduce(np.array([float(value) for value in values]))
 
     def _worst(self, vectors: np.ndarray) -> str:

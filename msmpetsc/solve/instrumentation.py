@@ -20,14 +20,10 @@ EVENTS = {
 
 @dataclass(frozen=True)
 class Probes:
-    """Probes of a run's steps.
+    """Probes of a run's steps."""
 
-    true_error : every so many steps the true error is measured; None for never
-    trace      : the step whose iterates are followed; None for none
-    """
-
-    true_error: int | None = None
-    trace: int | None = None
+    true_error: int | None = None  # every so many steps the true error is measured; None for never
+    trace: int | None = None  # the step whose iterates are followed; None for none
 
     def asks(self, index: int) -> bool:
         """Whether the true error of a step is to be measured."""

@@ -1,6 +1,8 @@
 """Monitors of a run, which warn once: of cells inside out, steps that ended far from their solution, energy that came
 from nowhere, and nodes inside an obstacle that comes to be there."""
 
+from typing import ClassVar
+
 import numpy as np
 from mpi4py import MPI
 
@@ -18,6 +20,10 @@ FAR = 0.3  # relative error of a step: a budget of iterations that leaves so muc
 
 class Monitors:
     """Monitors of one run. All ranks warn alike, rank 0 is heard."""
+
+    state: ClassVar[dict[str, Range]] = {
+        **dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT), "worst_error": ANY, "worst_gain": ANY
+    }  # fmt: skip
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
@@ -75,12 +81,6 @@ class Monitors:
                 )  # fmt: skip
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        counts = dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT)
-        return {**counts, "worst_error": ANY, "worst_gain": ANY}
 
     def sum_up(self) -> None:
         """Say at the end of a run how often it was."""

@@ -21,25 +21,22 @@ from msmpetsc.solve.petsc.words import options_of, words_of
 class Preset:
     """about: when to use it. options: PETSc's, without the dash.
 
-    true_hessian : the Jacobian is the true Hessian of g, not the constant A
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
-    start_from_b : CG starts from x = b, as in the paper's Algorithm 1
     extrapolate  : a step starts from the best of several guesses, not from y as published
     iterations   : a fixed number of them is the method as published; None iterates to the error target
     inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
-    kronecker    : A is factored as A (x) I_3, 3m x 3m
     chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
     """
 
     about: str
     options: dict[str, str]
-    true_hessian: bool = False
+    true_hessian: bool = False  # the Jacobian is the true Hessian of g, not the constant A
     projected: int = 0
-    start_from_b: bool = False
+    start_from_b: bool = False  # CG starts from x = b, as in the paper's Algorithm 1
     extrapolate: bool = True
     iterations: int | None = None
     inexact: bool = False
-    kronecker: bool = False
+    kronecker: bool = False  # A is factored as A (x) I_3, 3m x 3m
     chooses: bool = False
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import ClassVar
 
 from msmpetsc.checkpoint import COUNT, Range
 from msmpetsc.comm import log
@@ -28,6 +29,8 @@ class Recovery:
     make    : makes an integrator
     balance : examines each step that one takes
     """
+
+    state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
 
     def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance):
         self.time, self.solver, self.make, self.balance = scene.time, scene.solver, make, balance
@@ -62,11 +65,6 @@ class Recovery:
             result, after = self._take(0, state, time)
             return replace(result, cost=result.cost + Work(fallbacks=1)), after
         return self._in_pieces(state, time, max(self.level, 1) if failure else self.level)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"level": (0, DEEPEST), "recovered": COUNT}
 
     def sum_up(self) -> None:
         """Say at the end of a run how many steps were recovered."""
@@ -122,7 +120,6 @@ class Recovery:
         return self.make(time, self.solver, "")
 
     def destroy(self) -> None:
-        """Destroy the integrators (collective)."""
         for integrator in self.spare.values():
             integrator.destroy()
         self.spare.clear()

@@ -10,6 +10,8 @@ T is all of the run's time: so of a swing of frequency omega the second is its a
 that nothing holds the way |v| T. They are estimated as errors of steps are, once a step has moved little.
 """
 
+from typing import ClassVar
+
 import numpy as np
 from mpi4py import MPI
 
@@ -34,6 +36,13 @@ class Rest:
 
     has_come : whether it has
     """
+
+    state: ClassVar[dict[str, Range]] = {
+        "farthest": LENGTH,
+        "next": COUNT,
+        "wait": (1, LONGEST_WAIT),
+        "has_come": (0, 1),
+    }
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, environment: Environment):
         self.comm, self.model, self.environment = comm, model, environment
@@ -67,7 +76,6 @@ class Rest:
         return float(np.sqrt(self.comm.allreduce(float(self.model.lattice.mass @ (own**2).sum(axis=1)))))
 
     def _is_at_rest(self, state: State, time: float, limit: float) -> bool:
-        """Whether both lengths are within the limit [m sqrt(kg)]."""
         lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), self.environment.touches
         preset = find_preset(PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
@@ -80,11 +88,6 @@ class Rest:
             return amplitude(stepper, state.q, state.velocity(self.time_step)) <= limit
         finally:
             stepper.destroy()
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"farthest": LENGTH, "next": COUNT, "wait": (1, LONGEST_WAIT), "has_come": (0, 1)}
 
 
 def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:

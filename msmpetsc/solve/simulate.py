@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
+from typing import ClassVar
 
 import numba
 import numpy as np
@@ -72,6 +73,8 @@ def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
 class Effort:
     """What the steps since the frame stored before took, and how far off those are whose true errors were measured."""
 
+    state: ClassVar[dict[str, Range]] = {"work": ANY, "true_error": ANY, "energy_error": ANY}
+
     work: Work = NO_WORK
     true_error: float = np.nan
     energy_error: float = np.nan
@@ -79,11 +82,6 @@ class Effort:
     def measure(self, errors: np.ndarray) -> None:
         """Take note of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"work": ANY, "true_error": ANY, "energy_error": ANY}
 
 
 class Simulation:
@@ -265,7 +263,6 @@ class Simulation:
         self.destroy()
 
     def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
         self.recovery.destroy()
         self.integrator.destroy()
         if self.surface:

@@ -125,20 +125,6 @@ def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: di
     assert all(result.cost.step_error <= 1e-3 for result in swing(preset, 2, error=1e-3))
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"snes_type": "shell"}, "PETSc cannot take a step with these options: .*SNESShellSetSolve"),
-        ({"snes_type": "python", "snes_python_type": "gone.Gone"}, "PETSc refuses its options: No module named 'gone'"),
-    ],
-)
-def test_options_that_cannot_be_are_one_line(petsc_options, options: dict[str, str], said: str):
-    petsc_options(**options)
-    with pytest.raises(InputError, match=said) as refused:
-        swing("newton", 1)
-    assert len(str(refused.value).splitlines()) == 1
-
-
 def test_a_fault_of_ours_within_petsc_is_no_bad_option():
     """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own error."""
     from petsc4py import PETSc
@@ -160,16 +146,6 @@ def test_a_preset_leaves_no_options_behind():
     for preset in PRESETS:
         swing(preset, 1)
     assert PETSc.Options().getAll() == before
-
-
-def test_pinned_nodes_do_not_move_and_are_no_unknowns(reference: list):
-    lattice = beam()
-    assert lattice.pinned.sum() == 9
-    for result in reference:
-        np.testing.assert_array_equal(result.position[lattice.pinned], lattice.nodes[lattice.pinned])
-    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
-    assert stepper.jacobian.matrix.getSize()[0] == lattice.owned - 9
-    stepper.destroy()
 
 
 def test_A_is_M_plus_t2_L():

@@ -224,19 +224,6 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
     assert frames[-1].momentum[2] == pytest.approx(0.5 * model.lattice.mass.sum(), rel=0.2)  # the rest sways
 
 
-def test_a_block_leaps_back_from_a_mirror(tmp_path: Path):
-    """Restitution 1: the body's middle goes up with most of its speed, the rest shakes the block."""
-    floor = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1]}
-    time = {"step": T, "duration": 16 * T} | EXPLICIT
-    _, frames = play(block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -G]}, obstacle=[floor]))
-    momentum = np.array([f.momentum[2] for f in frames])
-    energy = np.array([f.kinetic + f.elastic + f.potential + f.contact for f in frames])
-    down = momentum.min()
-    np.testing.assert_allclose(energy, energy[0], rtol=0.05)
-    assert momentum.max() > -0.5 * down
-    assert min(f.position[:, 2].min() for f in frames) > -0.05 - 0.1 * CELL  # the way of a substep
-
-
 TILT = 0.3  # [rad] of the slope
 
 
@@ -278,19 +265,6 @@ def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
     expected = m * G * np.sin(TILT) * last.time - mu * (last.momentum[2] + m * G * np.cos(TILT) * last.time)
     assert last.momentum[0] == pytest.approx(expected, rel=1e-6)
     assert last.momentum[0] == pytest.approx(m * G * (np.sin(TILT) - mu * np.cos(TILT)) * last.time, rel=1e-6)
-
-
-def test_friction_on_what_moves_carries_it_along(tmp_path: Path):
-    """A belt that starts to run: the block comes to its speed at mu g, and no faster."""
-    mu, speed = 0.3, 0.5
-    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": mu}
-    belt = floor | {"path": [{"time": 10.0, "by": [10 * speed, 0, 0]}]}
-    scene = block_scene(
-        tmp_path, gravity={"acceleration": [0, 0, -G]}, obstacle=[belt], time={"step": T, "duration": 30 * T} | EXPLICIT
-    )
-    model, frames = play(scene)
-    v = np.array([f.momentum[0] for f in frames]) / model.lattice.mass.sum()
-    assert v.max() < 1.1 * speed and v[-1] == pytest.approx(speed, rel=0.1)
 
 
 # ---- ranks

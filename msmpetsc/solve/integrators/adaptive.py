@@ -19,14 +19,14 @@ that BDF2 needs where the length changes. All methods are collective.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import like, to_host
-from msmpetsc.checkpoint import MOST_COUNT, Checkpoint, Range
+from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
@@ -112,25 +112,6 @@ def between(
     return q, v
 
 
-@dataclass
-class Taken:
-    """Steps taken so far.
-
-    steps, again      : that stand, and that were taken again shorter
-    shortest, longest : levels
-    """
-
-    steps: int = 0
-    again: int = 0
-    shortest: int = 99
-    longest: int = -99
-
-    def add(self, level: int) -> None:
-        """Count one that stands."""
-        self.steps += 1
-        self.shortest, self.longest = min(self.shortest, level), max(self.longest, level)
-
-
 class Adaptive(Integrator):
     """Takes the scene's steps in steps of its own, shorter or longer ones.
 
@@ -157,12 +138,11 @@ class Adaptive(Integrator):
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
-        self.tick, self.last, self.taken = 0, 0, Taken()
+        self.tick = self.last = 0
         self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
 
     @property
     def unknowns(self) -> int:
-        """Free nodes of this rank."""
         return self._integrator_last().unknowns
 
     def set_up(self) -> None:
@@ -177,7 +157,7 @@ class Adaptive(Integrator):
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
             self.kept[level].set_up()
-            if self.taken.steps:
+            if self.tick:
                 self.kept[level].forget()  # as one that was kept and not used last
         elif level != next(reversed(self.kept)):
             self.kept[level] = self.kept.pop(level)
@@ -219,9 +199,10 @@ class Adaptive(Integrator):
         cost = Work()
         while True:
             level = self._next_level(state)
-            before = self._begun(state, level, restarts)
+            before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
             try:
-                result, after, measure = self._try(before, level)
+                result, after = self.balance.step(self._integrator(level), before, end, self._length(level))
+                measure = self._measure(before, result, after, level)
                 stands = self.control.accepts(level, measure)
             except StepFailed:
                 stands = False
@@ -233,7 +214,6 @@ class Adaptive(Integrator):
                 self.control.pay(level, measure)
                 result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
                 return self._taken(result, before, after, level)
-            self.taken.again += 1
 
     def _next_level(self, state: State) -> int:
         """Of the step to be tried: no more than twice as long as the last, whose history it needs."""
@@ -241,32 +221,22 @@ class Adaptive(Integrator):
         return self.ticks.fitting(self.tick, most)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
-        """The state for a step of a level, with the history that it looks back to."""
         length, v = self._length(level), state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
             history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
         return replace(state, q_previous=state.q - length * v, history=history)
 
-    def _end(self, level: int) -> float:
-        """Time at which a step ends [s]."""
-        return self._reached(self.tick + self.ticks.length(level))
-
     def _reached(self, tick: int) -> float:
         """Time of a step that ends at a tick [s]: just before what begins or ends there."""
         return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
 
-    def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
-        """A step of a level, and what it shows."""
-        result, after = self.balance.step(self._integrator(level), before, self._end(level), self._length(level))
-        return result, after, self._measure(before, result, after, level)
-
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
-        """Of all ranks' nodes."""
         owned, t = slice(self.lattice.owned), self._length(level)
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
-        free = mass * ~self.environment.fixed_at(self._end(level))[owned]
+        end = self._reached(self.tick + self.ticks.length(level))
+        free = mass * ~self.environment.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
@@ -276,17 +246,15 @@ class Adaptive(Integrator):
         late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
         if self.environment.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
-            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, self._end(level), t))
+            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, end, t))
         sums += [mass @ (coming**2).sum(axis=1), late]
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 
     def _taken(self, result: StepResult, before: State, after: State, level: int) -> tuple[StepResult, State]:
-        """A step that stands, as the scene's step has it."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
-        self.taken.add(level)
         history = after.history or (before.q, before.velocity(t))
         previous = result.position - T / t * (result.position - result.previous)
         result = replace(result, previous=previous)
@@ -294,7 +262,7 @@ class Adaptive(Integrator):
 
     @property
     def state(self) -> dict[str, Range]:
-        return {"tick": (0, self.ticks.ticks), "last": self.levels, "taken": (-99, MOST_COUNT)}
+        return {"tick": (0, self.ticks.ticks), "last": self.levels}
 
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
@@ -317,14 +285,8 @@ class Adaptive(Integrator):
         self._integrator_last().refuse_unused_options(at_end, awaited)
 
     def sum_up(self) -> None:
-        """Say at the end of a run what steps were taken, and how far off the motion may be."""
-        taken, control = self.taken, self.control
-        if taken.steps:
-            shortest, longest = self._length(taken.shortest), self._length(taken.longest)
-            log.info(
-                "%d steps of %.3g to %.3g s, %d taken again; the motion is some %.2g of its size off (time.error = %g)",
-                taken.steps, shortest, longest, taken.again, control.estimate, control.asked,
-            )  # fmt: skip
+        """Say at the end of a run how far off the motion may be."""
+        log.info("the motion is some %.2g of its size off (time.error = %g)", self.control.estimate, self.control.asked)
 
     def destroy(self) -> None:
         self.mean.destroy()

@@ -21,10 +21,7 @@ class ContactFaces:
     again; from then on a node that has a face keeps it, so that this ends.
 
     q, y       : (l, 3) [m], as a StepProblem has them
-    time       : of the step's end [s]
-    before     : (o, l) faces when it began (environment); None: the nearest
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back
-    fixed      : (l,) bool, nodes that are no unknowns
     sides      : (o, l) faces of the problem to solve; once settled, those of the step
     is_settled : the problem solved last was the right one
     """
@@ -33,10 +30,10 @@ class ContactFaces:
     environment: Environment
     q: np.ndarray
     y: np.ndarray
-    time: float
+    time: float  # of the step's end [s]
     time_step: float
-    before: np.ndarray | None
-    fixed: np.ndarray
+    before: np.ndarray | None  # (o, l) faces when it began (environment); None: the nearest
+    fixed: np.ndarray  # (l,) bool, nodes that are no unknowns
     q_before: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -14,20 +14,13 @@ HISTORY, SIDES = ("history_q", "history_v"), "sides"
 
 @dataclass(frozen=True)
 class Ledger:
-    """Energies that a run keeps account of [J].
+    """Energies that a run keeps account of [J]."""
 
-    put_in  : the most that the body had by right
-    gained  : from nowhere, and not lost since; negative where a swing may give back
-    steady  : the same without a known swing
-    since_frame : gained since the frame stored before
-    bounced : what nodes gained that bounced off its end
-    """
-
-    put_in: float = 0.0
-    gained: float = 0.0
-    steady: float = 0.0
-    since_frame: float = 0.0
-    bounced: float = 0.0
+    put_in: float = 0.0  # the most that the body had by right
+    gained: float = 0.0  # from nowhere, and not lost since; negative where a swing may give back
+    steady: float = 0.0  # the same without a known swing
+    since_frame: float = 0.0  # gained since the frame stored before
+    bounced: float = 0.0  # what nodes gained that bounced off its end
 
     @property
     def share(self) -> float:
@@ -44,7 +37,6 @@ class State:
     not what the frame shows, which is the step as it was solved.
 
     history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
-    ledger  : of energy, as the steps so far have filled it
     sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest
     """
 
@@ -52,7 +44,7 @@ class State:
     q_previous: np.ndarray
     history: tuple[np.ndarray, np.ndarray] | None = None
     sides: np.ndarray | None = None
-    ledger: Ledger = NO_ENERGY
+    ledger: Ledger = NO_ENERGY  # of energy, as the steps so far have filled it
 
     def velocity(self, time_step: float) -> np.ndarray:
         """(l, 3) [m/s]"""

@@ -17,6 +17,7 @@ anchor that lets go, an obstacle. Without inertia, what nothing holds has no equ
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -32,7 +33,7 @@ from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.bodies import Bodies, bodies_of
+from msmpetsc.solve.multigrid.bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
@@ -45,8 +46,6 @@ SOON = 30  # iterations of a load step that may still be halved
 SMALLEST = 2.0**-10  # of the load: the smallest load step
 MOST_FAILURES = 50  # of the load steps of one state
 SMALL = 2.0**-4  # of the load: a step no larger is not refused for what a smaller one may avoid
-FLAT = 1e-6  # cells: nodes no farther than that from a line are on it
-WAYS = ("by nothing", "at a point, about which it turns", "along a line, about which it turns")  # by dimensions
 
 
 class LoadSteps:
@@ -119,14 +118,14 @@ class LoadPath:
             problem = self._problem(faces.problem(), share)
             result = self.stepper.step(problem, self._guess(problem, share))
             faces.compare(result.position)
-        if steps.may_be_refused:
-            self._refuse_folds(result.position)
+        count, where = worst_inverted(self.comm, self.stepper.lattice, result.position)
+        if steps.may_be_refused and count > self.inverted:
+            raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
         self.known = [self.known[-1], (share, result.position)]
         self.problem, self.sides = problem, faces.sides
         return result
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
-        """A share of the problem of the whole load."""
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
@@ -156,12 +155,6 @@ class LoadPath:
         values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
         return ahead if values[1] < values[0] else q
 
-    def _refuse_folds(self, q: np.ndarray) -> None:
-        """Raise StepFailed where more cells are inside out at q (l, 3) [m] than before."""
-        count, where = worst_inverted(self.comm, self.stepper.lattice, q)
-        if count > self.inverted:
-            raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
-
 
 class Static(ImplicitEuler):
     """States of equilibrium at the times of steps: that at ``time``, from the one a step before.
@@ -173,10 +166,8 @@ class Static(ImplicitEuler):
     """
 
     STATIC = True
-
-    def __init__(self, *arguments, **settings):
-        self.error = self.made_for = 0.0
-        super().__init__(*arguments, **settings)
+    state: ClassVar[dict[str, Range]] = {"error": ANY}
+    error = made_for = 0.0
 
     def _first_tau(self) -> float:
         return SLENDER * transit_time(self.comm, self.environment.lattice)
@@ -189,18 +180,14 @@ class Static(ImplicitEuler):
         """Make ready, and settle tau. Raises InputError for a body that is not held."""
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
-        lowest = self._lowest()
+        minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
+        minimum.estimate.linearise(rest)
+        lowest = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]  # of M^(-1) tau^2 (Hessian of E), roughly
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
             self.stepper = self._new_stepper(self.made_for)
             self.stepper.set_up()
-
-    def _lowest(self) -> float:
-        """The lowest eigenvalue of M^(-1) tau^2 (Hessian of E) of the body at rest, roughly (collective)."""
-        minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
-        minimum.estimate.linearise(rest)
-        return minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
@@ -229,10 +216,6 @@ class Static(ImplicitEuler):
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
         return result
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"error": ANY}
 
     def save(self, checkpoint: Checkpoint) -> None:
         super().save(checkpoint)
@@ -265,55 +248,20 @@ def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError where rigid motions are left to the free nodes, or to a part of them that no spring joins with
-    the rest (collective).
-
-    A part is held by the nodes at the other ends of its springs, of which three must not be on a line.
-    """
-    bodies = bodies_of(unknowns)
-    spans = _spans(unknowns, bodies)
-    loose = np.flatnonzero(spans < len(WAYS))
-    if not len(loose):
+    """Raise InputError for a body, or a part of one that no spring joins with the rest, that nothing holds
+    (collective)."""
+    bodies, lattice = bodies_of(unknowns), unknowns.lattice
+    if not bodies.free.any():
         return
-    nodes, positions, first = _nodes(unknowns, bodies, int(loose[0]))
-    place, whose = ", ".join(f"{x:.4g}" for x in positions), of_body(unknowns.lattice, first)
-    what = "the body" if len(spans) == 1 else f"a part {whose}of {nodes} nodes about ({place}) m at rest"
-    more = f", and so are {len(loose) - 1} more parts" if len(loose) > 1 else ""
-    raise InputError(
-        f'time.integrator = "static": {what} is held {WAYS[spans[loose[0]]]}{more}: it has no equilibrium without '
-        "inertia; pin it or lead it by an anchor (contact does not count), or choose another integrator"
-    )
-
-
-def _spans(unknowns: Unknowns, bodies: Bodies) -> np.ndarray:
-    """Return of each body (b,) by what it is held: 0 nothing, 1 a point, 2 points on a line, 3 others."""
-    comm, lattice = unknowns.comm, unknowns.lattice
-    springs, number = lattice.springs[: lattice.springs_owned], bodies.number
-    nodes = (to_host(lattice.nodes) - _middle(comm, to_host(lattice.nodes))) / lattice.cell_size
-    sums = np.zeros((len(bodies.free), 13))  # count, sum of p, sum of p p^T
-    for free, held in (springs.T, springs[:, ::-1].T):
-        joins = (number[free] >= 0) & (number[held] < 0)
-        p = nodes[held[joins]]
-        moments = np.concatenate([np.ones((len(p), 1)), p, (p[:, :, None] * p[:, None, :]).reshape(-1, 9)], axis=1)
-        np.add.at(sums, number[free[joins]], moments)
-    comm.Allreduce(MPI.IN_PLACE, sums, MPI.SUM)
-    count, mean = sums[:, 0], sums[:, 1:4] / np.maximum(sums[:, :1], 1)
-    spread = sums[:, 4:].reshape(-1, 3, 3) - count[:, None, None] * mean[:, :, None] * mean[:, None, :]
-    apart = np.linalg.eigvalsh(spread)[:, 1:] > FLAT * np.maximum(count, 1)[:, None]
-    return np.where(count > 0, 1 + apart.sum(axis=1), 0)
-
-
-def _middle(comm: MPI.Comm, nodes: np.ndarray) -> np.ndarray:
-    """Return a point (3,) [m] amid the nodes (l, 3) of all ranks."""
-    sums = comm.allreduce(np.append(nodes.sum(axis=0), len(nodes)))
-    return sums[:3] / sums[3]
-
-
-def _nodes(unknowns: Unknowns, bodies: Bodies, body: int) -> tuple[int, np.ndarray, int]:
-    """Return how many nodes a body has, their mean (3,) [m] at rest, and the least of their global numbers."""
-    comm, lattice = unknowns.comm, unknowns.lattice
-    rows = np.flatnonzero(bodies.number[: lattice.owned] == body)
+    rows = np.flatnonzero(bodies.number[: lattice.owned] == np.flatnonzero(bodies.free)[0])
     own = to_host(lattice.nodes[: lattice.owned])[rows]
-    sums = comm.allreduce(np.append(own.sum(axis=0), len(own)))
-    least = comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
-    return int(sums[3]), sums[:3] / sums[3], least
+    sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
+    first = unknowns.comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
+    what = "the body"
+    if len(bodies.free) > 1:
+        place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
+        what = f"a part {of_body(lattice, first)}of {int(sums[3])} nodes about ({place}) m at rest"
+    raise InputError(
+        f'time.integrator = "static": {what} is held by nothing: it has no equilibrium without inertia; pin it or lead '
+        "it by an anchor (contact does not count), or choose another integrator"
+    )

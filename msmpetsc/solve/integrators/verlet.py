@@ -17,6 +17,7 @@ which is none for a quadratic E. A step that gains too much is taken again, in t
 
 import sys
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -57,6 +58,12 @@ TORN = 100.0  # of the energy that presses every spring to a point: no body live
 class Verlet(Integrator):
     """Velocity Verlet's method. ``time.substep`` may only shorten its substeps."""
 
+    state: ClassVar[dict[str, Range]] = {
+        "substep": (sys.float_info.min, np.inf),
+        "halvings": (0, HALVINGS),
+        "gained": FINITE,
+    }
+
     def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, probes: Probes, _prefix: str):
         if probes != Probes():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
@@ -85,16 +92,11 @@ class Verlet(Integrator):
 
     @property
     def unknowns(self) -> int:
-        """Free nodes of this rank: pinned ones and led ones aside."""
         return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"substep": (sys.float_info.min, np.inf), "halvings": (0, HALVINGS), "gained": FINITE}
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)
@@ -138,7 +140,6 @@ class Verlet(Integrator):
         )
 
     def _begin(self, state: State, start: float) -> None:
-        """q, v and grad E of a state."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
         self.work = self.springs_work = 0.0
@@ -149,12 +150,10 @@ class Verlet(Integrator):
             self.highest.squared = 0.0
 
     def _meet(self, state: State, time: float) -> None:
-        """The sides of a state."""
         before = None if state.sides is None else state.sides[:, : self.lattice.owned]
         self.sides = self.environment.contact_faces(self.q, self.q, time, 0.0, before, self.fixed)
 
     def _take(self, count: int, start: float, time: float) -> None:
-        """All substeps of a step."""
         self.known = None
         times = np.linspace(start, time, 1 + count).tolist()
         duration = 0.5 * (times[1] - start)
@@ -202,7 +201,6 @@ class Verlet(Integrator):
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
-        """grad E at q, with what obstacles push."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
         self.elastic = self.gradient[: self.lattice.owned]
@@ -299,11 +297,9 @@ class Verlet(Integrator):
         return self.highest.squared_at(self.position.values)
 
     def _energy(self) -> float:
-        """E of the springs [J] (collective)."""
         return self.comm.allreduce(self.elasticity.energy(self.position.values))
 
     def destroy(self) -> None:
-        """Collective."""
         for field in (self.position, self.velocity, self.highest):
             field.destroy()
 

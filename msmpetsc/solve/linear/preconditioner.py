@@ -90,7 +90,6 @@ class ContactDiagonal:
         return changed
 
     def _columns(self, bound: np.ndarray) -> np.ndarray:
-        """(k,) of a bound of each owned node [N/m]."""
         free = bound[self.unknowns.free]
         return np.tile(free, len(self.own) // max(len(free), 1))
 

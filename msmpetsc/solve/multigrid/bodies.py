@@ -23,14 +23,10 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies of a lattice.
+    """Bodies of a lattice."""
 
-    number : (l,) of each local node's body; -1 where it is held
-    free   : (b,) bool of each body, whether no spring holds it
-    """
-
-    number: np.ndarray
-    free: np.ndarray
+    number: np.ndarray  # (l,) of each local node's body; -1 where it is held
+    free: np.ndarray  # (b,) bool of each body, whether no spring holds it
 
     def apart(self, comm: MPI.Comm, ijk: np.ndarray) -> np.ndarray:
         """Return how far each local node's body is to be moved along the grid's first axis, (l,), so that no two have a

@@ -132,7 +132,6 @@ class Multigrid:
             yield "matptap_backend_cpu", "true"  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
 
     def _create_cycle(self) -> None:
-        """Make PCMG know the levels."""
         pc, top = self.pc, len(self.levels)
         pc.setOptionsPrefix(self.prefix)
         pc.setOperators(self.operator)

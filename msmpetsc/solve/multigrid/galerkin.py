@@ -52,14 +52,11 @@ OF_NODES = _products(WEIGHTS)
 
 @dataclass(frozen=True)
 class ByCell:
-    """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]].
-
-    code : of each, in that order, where its ends or corners are in that cell
-    """
+    """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]]."""
 
     start: np.ndarray
     order: np.ndarray
-    code: np.ndarray
+    code: np.ndarray  # of each, in that order, where its ends or corners are in that cell
 
     @classmethod
     def of(cls, cells: np.ndarray, keys: np.ndarray, code: np.ndarray, which: np.ndarray) -> "ByCell":

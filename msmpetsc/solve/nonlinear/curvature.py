@@ -11,7 +11,7 @@ other steps the mode found last is followed in a few iterations.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -62,14 +62,12 @@ UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 class Compression:
     """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of its contacts with
     itself included; whether a cell resists.
-
-    inertia : M is part of H, which outweighs what is not positive in the rest
     """
 
     greatest: float
     total: float
     resists: bool
-    inertia: bool = True
+    inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
 
     @property
     def is_harmless(self) -> bool:
@@ -94,6 +92,8 @@ class LowestCurvature:
 
     preconditioner : of the step's linear solves, or multigrid for a long search
     """
+
+    state: ClassVar[dict[str, Range]] = {"searched": ANY, "knows_mode": (0, 1)}
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
@@ -157,7 +157,7 @@ class LowestCurvature:
     def _way_down(self, modes: np.ndarray) -> np.ndarray:
         """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
         which of them rounding has made the first, so that it goes the same way on any ranks."""
-        direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
+        direction = self.comm.allreduce(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(
@@ -183,19 +183,19 @@ class LowestCurvature:
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
         random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        return self._unit(self._preconditioned(like(self.functional.mass, random)))
+        return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
 
     def _iterate(self, start: np.ndarray, block: int, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l, n), and theirs
         (k, n)."""
         size, mass = min(block, len(start)), self.functional.mass
-        values, (x, last) = self._ritz((start, self._product(start)), size)
+        values, (x, last) = self._ritz((start, self._of_each(self.hessian.mult, start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
             residuals /= self._greatest(residuals)  # which single precision can hold
-            w = self._unit(self._without_rigid(self._preconditioned(residuals)))
-            blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
+            w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
+            blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
             values, (x, last) = self._ritz((span, products), size)
             lowest.append(values[0])
@@ -211,7 +211,9 @@ class LowestCurvature:
         """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
         of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
-        grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
+        grams = self.comm.allreduce(
+            np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)])
+        )
         sizes, parts = np.linalg.eigh(grams[1])
         kept = sizes > DEPENDENT * max(sizes[-1], TINY)
         parts = parts[:, kept] / np.sqrt(sizes[kept])
@@ -236,7 +238,7 @@ class LowestCurvature:
             motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
         motions = motions.reshape(6, -1)
         for _ in range(2):  # once more, for what the first left of rounding
-            sizes, parts = np.linalg.eigh(self._sum(to_host((motions * self.functional.mass) @ motions.T)))
+            sizes, parts = np.linalg.eigh(self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T)))
             kept = sizes > DEPENDENT * sizes[-1]
             motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions
@@ -244,16 +246,8 @@ class LowestCurvature:
     def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
         if self.rigid is None:
             return directions
-        parts = self._sum(to_host((directions * self.functional.mass) @ self.rigid.T))
+        parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ self.rigid.T))
         return directions - like(directions, parts) @ self.rigid
-
-    def _product(self, directions: np.ndarray) -> np.ndarray:
-        """H of each."""
-        return self._of_each(self.hessian.mult, directions)
-
-    def _preconditioned(self, directions: np.ndarray) -> np.ndarray:
-        """P^(-1) of each."""
-        return self._of_each(self.preconditioner.apply, directions)
 
     def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
         if self.vectors is None:
@@ -278,15 +272,7 @@ class LowestCurvature:
         return like(directions, np.maximum(most, TINY)[:, None])
 
     def _lengths(self, directions: np.ndarray) -> np.ndarray:
-        return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))
-
-    def _sum(self, values: np.ndarray) -> np.ndarray:
-        """Sum over all ranks."""
-        return self.comm.allreduce(values)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"searched": ANY, "knows_mode": (0, 1)}
+        return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""
@@ -305,7 +291,6 @@ class LowestCurvature:
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def forget(self) -> None:
-        """Know nothing of the steps before."""
         self.searched, self.mode = NONE, None
 
     def destroy(self) -> None:

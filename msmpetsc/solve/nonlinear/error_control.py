@@ -41,25 +41,18 @@ KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).ite
 class Outcome:
     """What a solve has come to, as far as is known at its last iterate.
 
-    goal        : relative error to come to; 0 where a budget of iterations ends the step
-    error       : of the last iterate, estimated or bounded
-    bound       : on it
-    residual    : |F|_(M^-1) of the last iterate
-    early       : how many times the goal an error may be to be estimated
     corrected   : the last iterate's error was estimated, so that its Newton correction is known
-    alarm       : where something has shown a negative curvature
-    at_rounding : F is nothing but rounding
     doubts      : how often the step came to a point that is no minimum, or farther from one than it seemed
     """
 
-    goal: float = 0.0
-    error: float = np.inf
-    bound: float = np.inf
-    residual: float = np.inf
-    early: float = EARLY
+    goal: float = 0.0  # relative error to come to; 0 where a budget of iterations ends the step
+    error: float = np.inf  # of the last iterate, estimated or bounded
+    bound: float = np.inf  # on it
+    residual: float = np.inf  # |F|_(M^-1) of the last iterate
+    early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
-    alarm: Alarm = Alarm.NOWHERE
-    at_rounding: bool = False
+    alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
+    at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
 
     @property
@@ -75,18 +68,14 @@ class Outcome:
 
 @dataclass(eq=False)
 class ErrorControl:
-    """Judges the iterates of one stepper. All methods that are given an iterate are collective.
-
-    target   : relative error at which a step is done; 0 where a budget of iterations ends it
-    tightest : ksp_rtol that no linear solve goes below
-    """
+    """Judges the iterates of one stepper. All methods that are given an iterate are collective."""
 
     functional: StepFunctional
     estimate: ErrorEstimate
     curvature: LowestCurvature
     rounding: Rounding
-    target: float
-    tightest: float
+    target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
+    tightest: float  # ksp_rtol that no linear solve goes below
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:

@@ -21,17 +21,13 @@ from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
 class StepProblem:
     """Data of one implicit step.
 
-    q          : q_n (l, 3) [m], ghosts included
-    y          : where the nodes would be without forces (l, 3) [m]
-    load       : f_ext (owned, 3) [N]
-    contact    : penalties that press on the nodes in this step
     prescribed : q_n with the anchored nodes where they will be (l, 3) [m]; None if they stay
     """
 
-    q: np.ndarray
-    y: np.ndarray
-    load: np.ndarray
-    contact: Contact | None = None
+    q: np.ndarray  # q_n (l, 3) [m], ghosts included
+    y: np.ndarray  # where the nodes would be without forces (l, 3) [m]
+    load: np.ndarray  # f_ext (owned, 3) [N]
+    contact: Contact | None = None  # penalties that press on the nodes in this step
     prescribed: np.ndarray | None = None
 
     @property

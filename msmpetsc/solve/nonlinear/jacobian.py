@@ -29,9 +29,6 @@ from msmpetsc.solve.presets import Preset, SolverOptions
 class Jacobian:
     """The true Hessian of g, or the constant A = M + t^2 L in its place (Eq. 15-17).
 
-    touches  : steps may have a ``contact``
-    owned    : takes what must be destroyed, in the order it was made
-
     diagonal : of A (m,), of this rank's free nodes [kg]
 
     Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays, and for multigrid
@@ -41,8 +38,8 @@ class Jacobian:
     functional: StepFunctional
     preset: Preset
     options: SolverOptions
-    touches: bool
-    owned: ExitStack
+    touches: bool  # steps may have a ``contact``
+    owned: ExitStack  # takes what must be destroyed, in the order it was made
 
     def __post_init__(self) -> None:
         functional, options, true_hessian = self.functional, self.options, self.preset.true_hessian

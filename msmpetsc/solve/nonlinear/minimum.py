@@ -28,18 +28,12 @@ FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g f
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a point x.
+    """Verdict on a point x."""
 
-    error      : relative, of x; infinite where no estimate can be had
-    direction  : (n,) of negative curvature; None where there is none
-    curvature  : of it, an eigenvalue of M^(-1) H
-    is_minimum : that will do
-    """
-
-    error: float
-    direction: np.ndarray | None = None
-    curvature: float = 1.0
-    is_minimum: bool = False
+    error: float  # relative, of x; infinite where no estimate can be had
+    direction: np.ndarray | None = None  # (n,) of negative curvature; None where there is none
+    curvature: float = 1.0  # of it, an eigenvalue of M^(-1) H
+    is_minimum: bool = False  # that will do
 
 
 class Minimum:

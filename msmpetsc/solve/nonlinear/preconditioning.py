@@ -159,17 +159,15 @@ class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
-    kind    : -pc_type; multigrid is taken where that is mg
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
-    nodes   : free ones, on all ranks
     """
 
     make_of_matrix: Callable[[], Preconditioner]
     make_multigrid: Callable[[], LatticePreconditioner]
-    kind: str
+    kind: str  # -pc_type; multigrid is taken where that is mg
     chooses: bool
     ratio: float
-    nodes: int
+    nodes: int  # free ones, on all ranks
 
     def __post_init__(self) -> None:
         self.is_searching = False

@@ -44,23 +44,18 @@ INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 class StepResult:
     """Result of one step.
 
-    position   : (l, 3) [m], ghosts included
-    previous   : (l, 3) [m], such that the velocity is (position - previous) / t
-    cost       : of the step
-    work       : of obstacles that struck this rank's nodes [J]
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
-    static     : a state of equilibrium, not a motion
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
-    position: np.ndarray
-    previous: np.ndarray
-    cost: Work
-    work: float = 0.0
+    position: np.ndarray  # (l, 3) [m], ghosts included
+    previous: np.ndarray  # (l, 3) [m], such that the velocity is (position - previous) / t
+    cost: Work  # of the step
+    work: float = 0.0  # of obstacles that struck this rank's nodes [J]
     explicit: bool = False
     swing: float = 0.0
-    static: bool = False
+    static: bool = False  # a state of equilibrium, not a motion
     time_error: float = np.nan
 
 
@@ -70,9 +65,6 @@ class Stepper:
 
     error          : relative error at which a step is done; None for the preset's own rule
     max_iterations : a budget instead of a promise: the step is taken as it is then
-    touches        : whether steps may have a ``contact``
-    prefix         : of its PETSc options
-    static         : what is looked for is an equilibrium: M weighs errors and nothing else
     observer       : called with the positions (l, 3) [m] of each iterate, when its error is known
 
     Raises InputError for PETSc options that do not go together (collective).
@@ -84,9 +76,9 @@ class Stepper:
     preset: Preset
     error: float | None = None
     max_iterations: int | None = None
-    touches: bool = False
-    prefix: str = ""
-    static: bool = False
+    touches: bool = False  # whether steps may have a ``contact``
+    prefix: str = ""  # of its PETSc options
+    static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
     observer: Callable[[np.ndarray], None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -186,7 +178,6 @@ class Stepper:
             return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
 
     def _begin(self, problem: StepProblem, start: np.ndarray | None) -> None:
-        """Put the first guess into x."""
         self.functional.begin(problem)
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
@@ -293,12 +284,10 @@ class Stepper:
         return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
-        """F at x, in ``work``."""
         with LOCAL:
             return self.functional.evaluate(x, self.work)
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """F for SNES."""
         with LOCAL:
             self.functional.evaluate(x, f)
 

@@ -6,7 +6,7 @@ from conftest import WORKERS
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.solve.multigrid.grids import grid_indices, grids, parents_of
+from msmpetsc.solve.multigrid.grids import grid_indices, grids
 
 
 @pytest.mark.parametrize("pins", [False, True])
@@ -29,14 +29,6 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
             np.testing.assert_allclose((p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12)
             assert (p != 0).any(axis=0).all()  # no coarse node without fine ones
             fine = ijk
-
-
-def test_a_node_has_the_parents_around_it():
-    keys, needed = parents_of(np.array([[2, 4, 6], [3, 4, 6], [3, 5, 6], [3, 5, 7]]))
-    np.testing.assert_array_equal(needed.sum(axis=1), [1, 2, 4, 8])
-    parents = decode_morton(keys[3][needed[3]])
-    np.testing.assert_array_equal(np.unique(parents, axis=0), 1 + np.array([0, 1, 2]) + np.argwhere(np.ones((2, 2, 2))))
-    np.testing.assert_array_equal(decode_morton(keys[0][needed[0]]), [[1, 2, 3]])
 
 
 @pytest.mark.parametrize(

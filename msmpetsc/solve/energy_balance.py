@@ -20,10 +20,12 @@ Wanner, Geometric Numerical Integration, IX): only what was gained with and with
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import SupportsFloat
 
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -49,7 +51,7 @@ class Energies:
     elastic: float
     contact: float
     potential: float
-    momentum: np.ndarray  # (3,) [kg m/s]
+    momentum: Floats  # (3,) [kg m/s]
     touch: Touch  # contacts of the surface with itself
 
     @property
@@ -76,7 +78,7 @@ class EnergyBalance:
         self.credit = CREDIT * self.swings
         self._now: Energies | Callable[[], Energies] = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
         # positions that the last step ended at, their elastic energy [J]
-        self.known: tuple[np.ndarray, float] | None = None
+        self.known: tuple[Positions, float] | None = None
         self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     @property
@@ -86,11 +88,11 @@ class EnergyBalance:
             self._now = self._now()
         return self._now
 
-    def show(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> None:
+    def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
         """Have the energies of a moment within a step, or at the end of one taken before."""
         self._now = partial(self._energies, q, v, time, sides)
 
-    def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> Energies:
+    def _energies(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> Energies:
         """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
@@ -148,7 +150,7 @@ class EnergyBalance:
         if not np.isfinite(total):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
 
-    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
+    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: Floats, bounces: bool) -> Ledger:
         start, pushed, work, struck, swing = sums
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
@@ -175,7 +177,7 @@ class EnergyBalance:
         own = after.q is not result.position or after.q_previous is not result.previous
         return self.comm.allreduce(own, MPI.LOR)
 
-    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> np.ndarray:
+    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
         """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of
         obstacles that drag, and that which the step counted itself; and its swing (collective)."""
         lattice, environment = self.lattice, self.environment
@@ -201,9 +203,9 @@ class EnergyBalance:
         sums[0] += (known[1] if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 
-    def _sums(self, *values: float) -> np.ndarray:
+    def _sums(self, *values: SupportsFloat) -> Floats:
         return self.comm.allreduce(np.array([float(value) for value in values]))
 
-    def _worst(self, vectors: np.ndarray) -> str:
+    def _worst(self, vectors: Rows) -> str:
         owned = np.arange(self.lattice.owned)
         return "worst at " + node_of_greatest(self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1))

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions
 from msmpetsc.checkpoint import ANY, COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.obstacle import describe_overlap
@@ -30,7 +31,7 @@ class Monitors:
         self.frames = self.most = self.now = self.far = self.gaining = 0
         self.worst_error = self.worst_gain = 0.0
 
-    def inverted(self, index: int, time: float, q: np.ndarray) -> int:
+    def inverted(self, index: int, time: float, q: Positions) -> int:
         """Count the cells inside out at q (l, 3) [m] (collective)."""
         self.now, position = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
@@ -59,7 +60,7 @@ class Monitors:
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
-    def overlaps(self, index: int, environment: Environment, q: np.ndarray, time: float, time_step: float) -> None:
+    def overlaps(self, index: int, environment: Environment, q: Positions, time: float, time_step: float) -> None:
         """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it
         (collective)."""
         new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]

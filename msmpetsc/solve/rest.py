@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.build import Model
 from msmpetsc.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.comm import log
@@ -70,7 +71,7 @@ class Rest:
             )  # fmt: skip
         return self.has_come
 
-    def _norm(self, moved: np.ndarray) -> float:
+    def _norm(self, moved: Rows) -> float:
         """|v|_M of displacements (l, 3) [m]."""
         own = moved[: self.model.lattice.owned]
         return float(np.sqrt(self.comm.allreduce(float(self.model.lattice.mass @ (own**2).sum(axis=1)))))
@@ -90,7 +91,7 @@ class Rest:
             stepper.destroy()
 
 
-def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:
+def distance(stepper: Stepper, q: Positions, enough: float) -> float:
     """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there is no minimum
     (collective)."""
     functional = stepper.functional
@@ -99,7 +100,7 @@ def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:
     return stepper.control.estimate(iterate, functional.dual_norm(iterate.f), enough)
 
 
-def amplitude(stepper: Stepper, q: np.ndarray, v: np.ndarray) -> float:
+def amplitude(stepper: Stepper, q: Positions, v: Rows) -> float:
     """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in the norm of M;
     infinite where there is none (collective)."""
     functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work

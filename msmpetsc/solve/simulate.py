@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import on_host, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import on_root
@@ -79,7 +79,7 @@ class Effort:
     true_error: float = np.nan
     energy_error: float = np.nan
 
-    def measure(self, errors: np.ndarray) -> None:
+    def measure(self, errors: Rows) -> None:
         """Take note of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
@@ -220,7 +220,7 @@ class Simulation:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
 
-    def _frame(self, index: int, q: np.ndarray) -> Frame:
+    def _frame(self, index: int, q: Positions) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.balance.energies
         effort, gained = self.effort, self.state.ledger.since_frame
@@ -281,7 +281,7 @@ class SurfaceMotion:
         self.scatter = PETSc.Scatter().create(self.nodes, index, self.needed, None)
         index.destroy()
 
-    def __call__(self, position: np.ndarray) -> np.ndarray:
+    def __call__(self, position: Positions) -> Rows:
         """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
         self.nodes.array[:] = position.ravel()
         self.scatter.scatter(self.nodes, self.needed)
@@ -296,9 +296,7 @@ class SurfaceMotion:
 
 
 @numba.njit(cache=True)
-def _weighted_sums(
-    points: np.ndarray, starts: np.ndarray, columns: np.ndarray, weights: np.ndarray, nodes: np.ndarray
-) -> None:
+def _weighted_sums(points: Positions, starts: Indices, columns: Indices, weights: Floats, nodes: Positions) -> None:
     """Write W (in CSR form) times nodes (k, 3) into points (v, 3): as SciPy does, in three fifths of the time."""
     for i in range(len(points)):
         x = y = z = 0.0

@@ -25,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Positions, Rows, like, to_host
 from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
@@ -46,12 +46,12 @@ JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it ye
 SWEEPS = 4
 
 
-def euler_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
+def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
     """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
     return 0.5 * time_step * (w - v)
 
 
-def bdf2_error(q: np.ndarray, v: np.ndarray, x: np.ndarray, w: np.ndarray, time_step: float) -> np.ndarray:
+def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
     """The same of BDF2."""
     return 1.6 * (x - q - 0.5 * time_step * (v + w))
 
@@ -71,7 +71,7 @@ class NeighbourMean:
         joined = csr_array((np.ones(own.sum()), (rows[own], columns[own])), shape=shape)
         self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
 
-    def __call__(self, vectors: np.ndarray) -> np.ndarray:
+    def __call__(self, vectors: Rows) -> Rows:
         """Of (owned, 3)."""
         for _ in range(SWEEPS):
             self.field.values[: self.owned] = vectors
@@ -102,9 +102,7 @@ def levels_of(time: Time) -> tuple[int, int]:
     return max(lowest, -40), min(highest, 40)
 
 
-def between(
-    q_0: np.ndarray, v_0: np.ndarray, q_1: np.ndarray, v_1: np.ndarray, time_step: float, s: float
-) -> tuple[np.ndarray, np.ndarray]:
+def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
     """Positions and velocities at a share s of a step, by the cubic through those at its ends; s may lie outside."""
     t, r = time_step, 1 - s
     q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0 + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1

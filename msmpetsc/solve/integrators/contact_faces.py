@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Indices, Mask, Positions
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -28,20 +29,20 @@ class ContactFaces:
 
     comm: MPI.Comm
     environment: Environment
-    q: np.ndarray
-    y: np.ndarray
+    q: Positions
+    y: Positions
     time: float  # of the step's end [s]
     time_step: float
-    before: np.ndarray | None  # (o, l) faces when it began (environment); None: the nearest
-    fixed: np.ndarray  # (l,) bool, nodes that are no unknowns
-    q_before: np.ndarray | None = None
+    before: Indices | None  # (o, l) faces when it began (environment); None: the nearest
+    fixed: Mask  # (l,) bool, nodes that are no unknowns
+    q_before: Positions | None = None
 
     def __post_init__(self) -> None:
         self.solves = 0
         self.is_settled = False
         self.sides = self._crossed(self.y)
 
-    def _crossed(self, end: np.ndarray) -> np.ndarray:
+    def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
             return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
@@ -52,7 +53,7 @@ class ContactFaces:
         contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
-    def compare(self, x: np.ndarray) -> None:
+    def compare(self, x: Positions) -> None:
         """Know the faces anew from the solution x (l, 3) [m]. Raises StepFailed where they do not settle."""
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
@@ -71,7 +72,7 @@ class ContactFaces:
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
 
-    def _differs(self, x: np.ndarray, sides: np.ndarray) -> bool:
+    def _differs(self, x: Positions, sides: Indices) -> bool:
         """Whether penalties press on any node at x otherwise with ``sides``."""
         if not (self.environment.has_sides and self.environment.penalties):
             return False

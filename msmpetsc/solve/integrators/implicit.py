@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
@@ -92,8 +93,8 @@ class ImplicitEuler(Integrator):
         return replace(result, work=work), State(after, before, sides=sides)
 
     def _solve(
-        self, state: State, y: np.ndarray, time: float, time_step: float, q_before: np.ndarray | None = None
-    ) -> tuple[StepResult, np.ndarray]:
+        self, state: State, y: Positions, time: float, time_step: float, q_before: Positions | None = None
+    ) -> tuple[StepResult, Indices]:
         """The x that belongs to y, as it will be at ``time``, and the contact faces that it has.
 
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
@@ -112,7 +113,7 @@ class ImplicitEuler(Integrator):
         self.trace = Trace()
         self.trace.follow(self.stepper)
 
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
+    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
         if self.reference is None:
             lattice = self.stepper.lattice
             self.reference = Reference(
@@ -216,7 +217,7 @@ class Bdf2(ImplicitEuler):
             q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
-    def _history(self, state: State, time: float) -> tuple[tuple[np.ndarray, np.ndarray], Work]:
+    def _history(self, state: State, time: float) -> tuple[tuple[Positions, Rows], Work]:
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
         which is the true one but for a part of first order; the work that this takes."""
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)

@@ -4,6 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -32,7 +33,7 @@ class Integrator(Protocol):
         """Trace the iterates of the step that comes next, if it has any."""
         return
 
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
+    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
         """Position and energy error (2,) of step ``index``, taken last, and its trace if it was followed.
 
         NaN where no single step was solved.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Indices, Positions, Rows
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import with_ghosts
@@ -40,13 +41,13 @@ class State:
     sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest
     """
 
-    q: np.ndarray
-    q_previous: np.ndarray
-    history: tuple[np.ndarray, np.ndarray] | None = None
-    sides: np.ndarray | None = None
+    q: Positions
+    q_previous: Positions
+    history: tuple[Positions, Rows] | None = None
+    sides: Indices | None = None
     ledger: Ledger = NO_ENERGY  # of energy, as the steps so far have filled it
 
-    def velocity(self, time_step: float) -> np.ndarray:
+    def velocity(self, time_step: float) -> Rows:
         """(l, 3) [m/s]"""
         return (self.q - self.q_previous) / time_step
 
@@ -79,7 +80,7 @@ class State:
         return State(q, q_previous, history, sides, Ledger(**numbers))
 
 
-def _sides(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
+def _sides(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Indices:
     """(o, l) from the owned ones (owned, o), three at a time (collective)."""
     count = rows.shape[1]
     sides = np.zeros((count, len(lattice.nodes)), np.int8, like=lattice.nodes)

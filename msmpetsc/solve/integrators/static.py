@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
@@ -104,7 +104,7 @@ class LoadPath:
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
         self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
-        self.holding: np.ndarray | None = None  # r (owned, 3) [N], once it is asked for
+        self.holding: Rows | None = None  # r (owned, 3) [N], once it is asked for
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
@@ -134,7 +134,7 @@ class LoadPath:
             prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
-    def _holding(self, whole: StepProblem) -> np.ndarray:
+    def _holding(self, whole: StepProblem) -> Rows:
         """The force (owned, 3) [N] that would keep the free nodes where they are."""
         stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
         functional.begin(replace(whole, y=self.base, prescribed=None))
@@ -144,7 +144,7 @@ class LoadPath:
         holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
         return holding
 
-    def _guess(self, problem: StepProblem, share: float) -> np.ndarray:
+    def _guess(self, problem: StepProblem, share: float) -> Positions:
         """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:

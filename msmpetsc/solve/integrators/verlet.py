@@ -22,7 +22,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest, like
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
@@ -84,7 +84,7 @@ class Verlet(Integrator):
         self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
         self.halvings = 0  # of substeps, for what they gained
         self.end = 0.0  # of the step [s]
-        self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
+        self.known: Floats | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
         self.anchors: int | None = None  # how many hold
         self.fixed = environment.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
@@ -169,7 +169,7 @@ class Verlet(Integrator):
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
-    def _is_to_halve(self, start: np.ndarray, energy: float) -> bool:
+    def _is_to_halve(self, start: Rows, energy: float) -> bool:
         """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and its substeps are now
         halved; they are doubled again for the next one where it gained next to nothing (collective). Where obstacles
         push, what springs seem to gain may be theirs."""
@@ -313,7 +313,7 @@ class HighestMode:
         self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
-    def hold(self, fixed: np.ndarray) -> None:
+    def hold(self, fixed: Mask) -> None:
         """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
         ranks."""
         self.fixed = fixed
@@ -323,7 +323,7 @@ class HighestMode:
         self._normalise()
         self.squared = 0.0
 
-    def squared_at(self, q: np.ndarray) -> float:
+    def squared_at(self, q: Positions) -> float:
         """omega^2 of the springs at q (l, 3) [m] (collective).
 
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.

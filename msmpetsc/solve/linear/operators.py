@@ -6,7 +6,7 @@ The scalar matrix A acts on the m x 3 block that a vector of unknowns is: one pr
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
@@ -27,7 +27,7 @@ class Block:
         self.destroy = self.mat.destroy
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> Floats:
         """x, then y, then z; to be read or written at once."""
         return self.memory.values(self.mat)
 
@@ -37,12 +37,12 @@ class ContactBlocks:
 
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.t2, self.unknowns = time_step**2, unknowns
-        self.parts: list[tuple[np.ndarray, np.ndarray]] = []  # rows of unknowns, their blocks (k, 3, 3)
+        self.parts: list[tuple[Indices, Rows]] = []  # rows of unknowns, their blocks (k, 3, 3)
         row = np.full(unknowns.lattice.owned, -1)
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool, secants: Secants | None = None) -> None:
+    def linearise(self, contact: Contact | None, q: Positions, true: bool, secants: Secants | None = None) -> None:
         """Take the blocks at positions q, ``true`` ones, but for ``secants``, or such as go with A."""
         self.parts = []
         with CONTACT:
@@ -108,7 +108,7 @@ class TrueHessian(Viewable):
         self.products = 0
 
     def linearise(
-        self, q: np.ndarray, contact: Contact | None, projected: bool = False, secants: Secants | None = None
+        self, q: Positions, contact: Contact | None, projected: bool = False, secants: Secants | None = None
     ) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
         ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""

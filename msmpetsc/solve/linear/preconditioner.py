@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Floats, Positions, like
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -30,7 +30,7 @@ class Preconditioner:
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         return self.contact is not None and self.contact.follow(contact, q)
 
@@ -80,7 +80,7 @@ class ContactDiagonal:
         self.own = unknowns.memory.read(self.vector).copy()
         self.added = np.zeros_like(self.own)
 
-    def follow(self, contact: Contact | None, q: np.ndarray) -> bool:
+    def follow(self, contact: Contact | None, q: Positions) -> bool:
         """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         lattice = self.unknowns.lattice
         bound = self._columns(contact.bound(q) if contact else np.zeros(lattice.owned, like=q))
@@ -89,11 +89,11 @@ class ContactDiagonal:
             self._add(bound)
         return changed
 
-    def _columns(self, bound: np.ndarray) -> np.ndarray:
+    def _columns(self, bound: Floats) -> Floats:
         free = bound[self.unknowns.free]
         return np.tile(free, len(self.own) // max(len(free), 1))
 
-    def _add(self, bound: np.ndarray) -> None:
+    def _add(self, bound: Floats) -> None:
         self.added = bound
         self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
         self.matrix.setDiagonal(self.vector)

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.lattice.lattice import Lattice
@@ -73,15 +73,15 @@ class Unknowns:
         vector.setType(self.memory.vec_type)
         return vector
 
-    def columns(self, vector: PETSc.Vec) -> np.ndarray:
+    def columns(self, vector: PETSc.Vec) -> Rows:
         """A vector of unknowns as (3, m), not to be written to."""
         return self.memory.read(vector).reshape(3, self.size)
 
-    def columns_to_write(self, vector: PETSc.Vec) -> np.ndarray:
+    def columns_to_write(self, vector: PETSc.Vec) -> Rows:
         """A vector of unknowns as (3, m), to be written to at once."""
         return self.memory.write(vector).reshape(3, self.size)
 
-    def to_nodes(self, vector: PETSc.Vec, nodes: np.ndarray) -> None:
+    def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
         """Write unknowns into the free rows, ghosts included, of ``nodes`` (l, 3) (collective)."""
         if self.has_ghosts:
             with GHOSTS:
@@ -90,11 +90,11 @@ class Unknowns:
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
 
-    def from_nodes(self, nodes: np.ndarray, vector: PETSc.Vec) -> None:
+    def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
         """Write the free owned rows of ``nodes`` (>= owned, 3) into the unknowns."""
         _collect(self.size, nodes, self.free, self.columns_to_write(vector))
 
-    def scaled_sum(self, a: np.ndarray, t2: float, b: np.ndarray, vector: PETSc.Vec) -> None:
+    def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
         _scaled_sum(self.size, self.inertia, a, t2, b, self.free, self.columns_to_write(vector))
 

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.geometry.grid import LIMIT
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -25,10 +25,10 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 class Bodies:
     """Bodies of a lattice."""
 
-    number: np.ndarray  # (l,) of each local node's body; -1 where it is held
-    free: np.ndarray  # (b,) bool of each body, whether no spring holds it
+    number: Indices  # (l,) of each local node's body; -1 where it is held
+    free: Mask  # (b,) bool of each body, whether no spring holds it
 
-    def apart(self, comm: MPI.Comm, ijk: np.ndarray) -> np.ndarray:
+    def apart(self, comm: MPI.Comm, ijk: Indices) -> Indices:
         """Return how far each local node's body is to be moved along the grid's first axis, (l,), so that no two have a
         coarse cell in common; 0 where the grid has no room for that, and of what is held (collective).
 
@@ -57,7 +57,7 @@ def bodies_of(unknowns: Unknowns) -> Bodies:
     return Bodies(number, ~held)
 
 
-def _names(unknowns: Unknowns, part: np.ndarray) -> np.ndarray:
+def _names(unknowns: Unknowns, part: Indices) -> Indices:
     """The least global number (l,) in the body of each node; ``part`` (l,) that of this rank it belongs to.
 
     Ranks that have parts of one body tell each other until none learns of a lesser number.
@@ -91,7 +91,7 @@ class Translations:
         self.mass = unknowns.lattice.mass[unknowns.free]
         self.of_body = self._sums(self.mass[None])[0]
 
-    def of(self, forces: np.ndarray) -> np.ndarray:
+    def of(self, forces: Rows) -> Rows:
         """Return T (T^T M T)^-1 T^T f, (3, m), of f (3, m)."""
         moved = self._sums(forces) / self.of_body
         return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))[:, self.body]
@@ -107,7 +107,7 @@ class Translations:
         moved = unknowns.columns_to_write(y)
         moved += whole - self.of(self.mass * moved)
 
-    def _sums(self, rows: np.ndarray) -> np.ndarray:
+    def _sums(self, rows: Rows) -> Floats:
         """Sums (r, b) over each free body's nodes of rows (r, m)."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
         return self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
@@ -91,7 +91,7 @@ class Multigrid:
             rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
         return galerkin, levels
 
-    def update(self, q: np.ndarray, contact: np.ndarray) -> None:
+    def update(self, q: Positions, contact: Rows) -> None:
         """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.fine.update(q, contact)
         self.operator.assemble()
@@ -211,7 +211,7 @@ class ProjectedHessian(Viewable):
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
 
-    def update(self, q: np.ndarray, contact: np.ndarray) -> None:
+    def update(self, q: Positions, contact: Rows) -> None:
         """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
         unknowns, blocks = self.unknowns, self._half_bound()
@@ -224,7 +224,7 @@ class ProjectedHessian(Viewable):
         own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
         unknowns.columns_to_write(diagonal)[:] = own
 
-    def _half_bound(self) -> np.ndarray:
+    def _half_bound(self) -> Rows:
         blocks = np.zeros((len(self.q), 9), like=self.q)
         self.elasticity.add_half_bound(self.q, blocks)
         return blocks

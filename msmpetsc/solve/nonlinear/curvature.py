@@ -17,7 +17,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest, like, to_host
+from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
@@ -32,7 +32,7 @@ ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
 
-Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
+Block = tuple[Rows, Rows]  # directions (k, n), and what H makes of them
 
 
 class Alarm(IntEnum):
@@ -99,19 +99,19 @@ class LowestCurvature:
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
-        self.known: tuple[StepProblem | None, np.ndarray, Compression] = (None, np.empty(0), NONE)  # the last asked for
+        self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
-        self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.knows_mode = False  # in the last checkpoint
         self.vectors: list[PETSc.Vec] | None = None
-        self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
+        self.rigid: Rows | None = None  # motions (6, n) that are left out
 
     @property
     def effort(self) -> SearchEffort:
         """Effort that a search takes with this preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
-    def compression(self, q: np.ndarray) -> Compression:
+    def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
         problem, at, known = self.known
         same = problem is self.functional.problem and bool(np.array_equal(at, q))
@@ -120,7 +120,7 @@ class LowestCurvature:
             self.known = self.functional.problem, q, known
         return known
 
-    def _compression(self, q: np.ndarray) -> Compression:
+    def _compression(self, q: Positions) -> Compression:
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity, contact = elasticity.concavity(q)[free], functional.problem.contact
@@ -132,8 +132,8 @@ class LowestCurvature:
         return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
 
     def lowest(
-        self, q: np.ndarray, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
-    ) -> tuple[float, np.ndarray]:
+        self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
+    ) -> tuple[float, Floats]:
         """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
 
         q       : positions (l, 3) [m] that H was linearised at last
@@ -154,15 +154,13 @@ class LowestCurvature:
             return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
         return values[0], self.mode
 
-    def _way_down(self, modes: np.ndarray) -> np.ndarray:
+    def _way_down(self, modes: Rows) -> Floats:
         """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
         which of them rounding has made the first, so that it goes the same way on any ranks."""
         direction = self.comm.allreduce(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(
-        self, q: np.ndarray, hint: PETSc.Vec | None, effort: SearchEffort
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
         """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
         rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
         of all of them."""
@@ -177,7 +175,7 @@ class LowestCurvature:
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
         return self._iterate(np.concatenate([modes, *known, *rigid]), effort.block, MOST, effort.least // 2)
 
-    def _random(self, count: int) -> np.ndarray:
+    def _random(self, count: int) -> Rows:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
         lattice, free = self.functional.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
@@ -185,7 +183,7 @@ class LowestCurvature:
         random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
         return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
 
-    def _iterate(self, start: np.ndarray, block: int, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
+    def _iterate(self, start: Rows, block: int, most: int, least: int) -> tuple[Floats, Rows]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l, n), and theirs
         (k, n)."""
         size, mass = min(block, len(start)), self.functional.mass
@@ -207,26 +205,27 @@ class LowestCurvature:
                 break
         return values, x[0]
 
-    def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
+    def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
         """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
         of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
-        grams = self.comm.allreduce(
-            np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)])
-        )
+        own = [span @ products.T, (span * self.functional.mass) @ span.T]
+        grams = self.comm.allreduce(np.stack([to_host(gram) for gram in own]))
         sizes, parts = np.linalg.eigh(grams[1])
         kept = sizes > DEPENDENT * max(sizes[-1], TINY)
         parts = parts[:, kept] / np.sqrt(sizes[kept])
         values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
         parts = (parts @ turns)[:, :size].T
-        best = tuple(like(a, parts) @ a for a in block)
+        on_device = like(span, parts)
+        best = on_device @ span, on_device @ products
         if len(span) <= size:
             return values[:size], (best, None)
-        moved = tuple(like(a, parts[:, size:]) @ a[size:] for a in block)
-        lengths = np.maximum(self._lengths(moved[0]), TINY)
-        return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
+        rest = like(span, parts[:, size:])
+        moved = rest @ span[size:]
+        lengths = like(span, np.maximum(self._lengths(moved), TINY))[:, None]
+        return values[:size], (best, (moved / lengths, rest @ products[size:] / lengths))
 
-    def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
+    def _rigid_motions(self, q: Positions) -> Rows | None:
         """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
         are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
@@ -243,13 +242,13 @@ class LowestCurvature:
             motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions
 
-    def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
+    def _without_rigid(self, directions: Rows) -> Rows:
         if self.rigid is None:
             return directions
         parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ self.rigid.T))
         return directions - like(directions, parts) @ self.rigid
 
-    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
+    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: Rows) -> Rows:
         if self.vectors is None:
             self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         source, product = self.vectors
@@ -260,18 +259,18 @@ class LowestCurvature:
             result[:] = self.memory.read(product)
         return results
 
-    def _unit(self, directions: np.ndarray) -> np.ndarray:
+    def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
 
-    def _greatest(self, directions: np.ndarray) -> np.ndarray:
+    def _greatest(self, directions: Rows) -> Rows:
         """Greatest number (k, 1) of each of some directions (k, n)."""
         own = np.array([greatest(np.abs(direction)) for direction in directions])
         most = np.empty_like(own)
         self.comm.Allreduce(own, most, MPI.MAX)
         return like(directions, np.maximum(most, TINY)[:, None])
 
-    def _lengths(self, directions: np.ndarray) -> np.ndarray:
+    def _lengths(self, directions: Rows) -> Floats:
         return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))
 
     def save(self, checkpoint: Checkpoint) -> None:

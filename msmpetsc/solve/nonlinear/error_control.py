@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
@@ -125,7 +126,7 @@ class ErrorControl:
             return None
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
-    def final_error(self, error: float, at_rounding: bool, q: np.ndarray) -> float:
+    def final_error(self, error: float, at_rounding: bool, q: Positions) -> float:
         """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
         return self.rounding.added_to(error, self.functional.distance(q), at_rounding)
 

@@ -14,6 +14,7 @@ and that are together an error that will do; their sum is then the estimate.
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -84,7 +85,7 @@ class ErrorEstimate:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
 
-    def linearise(self, q: np.ndarray) -> None:
+    def linearise(self, q: Positions) -> None:
         """Take the Hessian at positions q (l, 3) [m]."""
         self.preconditioner.prepare(q, self.functional.problem.contact)
         self.hessian.linearise(q, self.functional.problem.contact)

@@ -4,11 +4,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 
-import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
@@ -95,7 +94,7 @@ class Jacobian:
         return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
 
     def linearise(
-        self, q: np.ndarray, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
+        self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False
     ) -> None:
         """Take the Jacobian at positions q (l, 3) [m] (collective): A is constant, only H and contact depend on q.
 
@@ -141,7 +140,7 @@ class FrictionKinks:
         """A full step comes next: the Hessian was taken where it begins."""
         self.is_awaited = True
 
-    def see(self, q: np.ndarray, base: np.ndarray) -> None:
+    def see(self, q: Positions, base: Positions) -> None:
         """Look at the full step from base to q (l, 3) [m], the first that is seen since it was awaited."""
         if self.is_awaited and self.contact:
             self.secants = self.contact.passes_kinks(q, base)

@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
@@ -31,7 +31,7 @@ class Verdict:
     """Verdict on a point x."""
 
     error: float  # relative, of x; infinite where no estimate can be had
-    direction: np.ndarray | None = None  # (n,) of negative curvature; None where there is none
+    direction: Floats | None = None  # (n,) of negative curvature; None where there is none
     curvature: float = 1.0  # of it, an eigenvalue of M^(-1) H
     is_minimum: bool = False  # that will do
 
@@ -126,7 +126,7 @@ class Minimum:
             return falls
         return self._descend(x, verdict.direction, verdict.curvature) or falls
 
-    def _descend(self, x: PETSc.Vec, direction: np.ndarray, curvature: float) -> bool:
+    def _descend(self, x: PETSc.Vec, direction: Floats, curvature: float) -> bool:
         """Move x along a direction (n,) of negative curvature; whether g falls that way."""
         functional = self.functional
         base = functional.evaluate(x, self.f).q

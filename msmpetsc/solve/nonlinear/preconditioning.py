@@ -14,6 +14,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
@@ -58,7 +59,7 @@ class LatticePreconditioner:
         """The projected Hessian."""
         return self.multigrid.operator
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
         due = self.is_stale
         self.is_free = self._is_free(q, contact)
@@ -66,12 +67,12 @@ class LatticePreconditioner:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
-    def build_anew(self, q: np.ndarray, contact: Contact | None) -> None:
+    def build_anew(self, q: Positions, contact: Contact | None) -> None:
         """Build the hierarchy at positions q (l, 3) [m], whatever there was."""
         self.is_stale = True
         self.prepare(q, contact)
 
-    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
         their forces balance: linear solves leave them there."""
         if self.translations and self._is_free(q, contact):
@@ -91,13 +92,13 @@ class LatticePreconditioner:
         self.wasted += max(its - self.pace * digits, 0.0)
         self.is_stale |= self.wasted > WORTH
 
-    def _build(self, q: np.ndarray, contact: np.ndarray) -> None:
+    def _build(self, q: Positions, contact: Rows) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact)
         self.pace, self.wasted = USUAL_PACE if self.is_first else None, 0.0
         self.is_first = self.is_stale = False
 
-    def _is_free(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def _is_free(self, q: Positions, contact: Contact | None) -> bool:
         """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
         if self.translations is None or contact is None:
             return self.translations is not None
@@ -106,7 +107,7 @@ class LatticePreconditioner:
         pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
-    def _blocks(self, q: np.ndarray, contact: Contact | None) -> np.ndarray:
+    def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
         """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
@@ -200,7 +201,7 @@ class StepPreconditioner:
         return sum(lattice.multigrid.fine.products for lattice in (self.multigrid, self.for_searches) if lattice)
 
     @contextmanager
-    def searching(self, q: np.ndarray, contact: Contact | None) -> Iterator[None]:
+    def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
         """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
         smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
         if self.is_chosen or not self.chooses or self.nodes < LARGE:
@@ -220,11 +221,11 @@ class StepPreconditioner:
             log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
             self.multigrid = self.make_multigrid()
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
         where linear solves would not."""
         if self.multigrid and self.is_chosen:

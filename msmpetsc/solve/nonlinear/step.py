@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
@@ -49,8 +50,8 @@ class StepResult:
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
-    position: np.ndarray  # (l, 3) [m], ghosts included
-    previous: np.ndarray  # (l, 3) [m], such that the velocity is (position - previous) / t
+    position: Positions  # (l, 3) [m], ghosts included
+    previous: Positions  # (l, 3) [m], such that the velocity is (position - previous) / t
     cost: Work  # of the step
     work: float = 0.0  # of obstacles that struck this rank's nodes [J]
     explicit: bool = False
@@ -79,7 +80,7 @@ class Stepper:
     touches: bool = False  # whether steps may have a ``contact``
     prefix: str = ""  # of its PETSc options
     static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
-    observer: Callable[[np.ndarray], None] | None = field(default=None, init=False)
+    observer: Callable[[Positions], None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.budget = self.max_iterations or 0
@@ -157,7 +158,7 @@ class Stepper:
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 
-    def step(self, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:
+    def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
         """Solve one step.
 
         start : a first guess (l, 3) [m]; the best of several if None
@@ -177,7 +178,7 @@ class Stepper:
             error = self.control.final_error(verdict.error, outcome.at_rounding, q)
             return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
 
-    def _begin(self, problem: StepProblem, start: np.ndarray | None) -> None:
+    def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)

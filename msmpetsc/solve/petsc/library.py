@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import InputError, StepFailed, did_you_mean
 
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
@@ -48,7 +49,7 @@ def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
     _check(library.MatDestroy(ctypes.byref(matrix)))
 
 
-def preallocate_coo(matrix: PETSc.Mat, rows: np.ndarray, columns: np.ndarray) -> None:
+def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
     """Say which entries ``set_values_coo`` will set, by their global indices (n,); negative ones are left out, those
     named twice are added (MatSetPreallocationCOO) (collective)."""
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
@@ -56,7 +57,7 @@ def preallocate_coo(matrix: PETSc.Mat, rows: np.ndarray, columns: np.ndarray) ->
     _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
 
 
-def set_values_coo(matrix: PETSc.Mat, values: np.ndarray) -> None:
+def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
     """Set those entries; values (n,) on the CPU or, of a matrix that is there, on a GPU (MatSetValuesCOO)
     (collective)."""
     _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
@@ -98,7 +99,7 @@ def square_restricts_transposed() -> bool:
     return is_transposed
 
 
-def _address(array: np.ndarray) -> ctypes.c_void_p:
+def _address(array: Array) -> ctypes.c_void_p:
     on_gpu = getattr(array, "__cuda_array_interface__", None)
     return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)
 

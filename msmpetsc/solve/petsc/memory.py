@@ -4,11 +4,10 @@ Both forms do the same: hand out the numbers of a vector as an array, without a 
 blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
 """
 
-import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
-from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.arrays import Floats, on_host
 from msmpetsc.solve.petsc.library import dense_pointer
 
 
@@ -20,15 +19,15 @@ class Memory:
 
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 
-    def read(self, vector: PETSc.Vec) -> np.ndarray:
+    def read(self, vector: PETSc.Vec) -> Floats:
         """Return this rank's numbers, not to be written to."""
         return vector.array_r
 
-    def write(self, vector: PETSc.Vec) -> np.ndarray:
+    def write(self, vector: PETSc.Vec) -> Floats:
         """Return this rank's numbers, to be written to at once; reading them as well is allowed."""
         return vector.array
 
-    def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
+    def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
         """Return a vector of all ranks' arrays (n,), which it keeps its numbers in."""
         return PETSc.Vec().createWithArray(array, (len(array), None), comm=comm)
 
@@ -36,7 +35,7 @@ class Memory:
         """Return a dense matrix; rows: of this rank, of all."""
         return _ready(PETSc.Mat().createDense((rows, (None, columns)), comm=comm))
 
-    def values(self, dense: PETSc.Mat) -> np.ndarray:
+    def values(self, dense: PETSc.Mat) -> Floats:
         """Return this rank's part of a dense matrix, column after column, to be read or written at once."""
         return dense.getDenseArray().T.reshape(-1)
 
@@ -50,13 +49,13 @@ class CudaMemory(Memory):
 
     vec_type, mat_type = PETSc.Vec.Type.CUDA, PETSc.Mat.Type.AIJCUSPARSE
 
-    def read(self, vector: PETSc.Vec) -> np.ndarray:
+    def read(self, vector: PETSc.Vec) -> Floats:
         return self._view(vector, "r")
 
-    def write(self, vector: PETSc.Vec) -> np.ndarray:
+    def write(self, vector: PETSc.Vec) -> Floats:
         return self._view(vector, "rw")
 
-    def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
+    def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
         return PETSc.Vec().createCUDAWithArrays(
             cudahandle=array.data.ptr,  # type: ignore[attr-defined]  # CuPy's
             size=(len(array), None),
@@ -66,10 +65,10 @@ class CudaMemory(Memory):
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
         return _ready(PETSc.Mat().createDenseCUDA((rows, (None, columns)), comm=comm))
 
-    def values(self, dense: PETSc.Mat) -> np.ndarray:
+    def values(self, dense: PETSc.Mat) -> Floats:
         return cuda.view(dense_pointer(dense), dense.getLocalSize()[0] * dense.getSize()[1])
 
-    def _view(self, vector: PETSc.Vec, mode: str) -> np.ndarray:
+    def _view(self, vector: PETSc.Vec, mode: str) -> Floats:
         pointer = vector.getCUDAHandle(mode)
         vector.restoreCUDAHandle(pointer, mode)
         return cuda.view(pointer, vector.getLocalSize())
@@ -84,5 +83,5 @@ def _ready(dense: PETSc.Mat) -> PETSc.Mat:
 HOST, CUDA = Memory(), CudaMemory()
 
 
-def memory_of(array: np.ndarray) -> Memory:
+def memory_of(array: Floats) -> Memory:
     return HOST if on_host(array) else CUDA

@@ -47,11 +47,9 @@ class Monitors:
         """Take note of the estimated error of a frame's steps."""
         if not error <= FAR:
             if not self.far:
-                off = (
-                    f"{error:.2g} off its solution, relative to what forces moved"
-                    if np.isfinite(error)
-                    else "with no minimum near"
-                )
+                off = "with no minimum near"
+                if np.isfinite(error):
+                    off = f"{error:.2g} off its solution, relative to what forces moved"
                 log.warning(
                     "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their "
                     "place, or a smaller time.step mend that",

@@ -23,7 +23,7 @@ class Preset:
 
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
     extrapolate  : a step starts from the best of several guesses, not from y as published
-    iterations   : a fixed number of them is the method as published; None iterates to the error target
+    iterations   : a fixed number of them is the method as published; None: to the error target
     inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
     chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
     """
@@ -70,7 +70,7 @@ LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
     "npc_snes_linesearch_type": "basic",
     "npc_snes_max_it": "1",
     "npc_snes_norm_schedule": "none",
-    "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
+    "npc_snes_divergence_tolerance": "-1",  # an impact may begin with 1e4 times y's residual
     **JACOBI_CG,
     "ksp_rtol": "1e-1",
 }
@@ -168,7 +168,7 @@ PRESETS = {
 
 # a user who chooses another type does not want what only goes with ours
 BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
-# these solve with A or the Hessian themselves: a plain iteration as their preconditioner has no place
+# these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
 
 
@@ -202,7 +202,7 @@ def _made_of(name: str, added: Mapping[str, Any]) -> Preset:
 
 
 def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
-    """Put the preset's options into PETSc's database where the user has set none; returns their names.
+    """Put the preset's options where the user has set none into PETSc's database; returns their names.
 
     SNES then does not give up before the ``budget`` of iterations is spent.
     """
@@ -288,7 +288,7 @@ class SolverOptions:
 
     def value(self, name: str) -> str:
         """Value of an option, the user's or the preset's; "" where there is none."""
-        return PETSc.Options().getString(self.prefix + name, "")
+        return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
         """Leave the database as the user has it."""

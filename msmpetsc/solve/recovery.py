@@ -20,7 +20,7 @@ ROBUST = "newton-projected"
 PREFIX = "fallback_"  # of the PETSc options of that
 WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
 
-MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # the string: prefix of its PETSc options
+MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # str: prefix of its PETSc options
 
 
 class Recovery:
@@ -51,8 +51,7 @@ class Recovery:
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises
-        StepFailed."""
+        """Take the step that ends at ``time``, after a ``failure`` of it if any. Raises StepFailed."""
         if failure and self.on_failure == "stop":
             raise failure
         if not self.recovered:
@@ -109,8 +108,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or the scene's own where that is static, or Verlet whose steps become
-        shorter."""
+        """Another integrator: implicit Euler's, or the scene's own where it is static, or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"

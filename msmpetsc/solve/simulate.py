@@ -176,7 +176,7 @@ class Simulation:
         return frame
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
-        """A step that failed, taken another way (collective). Raises StepFailed, naming the step."""
+        """A failed step, taken another way (collective). Raises StepFailed, naming the step."""
         try:
             if self.recovery.is_on:
                 raise failure

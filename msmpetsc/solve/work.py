@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one step, of the steps of a frame, or of any others; the sum of two is the work of both.
+    """Work of one step, of of a frame's steps, or of any others; the sum of two is the work of both.
 
     step_error : the greatest estimated relative error of the steps, which does not add up
     """

@@ -192,7 +192,7 @@ class Adaptive(Integrator):
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
+        """The next step that stands; others are taken again, shorter. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:
@@ -214,7 +214,7 @@ class Adaptive(Integrator):
                 return self._taken(result, before, after, level)
 
     def _next_level(self, state: State) -> int:
-        """Of the step to be tried: no more than twice as long as the last, whose history it needs."""
+        """Of the next step: no more than twice as long as the last, whose history it needs."""
         most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
         return self.ticks.fitting(self.tick, most)
 

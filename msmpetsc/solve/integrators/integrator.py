@@ -41,7 +41,7 @@ class Integrator(Protocol):
         return np.full(2, np.nan), None
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Store what the next step depends on beside its state, and forget all that is not stored."""
+        """Store what the next step depends on beside its state, and forget all else."""
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         """Go on after a step that ended at ``time`` [s]."""

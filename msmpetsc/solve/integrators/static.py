@@ -111,9 +111,10 @@ class LoadPath:
         """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one with cells turned
         inside out, which smaller steps may avoid."""
         share, q = steps.share, self.known[-1][1]
-        obstacles_move = 0.0 if len(self.known) > 1 else self.time_step  # [s]: in the first load step alone
-        fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(self.comm, self.environment, q, q, self.time, obstacles_move, self.sides, fixed)
+        fixed, time_step = self.stepper.lattice.pinned, self.time_step
+        if len(self.known) > 1:  # obstacles move in the first load step alone
+            time_step = 0.0
+        faces = ContactFaces(self.comm, self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
             result = self.stepper.step(problem, self._guess(problem, share))

@@ -44,7 +44,7 @@ from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step
-GAIN = 2e-3  # of a body's kinetic and elastic energy, from nowhere in a step: worth half the substep
+GAIN = 2e-3  # of all energy, from nowhere in a step: worth half the substep
 CREDIT = 0.1  # of it, that springs may lose and gain again
 EASED = 1 / 32  # of that: twice the substep, which gains from 4 to 16 times as much, will do again
 HALVINGS = 5  # of substeps, for what they gain
@@ -123,7 +123,7 @@ class Verlet(Integrator):
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
             begun = self._squared_acceleration(start)
-            with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
+            with np.errstate(over="ignore", invalid="ignore"):  # its energy tells of what runs away
                 self._take(count, start, time)
             energy, dt = self._energy(), self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
@@ -245,8 +245,7 @@ class Verlet(Integrator):
             self.q[anchored] = prescribed[anchored]
 
     def _strike(self, begin: float, end: float) -> None:
-        """Know the faces that nodes come into contact by. The velocity of one that bounces off is what then led
-        it there."""
+        """Know the faces of contact. The velocity of a node that bounces off is what then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)

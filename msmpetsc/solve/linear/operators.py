@@ -43,7 +43,7 @@ class ContactBlocks:
         self.row = like(unknowns.free, row)
 
     def linearise(self, contact: Contact | None, q: Positions, true: bool, secants: Secants | None = None) -> None:
-        """Take the blocks at positions q, ``true`` ones, but for ``secants``, or such as go with A."""
+        """Take the blocks at q, ``true`` ones, but for ``secants``, or such as go with A."""
         self.parts = []
         with CONTACT:
             for nodes, blocks in contact.hessian(q, true, secants) if contact else ():

@@ -65,7 +65,7 @@ class Preconditioner:
 
 
 class ContactDiagonal:
-    """Diagonal of the matrix that is preconditioned: that of A, and what bounds the blocks of contact.
+    """Diagonal of the matrix that is preconditioned: that of A, and a bound on contact's blocks.
 
     A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
 

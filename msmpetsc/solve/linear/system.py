@@ -1,4 +1,4 @@
-"""The constant matrix A = M + t^2 L as a PETSc matrix (paper Eq. 15-17, without the Kronecker factor).
+"""The constant A = M + t^2 L as a PETSc matrix (paper Eq. 15-17, without the Kronecker factor).
 
 A is scalar, m x m over the free nodes; solve.linear.operators lets it act on three coordinates at once.
 """

@@ -18,7 +18,7 @@ from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
 BALLAST = 1e-6  # of the mass
-BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node: a forecast of memory asks for them
+BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node, for a forecast of memory
 
 
 class Unknowns:

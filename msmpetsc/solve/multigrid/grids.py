@@ -39,7 +39,7 @@ def grid_indices(unknowns: Unknowns) -> Indices:
     nodes, keys = to_host(lattice.nodes), lattice.table.keys
     if not len(nodes):
         return np.empty((0, 3), np.int64)
-    # the first node of its body that this rank owns: it owns one, for a spring joins ghosts with such
+    # the first node of its body that this rank owns: a spring joins ghosts with such a node
     first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
     return decode_morton(keys[first]) + np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
 

@@ -27,7 +27,7 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 MOST = 100  # iterations of a long search
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
-MORE = 1.25  # times the compression of the last long search: time for another, for modes come and go
+MORE = 1.25  # times the compression of the last long search: modes may have come
 ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
@@ -146,7 +146,7 @@ class LowestCurvature:
         else:
             its = self.effort.followed
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
-        if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
+        if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
         self.mode = modes[0].copy()

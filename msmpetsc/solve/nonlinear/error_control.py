@@ -23,10 +23,10 @@ FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left
 KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
 LEAST_RATIO = 10.0  # taken, however near they were: an estimate that comes too early is the next solve's start
-EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
+EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
-CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
+CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
 NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 KINDS = {
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
@@ -80,7 +80,7 @@ class ErrorControl:
     ratio: float = FIRST_RATIO  # of bound to error in the last estimate
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
-        """What is known at an iterate: its error, only a bound on it while that is far too large."""
+        """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
         at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(before, residual=residual, at_rounding=at_rounding, alarm=alarm, corrected=False)

@@ -38,7 +38,7 @@ class StepProblem:
 
 @dataclass(frozen=True)
 class Iterate:
-    """Point that a solver came to: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
+    """Point of a solver: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
 
     q: Positions
     f: PETSc.Vec
@@ -47,7 +47,7 @@ class Iterate:
 class StepFunctional:
     """g of the problem given to ``begin``. All methods are collective.
 
-    Positions are (l, 3) [m], ghosts included; PETSc's vectors are of unknowns (solve.linear.unknowns).
+    Positions are (l, 3) [m], ghosts included; vectors are of unknowns (solve.linear.unknowns).
     """
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):

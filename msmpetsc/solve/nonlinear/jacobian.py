@@ -1,4 +1,4 @@
-"""Jacobian of F, as SNES has it: an operator to solve with, and what that is preconditioned with."""
+"""Jacobian of F, as SNES has it: an operator to solve with, and what preconditions that."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass

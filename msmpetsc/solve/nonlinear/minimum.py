@@ -21,7 +21,7 @@ from msmpetsc.solve.nonlinear.rounding import Rounding
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
-DOUBTFUL = 30.0  # times what both say may then be the error: it was seen 10 times as large in a valley
+DOUBTFUL = 30.0  # times what both say may be the error: 10 times were seen in a valley
 SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
@@ -81,8 +81,7 @@ class Minimum:
         return Verdict(self._second_estimate(nearer, first, rest, enough, value))
 
     def _estimate_closely(self, x: PETSc.Vec) -> bool:
-        """Estimate the error of x without an early end, which says little where g is hardly convex; whether it could be
-        had."""
+        """Estimate the error of x, where g is hardly convex, without an early end; whether it could be."""
         iterate = self.functional.evaluate(x, self.f)
         return bool(np.isfinite(self.estimate(iterate, self.functional.dual_norm(self.f), np.inf)))
 

@@ -34,7 +34,7 @@ MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says whe
 
 
 class LatticePreconditioner:
-    """The cycle (a PCPYTHON context), and where its hierarchy was built. All methods are collective.
+    """The cycle (a PCPYTHON context), and how its hierarchy serves. All methods are collective.
 
     translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
     is_first : there is none yet
@@ -73,8 +73,7 @@ class LatticePreconditioner:
         self.prepare(q, contact)
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies that nothing holds as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where
-        their forces balance: linear solves leave them there."""
+        """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
         if self.translations and self._is_free(q, contact):
             columns = self.unknowns.columns_to_write(x)
             columns -= self.translations.of(self.unknowns.columns(f))
@@ -95,7 +94,10 @@ class LatticePreconditioner:
     def _build(self, q: Positions, contact: Rows) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact)
-        self.pace, self.wasted = USUAL_PACE if self.is_first else None, 0.0
+        self.pace = None
+        if self.is_first:
+            self.pace = USUAL_PACE
+        self.wasted = 0.0
         self.is_first = self.is_stale = False
 
     def _is_free(self, q: Positions, contact: Contact | None) -> bool:
@@ -226,8 +228,7 @@ class StepPreconditioner:
         return self.in_use.prepare(q, contact)
 
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
-        where linear solves would not."""
+        """Move bodies as wholes to where their forces balance, where linear solves would not."""
         if self.multigrid and self.is_chosen:
             self.multigrid.balance(q, contact, f, x)
 

@@ -215,7 +215,7 @@ class Stepper:
         """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
-        if its very first direction has negative curvature it climbs, and the line search says so: the
+        if its very first direction has negative curvature it climbs, as the line search says: the
         projected Hessian takes over for some iterations (_linearise).
         """
         self.outcome = outcome
@@ -389,8 +389,7 @@ class Stepper:
             self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
 
     def _abandon(self) -> None:
-        """After an error within PETSc its objects may be in the middle of something, and crash when they are
-        destroyed: they stay, even when the interpreter ends."""
+        """Keep PETSc's objects for ever: after an error within it they may crash when they are destroyed."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 

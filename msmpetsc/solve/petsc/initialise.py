@@ -33,7 +33,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
     Raises InputError for option files that cannot be read, and for values that PETSc refuses at its start.
     """
-    on_root(comm, lambda: _check_files(words))  # rank 0 alone reads them: the others would wait for it
+    on_root(comm, lambda: _check_files(words))  # rank 0 alone reads them: others would wait
     failed = None
     with _captured_stderr() as text:
         try:
@@ -73,7 +73,7 @@ def _check_lines(where: str, lines: list[str]) -> None:
 
 
 def _message(text: str) -> str:
-    """Subject of an error that PETSc printed: its last line before the one on where to find help."""
+    """Subject of an error that PETSc printed: its last line before that on where to find help."""
     lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", text.partition("PETSC ERROR: See ")[0], re.MULTILINE)
     return printable(lines[-1].strip(), 200) if lines else ""
 
@@ -103,7 +103,7 @@ def is_running() -> bool:
 
 
 def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:
-    """Start PETSc, if it does not run, with those of the options that it reads only then (collective).
+    """Start PETSc, if it does not run, with those options that it reads only then (collective).
 
     The others are for ``lent_options``, which takes them back.
     """

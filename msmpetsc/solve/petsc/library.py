@@ -14,13 +14,13 @@ from msmpetsc.errors import InputError, StepFailed, did_you_mean
 
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
-NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked to make an error of it
+NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked for it
 
 
 @cache
 def petsc_library() -> ctypes.CDLL:
     """Return PETSc's library, opened once; what it prints may come by Python, whose lock is kept therefore."""
-    return ctypes.PyDLL(PETSc.__file__)  # petsc4py's extension; its symbols include those of libpetsc
+    return ctypes.PyDLL(PETSc.__file__)  # petsc4py's extension has those of libpetsc, too
 
 
 def total_iterations(ksp: PETSc.KSP) -> int:
@@ -31,8 +31,7 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Address of this rank's numbers of a dense matrix, on the GPU if it has them there
-    (MatDenseGetArrayAndMemType)."""
+    """Address of a rank's numbers of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
     library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
     pointer = array.value or 0
@@ -50,16 +49,15 @@ def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
 
 
 def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
-    """Say which entries ``set_values_coo`` will set, by their global indices (n,); negative ones are left out, those
-    named twice are added (MatSetPreallocationCOO) (collective)."""
+    """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left out, those named
+    twice are added (MatSetPreallocationCOO) (collective)."""
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
     count = ctypes.c_int64(len(rows))  # PetscCount
     _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
 
 
 def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
-    """Set those entries; values (n,) on the CPU or, of a matrix that is there, on a GPU (MatSetValuesCOO)
-    (collective)."""
+    """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO) (collective)."""
     _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
 
 
@@ -76,8 +74,7 @@ def replaced_option(name: str, value: str) -> Iterator[None]:
 
 
 def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
-    """Give Chebyshev's method the eigenvalues that it damps between; no matter for other methods
-    (KSPChebyshevSetEigenvalues)."""
+    """Give Chebyshev's method, if it is, what it damps between (KSPChebyshevSetEigenvalues)."""
     bounds = ctypes.c_double(greatest), ctypes.c_double(least)
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
 
@@ -123,7 +120,7 @@ def petsc_errors(
     """
     try:
         yield
-    except (PETSc.Error, ImportError, further) as error:  # type: ignore[misc]  # petsc4py has no types
+    except (PETSc.Error, ImportError, further) as error:
         # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
         # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
         cause = error.__cause__
@@ -144,7 +141,7 @@ def last_words(error: BaseException) -> str:
 
 
 def _nearest_type(words: str) -> str:
-    """Return the nearest type of solver where PETSc has not found one: ", did you mean 'pipecg'?"."""
+    """Return the nearest type of solver where there is none: ", did you mean 'pipecg'?"."""
     wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
     if wanted is None:
         return ""

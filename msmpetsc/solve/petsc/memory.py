@@ -4,6 +4,7 @@ Both forms do the same: hand out the numbers of a vector as an array, without a 
 blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
 """
 
+import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
@@ -21,11 +22,11 @@ class Memory:
 
     def read(self, vector: PETSc.Vec) -> Floats:
         """Return this rank's numbers, not to be written to."""
-        return vector.array_r
+        return np.asarray(vector.array_r)
 
     def write(self, vector: PETSc.Vec) -> Floats:
         """Return this rank's numbers, to be written to at once; reading them as well is allowed."""
-        return vector.array
+        return np.asarray(vector.array)
 
     def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
         """Return a vector of all ranks' arrays (n,), which it keeps its numbers in."""
@@ -37,7 +38,7 @@ class Memory:
 
     def values(self, dense: PETSc.Mat) -> Floats:
         """Return this rank's part of a dense matrix, column after column, to be read or written at once."""
-        return dense.getDenseArray().T.reshape(-1)
+        return np.asarray(dense.getDenseArray().T.reshape(-1))
 
 
 class CudaMemory(Memory):

@@ -34,10 +34,10 @@ from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import load_scene, scene_in
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.instrumentation import Probes, begin_timing
-from msmpetsc.solve.options import refuse_early
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import preset_names
+from msmpetsc.solve.refused_options import refuse_early
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
 

@@ -141,9 +141,9 @@ class Simulation:
 
     def _lend_options(self, until_the_end: ExitStack) -> bool:
         """Lend PETSc this simulation's options; return whether no other simulation is under way (collective)."""
-        from msmpetsc.solve.options import refuse_early
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
         from msmpetsc.solve.presets import in_use
+        from msmpetsc.solve.refused_options import refuse_early
 
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
         alone = not +in_use

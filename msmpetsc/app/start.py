@@ -72,9 +72,9 @@ def options_shown(comm: "MPI.Intracomm", request: RunRequest) -> list[str]:
     with lent_options(comm, request.petsc_words):
         from msmpetsc.app.run import read_scene
         from msmpetsc.solve.instrumentation import Probes
-        from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
         from msmpetsc.solve.petsc.device import choose
         from msmpetsc.solve.presets import find_preset, shown_options
+        from msmpetsc.solve.refused_options import refuse_bad_values, refuse_early, silence_options_left
         from msmpetsc.solve.simulate import solvers_of
 
         refuse_early(comm, FLAGS)

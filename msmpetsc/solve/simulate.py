@@ -32,12 +32,12 @@ from msmpetsc.solve.monitors import Monitors
 from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
 from msmpetsc.solve.nonlinear.reference import PRESET
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
+from msmpetsc.solve.refused_options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 

@@ -15,8 +15,6 @@ def bar(folder: Path, **tables) -> Path:
     return block_scene(folder, np.array([0.25, 0.125, 0.125]), **SWING | tables)
 
 
-
-
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """By explicit substeps of which 60 make the shortest step tried: their own error is of second order."""

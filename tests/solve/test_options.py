@@ -16,10 +16,10 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.options import refuse_early, refuse_unused
 from msmpetsc.solve.petsc.initialise import _check_files
 from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
+from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
 T = 1 / 60
 COMM = MPI.COMM_SELF

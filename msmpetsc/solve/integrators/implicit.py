@@ -30,8 +30,8 @@ from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 

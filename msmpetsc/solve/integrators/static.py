@@ -33,7 +33,7 @@ from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.bodies import bodies_of
+from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult

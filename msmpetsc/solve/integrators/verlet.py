@@ -39,7 +39,7 @@ from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it

@@ -22,7 +22,7 @@ from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import Viewable, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.bodies import bodies_of
+from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import memory

@@ -20,8 +20,8 @@ from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.preconditioner import Preconditioner
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.bodies import Translations
 from msmpetsc.solve.multigrid.cycle import Multigrid
+from msmpetsc.solve.multigrid.free_bodies import Translations
 from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG

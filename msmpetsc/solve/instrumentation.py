@@ -85,8 +85,7 @@ def _stored_bytes(multigrid: Multigrid) -> int:
     levels = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
     total, fine = multigrid.sum, multigrid.fine
     arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
-    for things in (total.springs, total.nodes, total.cells):
-        arrays += things.arrays
+    arrays += [*total.springs, *total.nodes, *total.cells]
     return levels + sum(array.nbytes for array in (*arrays, *_blocks(multigrid)))
 
 

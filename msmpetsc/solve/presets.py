@@ -234,17 +234,14 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     adapting &= set().union(*ours.values())
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
-        line = f"-{name} {_quoted(value)}".rstrip()
-        lines.append(
-            f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line
-        )
+        quoted = f'"{value}"' if value and " " in value else value or ""
+        line = f"-{name} {quoted}".rstrip()
+        if name in adapting:
+            line = f"# {line}    the tightest that a step may need; given, it is the one"
+        lines.append(line)
     for names in ours.values():
         forget_defaults(names)
     return lines
-
-
-def _quoted(value: str | None) -> str:
-    return f'"{value}"' if value and " " in value else value or ""
 
 
 def forget_defaults(names: set[str]) -> None:

@@ -162,7 +162,7 @@ class Simulation:
         before, self.state = self.state, after
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
-        if self.probes.asks(index) and not result.cost.is_of_recovery:
+        if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
             errors, trace = self.integrator.true_errors(index, result)
             self.effort.measure(errors)
             self.trace = trace or self.trace

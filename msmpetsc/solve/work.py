@@ -27,11 +27,6 @@ class Work:
         """What was done since, but for the error, which is of now."""
         return Work(self.step_error, *(getattr(self, name) - getattr(before, name) for name in COUNTED))
 
-    @property
-    def is_of_recovery(self) -> bool:
-        """Whether a step was taken another way than first tried."""
-        return self.substeps + self.fallbacks > 0
-
 
 NO_WORK = Work()
 COUNTED = [name for name in vars(NO_WORK) if name != "step_error"]  # what adds up

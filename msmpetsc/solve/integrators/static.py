@@ -64,10 +64,6 @@ class LoadSteps:
         return min(self.reached + self.size, 1.0)
 
     @property
-    def is_done(self) -> bool:
-        return self.reached == 1.0
-
-    @property
     def may_be_refused(self) -> bool:
         """Whether the next step is so large that smaller ones may well end better."""
         return self.size > SMALL
@@ -207,7 +203,7 @@ class Static(ImplicitEuler):
     def _follow(self, path: LoadPath, time: float) -> StepResult:
         """Bring all of the load on, with as few load steps as may be. Raises StepFailed."""
         steps = LoadSteps()
-        while not steps.is_done:
+        while steps.reached < 1.0:
             try:
                 with self._hurried(steps.may_be_refused):
                     result = path.try_share(steps)
@@ -249,20 +245,24 @@ def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError for a body, or a part of one that no spring joins with the rest, that nothing holds
-    (collective)."""
+    """Raise InputError for a body, or a part of one that no spring joins with the rest, that nothing holds, and where
+    no more than two nodes are held (collective)."""
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
-    if not bodies.free.any():
+    held = "held at a point or two, about which it turns"
+    if bodies.free.any():
+        held = "held by nothing"
+    elif lattice.table.total - unknowns.total > 2:
         return
-    rows = np.flatnonzero(bodies.number[: lattice.owned] == np.flatnonzero(bodies.free)[0])
-    own = to_host(lattice.nodes[: lattice.owned])[rows]
-    sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
-    first = unknowns.comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
     what = "the body"
     if len(bodies.free) > 1:
+        number = int(np.argmax(bodies.free))
+        rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
+        own = to_host(lattice.nodes[: lattice.owned])[rows]
+        sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
+        first = unknowns.comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
         place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
         what = f"a part {of_body(lattice, first)}of {int(sums[3])} nodes about ({place}) m at rest"
     raise InputError(
-        f'time.integrator = "static": {what} is held by nothing: it has no equilibrium without inertia; pin it or lead '
-        "it by an anchor (contact does not count), or choose another integrator"
+        f'time.integrator = "static": {what} is {held}: it has no equilibrium without inertia; pin it or lead it by an '
+        "anchor (contact does not count), or choose another integrator"
     )

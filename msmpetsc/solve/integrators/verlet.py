@@ -125,7 +125,8 @@ class Verlet(Integrator):
             begun = self._squared_acceleration(start)
             with np.errstate(over="ignore", invalid="ignore"):  # its energy tells of what runs away
                 self._take(count, start, time)
-            energy, dt = self._energy(), self.time_step / count
+            energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
+            dt = self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
@@ -145,13 +146,12 @@ class Verlet(Integrator):
         self.work = self.springs_work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
-            self._meet(state, start)
+            before = state.sides
+            if before is not None:
+                before = before[:, : self.lattice.owned]
+            self.sides = self.environment.contact_faces(self.q, self.q, start, 0.0, before, self.fixed)
             self._pull(start)
             self.highest.squared = 0.0
-
-    def _meet(self, state: State, time: float) -> None:
-        before = None if state.sides is None else state.sides[:, : self.lattice.owned]
-        self.sides = self.environment.contact_faces(self.q, self.q, time, 0.0, before, self.fixed)
 
     def _take(self, count: int, start: float, time: float) -> None:
         self.known = None
@@ -294,9 +294,6 @@ class Verlet(Integrator):
 
     def _elastic_squared(self) -> float:
         return self.highest.squared_at(self.position.values)
-
-    def _energy(self) -> float:
-        return self.comm.allreduce(self.elasticity.energy(self.position.values))
 
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):

@@ -77,8 +77,11 @@ class Multigrid:
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
+        if asked and asked < 2:
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has two levels or more")
         if asked and asked != len(coarse) + 1:
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {_possible(asked, len(coarse))}")
+            most = f"{len(coarse) + 1} at most, for a coarser grid would not be much smaller"
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {most}")
         galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
@@ -169,10 +172,6 @@ class Multigrid:
 
     def destroy(self) -> None:
         self.owned.close()
-
-
-def _possible(asked: int, coarse: int) -> str:
-    return "two levels or more" if asked < 2 else f"{coarse + 1} at most, for a coarser grid would not be much smaller"
 
 
 def greatest_eigenvalue(level: Level) -> float:

@@ -6,7 +6,7 @@ cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C);
 being turned inside out, t^2 times its curvature times G G^T, G the slopes of its volume at the cell's corners.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -50,8 +50,7 @@ OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8
 OF_NODES = _products(WEIGHTS)
 
 
-@dataclass(frozen=True)
-class ByCell:
+class ByCell(NamedTuple):
     """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]]."""
 
     start: Indices
@@ -66,14 +65,9 @@ class ByCell:
         start = np.append(start, len(cells)).astype(np.int32)
         return cls(start, which[by_cell].astype(np.int32), code[by_cell].astype(np.uint8))
 
-    @property
-    def arrays(self) -> tuple[Indices, Indices, Indices]:
-        """What kernels take."""
-        return self.start, self.order, self.code
-
     def near(self, array: Array) -> "ByCell":
         """Return the same in the memory that an array is in."""
-        return ByCell(like(array, self.start), like(array, self.order), like(array, self.code))
+        return ByCell(*(like(array, part) for part in self))
 
 
 class GalerkinSum:
@@ -141,12 +135,12 @@ class GalerkinSum:
         (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
         law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.ballast
-        add_springs(count, q, *self.springs.arrays, *law, self.t2, *self.of_springs, self.places, symmetric)
-        add_nodes(count, *self.nodes.arrays, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
+        add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
+        add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
         if self.elasticity.cells:
             law = self.elasticity.cells.law
-            add_resistance(count, q, *self.cells.arrays, *law, self.t2, self.weights, self.places, values)
+            add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
         values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 

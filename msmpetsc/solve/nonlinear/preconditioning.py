@@ -67,11 +67,6 @@ class LatticePreconditioner:
             self._build(q.copy(), self._blocks(q, contact))
         return due
 
-    def build_anew(self, q: Positions, contact: Contact | None) -> None:
-        """Build the hierarchy at positions q (l, 3) [m], whatever there was."""
-        self.is_stale = True
-        self.prepare(q, contact)
-
     def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
         """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
         if self.translations and self._is_free(q, contact):
@@ -210,7 +205,8 @@ class StepPreconditioner:
             yield
             return
         self.for_searches = self.for_searches or self.make_multigrid()
-        self.for_searches.build_anew(q, contact)
+        self.for_searches.is_stale = True
+        self.for_searches.prepare(q, contact)
         self.is_searching = True
         try:
             yield

@@ -223,8 +223,9 @@ class Stepper:
             return self.outcome
         self.projected = self.preset.projected > 0
         self._forget_pairs()
+        climbs = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
-        while self._climbs() and iterations < most:
+        while self.preset.true_hessian and self.snes.reason == climbs and iterations < most:
             self.projected = True
             its = self._run_snes()
             iterations += its
@@ -280,9 +281,6 @@ class Stepper:
             self.snes.setType(PETSc.SNES.Type.KSPONLY)
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
-
-    def _climbs(self) -> bool:
-        return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
 
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
         with LOCAL:

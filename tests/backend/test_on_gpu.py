@@ -132,17 +132,6 @@ def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
 
 
 @on_a_gpu
-def test_true_errors_are_measured_there(tmp_path: Path, on_gpu):
-    path = block_scene(tmp_path, **{**FALL, **HELD, "solver": {"preset": "newton", "error": 1e-2}})
-    here = play(path, Probes(true_error=4))
-    with on_gpu():
-        there = play(path, Probes(true_error=4))
-    errors = [[frame.true_error for frame in frames if frame.index % 4 == 0 < frame.index] for frames in (there, here)]
-    assert min(errors[1]) > 0 and max(errors[1]) < 1e-2
-    np.testing.assert_allclose(*errors, rtol=1e-3)
-
-
-@on_a_gpu
 def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
     path = block_scene(tmp_path, **FAILING, safety={"on_failure": "fallback"})
     here = play(path)

@@ -13,7 +13,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.adaptive import METHODS, between
+from msmpetsc.solve.integrators.adaptive import METHODS
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.simulate import refuse_bad_options
 
@@ -65,20 +65,6 @@ def test_the_local_error_of_a_swing(method: str, order: int):
         local = METHODS[method][1](x(1.0), v(1.0), after[0], after[1], wt)
         ratios.append(local / (after[0] - x(1 + wt)))
     assert abs(ratios[1] - 1) < 0.6 * abs(ratios[0] - 1) < 0.1
-
-
-def test_frames_within_a_step_are_of_third_order_and_meet_its_ends():
-    q_0, v_0, q_1, v_1 = np.random.default_rng(1).normal(size=(4, 5, 3))
-    for s, q, v in ((0.0, q_0, v_0), (1.0, q_1, v_1)):
-        found = between(q_0, v_0, q_1, v_1, 0.3, s)
-        np.testing.assert_allclose(found[0], q, atol=1e-14)
-        np.testing.assert_allclose(found[1], v, atol=1e-13)
-    errors = []
-    for t in (0.1, 0.05):
-        q, v = between(np.sin(1.0), np.cos(1.0), np.sin(1 + t), np.cos(1 + t), t, 0.3)
-        errors.append([abs(q - np.sin(1 + 0.3 * t)), abs(v - np.cos(1 + 0.3 * t))])
-    slopes = np.log2(np.divide(*errors))
-    assert slopes[0] > 3.8 and slopes[1] > 2.8
 
 
 # ---- the error reached

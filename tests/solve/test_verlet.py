@@ -76,18 +76,6 @@ def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
         assert velocity(state)[1, 2] == pytest.approx(expected, abs=1e-10)
 
 
-def test_free_fall_is_exact(tmp_path: Path):
-    time = {"step": T, "duration": 30 * T} | EXPLICIT
-    model, frames = play(block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -G]}))
-    weight = G * model.lattice.mass.sum()
-    for frame in frames:
-        fallen = np.zeros_like(model.lattice.nodes) - [0, 0, 0.5 * G * frame.time**2]
-        np.testing.assert_allclose(frame.position - model.lattice.nodes, fallen, atol=1e-12)
-        np.testing.assert_allclose(frame.momentum, [0, 0, -weight * frame.time], atol=1e-10)
-        assert frame.step_error == frame.ksp_its == 0
-    assert all(frame.iterations > 1 for frame in frames[1:])
-
-
 def test_free_flight_keeps_momentum_and_angular_momentum():
     """The forces are central, and a kick changes v at one q: the leapfrog keeps r x m v, implicit Euler does not."""
     lattice = cube()

@@ -62,5 +62,5 @@ def test_grid_indices_are_those_of_the_keys(name: str):
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_hierarchies_of_several_ranks_are_those_of_one(on_ranks, ranks: int):
     """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
-    done = on_ranks(ranks, WORKERS / "multigrid_worker.py", "hierarchy")
+    done = on_ranks(ranks, WORKERS / "multigrid_worker.py")
     assert done.returncode == 0 and done.stdout.count("same") == ranks, done.stdout + done.stderr

@@ -57,7 +57,7 @@ class Cost:
     def write(self, path: Path, command: str, failure: StepFailed | None = None) -> None:
         """Leave it all in a file (collective). Raises InputError where that cannot be written."""
         from msmpetsc.solve.instrumentation import hierarchies, times
-        from msmpetsc.solve.integrators.stability_limit import explicit_limit
+        from msmpetsc.solve.integrators.verlet import explicit_limit
 
         comm, simulation = self.comm, self.simulation
         device = "cpu" if on_host(simulation.model.lattice.nodes) else "cuda"

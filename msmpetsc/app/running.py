@@ -30,10 +30,10 @@ from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene, scene_in
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import Probes, begin_timing
-from msmpetsc.solve.options import refuse_bad_values, refuse_early, silence_options_left
 from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, preset_names, shown_options
+from msmpetsc.solve.refused_options import refuse_bad_values, refuse_early, silence_options_left
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options, solvers_of
 
 

@@ -17,7 +17,8 @@ from msmpetsc.build import Geometry, Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import Scene
-from msmpetsc.solve.petsc.words import lent_options, start_for_runs, words_of
+from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
+from msmpetsc.solve.petsc.words import words_of
 
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
 
@@ -140,9 +141,9 @@ class Simulation:
 
     def _lend_options(self, until_the_end: ExitStack) -> bool:
         """Lend PETSc this simulation's options; return whether no other simulation is under way (collective)."""
-        from msmpetsc.solve.options import refuse_early
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
         from msmpetsc.solve.presets import in_use
+        from msmpetsc.solve.refused_options import refuse_early
 
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
         alone = not +in_use

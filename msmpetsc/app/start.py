@@ -28,7 +28,7 @@ def run(ask: Callable[[], RunRequest]) -> Path:
     """
     from mpi4py import MPI
 
-    from msmpetsc.solve.petsc.words import start_for_runs
+    from msmpetsc.solve.petsc.initialise import start_for_runs
 
     comm = MPI.COMM_WORLD
     with ending_together(comm):
@@ -67,7 +67,7 @@ def options_given(comm: "MPI.Intracomm", request: RunRequest) -> Iterator[tuple[
     import numpy as np
 
     from msmpetsc.app.resume import as_before, earlier_run
-    from msmpetsc.solve.petsc.words import lent_options
+    from msmpetsc.solve.petsc.initialise import lent_options
 
     earlier = earlier_run(comm, request)
     asked = as_before(request, earlier)

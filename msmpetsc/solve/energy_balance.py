@@ -20,18 +20,20 @@ Wanner, Geometric Numerical Integration, IX): only what was gained with and with
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import SupportsFloat
 
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.surface.pairs import Touch
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import Ledger, State
+from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
 MOST = 3.0  # times all that the body ever had: explicit substeps near their limit let energy swing by nearly two
@@ -42,20 +44,15 @@ FLOOR = 1e-10  # of the energy that presses every spring to a point: what roundi
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies at one time [J].
+    """Energies at one time [J]."""
 
-    kinetic  : of all nodes; ``free`` of those that nothing prescribes
-    momentum : (3,) [kg m/s]
-    touch    : contacts of the surface with itself
-    """
-
-    kinetic: float
+    kinetic: float  # of all nodes; ``free`` of those that nothing prescribes
     free: float
     elastic: float
     contact: float
     potential: float
-    momentum: np.ndarray
-    touch: Touch
+    momentum: Floats  # (3,) [kg m/s]
+    touch: Touch  # contacts of the surface with itself
 
     @property
     def inner(self) -> float:
@@ -63,30 +60,26 @@ class Energies:
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
+@dataclass(eq=False)
 class EnergyBalance:
     """Examiner of a run's steps; states keep the ledger.
 
-    swings : whether the integrator's energy does
     checks : whether steps are balanced; if not only numbers that are not finite are found
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        environment: Environment,
-        elasticity: Elasticity,
-        swings: bool = False,
-        checks: bool = True,
-    ):
-        self.credit, self.checks = CREDIT if swings else 0.0, checks
-        self.comm, self.lattice, self.environment, self.elasticity = comm, lattice, environment, elasticity
+    comm: MPI.Comm
+    environment: Environment
+    elasticity: Elasticity
+    swings: bool = False  # whether the integrator's energy does
+    checks: bool = True
+
+    def __post_init__(self) -> None:
+        self.lattice = self.environment.lattice
+        self.credit = CREDIT * self.swings
         self._now: Energies | Callable[[], Energies] = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), Touch())
-        self.known: tuple[np.ndarray, float] | None = (
-            None  # positions that the last step ended at, their elastic energy [J]
-        )
-        springs = slice(lattice.springs_owned)
-        self.floor = FLOOR * comm.allreduce(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
+        # positions that the last step ended at, their elastic energy [J]
+        self.known: tuple[Positions, float] | None = None
+        self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
 
     @property
     def energies(self) -> Energies:
@@ -95,15 +88,11 @@ class EnergyBalance:
             self._now = self._now()
         return self._now
 
-    def start(self, state: State, time_step: float) -> None:
-        """Show the state that a run begins with."""
-        self.show(state.q, state.velocity(time_step), 0.0, state.sides)
-
-    def show(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> None:
+    def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
         """Have the energies of a moment within a step, or at the end of one taken before."""
         self._now = partial(self._energies, q, v, time, sides)
 
-    def _energies(self, q: np.ndarray, v: np.ndarray, time: float, sides: np.ndarray | None) -> Energies:
+    def _energies(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> Energies:
         """Energies of positions (l, 3) [m] and velocities (l, 3) [m/s] with obstacles as at ``time`` (collective)."""
         lattice, environment = self.lattice, self.environment
         owned = slice(lattice.owned)
@@ -132,7 +121,6 @@ class EnergyBalance:
         return result, replace(after, ledger=self._examine(before, result, after, time, time_step))
 
     def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Ledger:
-        """The ledger with a step from ``before`` to ``after``."""
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         if not self.checks:
@@ -162,8 +150,7 @@ class EnergyBalance:
         if not np.isfinite(total):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
 
-    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: np.ndarray, bounces: bool) -> Ledger:
-        """The ledger with a step; sums (5,) of _start."""
+    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: Floats, bounces: bool) -> Ledger:
         start, pushed, work, struck, swing = sums
         gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
@@ -190,7 +177,7 @@ class EnergyBalance:
         own = after.q is not result.position or after.q_previous is not result.previous
         return self.comm.allreduce(own, MPI.LOR)
 
-    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> np.ndarray:
+    def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
         """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of
         obstacles that drag, and that which the step counted itself; and its swing (collective)."""
         lattice, environment = self.lattice, self.environment
@@ -216,10 +203,9 @@ class EnergyBalance:
         sums[0] += (known[1] if known else sums[1]) + sums[2]
         return sums[[0, 2, 3, 4, 5]]
 
-    def _sums(self, *values: float) -> np.ndarray:
-        """Sums over all ranks; the values may be on a GPU."""
+    def _sums(self, *values: SupportsFloat) -> Floats:
         return self.comm.allreduce(np.array([float(value) for value in values]))
 
-    def _worst(self, vectors: np.ndarray) -> str:
+    def _worst(self, vectors: Rows) -> str:
         owned = np.arange(self.lattice.owned)
         return "worst at " + node_of_greatest(self.comm, self.lattice, owned, np.linalg.norm(vectors[owned], axis=1))

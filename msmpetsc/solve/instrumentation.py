@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from time import perf_counter
 
-import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Array, Positions, Rows
 from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.petsc.events import GRIDS, HIERARCHY, LOCAL, count, seconds
@@ -20,14 +20,10 @@ EVENTS = {
 
 @dataclass(frozen=True)
 class Probes:
-    """Probes of a run's steps.
+    """Probes of a run's steps."""
 
-    true_error : every so many steps the true error is measured; None for never
-    trace      : the step whose iterates are followed; None for none
-    """
-
-    true_error: int | None = None
-    trace: int | None = None
+    true_error: int | None = None  # every so many steps the true error is measured; None for never
+    trace: int | None = None  # the step whose iterates are followed; None for none
 
     def asks(self, index: int) -> bool:
         """Whether the true error of a step is to be measured."""
@@ -41,13 +37,13 @@ class Trace:
     iteration: list[int] = field(default_factory=list)
     ksp_its: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
-    positions: list[np.ndarray] = field(default_factory=list)
+    positions: list[Positions] = field(default_factory=list)
 
     def follow(self, stepper: Stepper) -> None:
         """Take the iterates from now on, which is when the step begins."""
         begin, before = perf_counter(), stepper.work_so_far()
 
-        def observe(q: np.ndarray) -> None:
+        def observe(q: Positions) -> None:
             nonlocal begin
             now = perf_counter()
             self.iteration.append(len(self.iteration))
@@ -58,7 +54,7 @@ class Trace:
 
         stepper.observer = observe
 
-    def as_lists(self, index: int, errors: np.ndarray) -> dict:
+    def as_lists(self, index: int, errors: Rows) -> dict:
         """The trace as plain lists, with the errors (k, 2) of the iterates."""
         lists = {"iteration": self.iteration, "ksp_its": self.ksp_its, "seconds": self.seconds}
         return {"frame": index, **lists, "position_error": errors[:, 0].tolist(), "energy_error": errors[:, 1].tolist()}
@@ -88,13 +84,12 @@ def _stored_bytes(multigrid: Multigrid) -> int:
     """
     levels = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
     total, fine = multigrid.sum, multigrid.fine
-    arrays: list[np.ndarray] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
-    for things in (total.springs, total.nodes, total.cells):
-        arrays += things.arrays
+    arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
+    arrays += [*total.springs, *total.nodes, *total.cells]
     return levels + sum(array.nbytes for array in (*arrays, *_blocks(multigrid)))
 
 
-def _blocks(multigrid: Multigrid) -> list[np.ndarray]:
+def _blocks(multigrid: Multigrid) -> list[Rows]:
     """Arrays that the finest level's Hessian has of its own, not of the lattice."""
     elasticity, hessian = multigrid.fine.elasticity, multigrid.fine.elastic
     lent = {id(array) for part in elasticity.parts for array in vars(part).values()}

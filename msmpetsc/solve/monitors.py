@@ -1,9 +1,12 @@
 """Monitors of a run, which warn once: of cells inside out, steps that ended far from their solution, energy that came
 from nowhere, and nodes inside an obstacle that comes to be there."""
 
+from typing import ClassVar
+
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions
 from msmpetsc.checkpoint import ANY, COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.obstacle import describe_overlap
@@ -19,12 +22,16 @@ FAR = 0.3  # relative error of a step: a budget of iterations that leaves so muc
 class Monitors:
     """Monitors of one run. All ranks warn alike, rank 0 is heard."""
 
+    state: ClassVar[dict[str, Range]] = {
+        **dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT), "worst_error": ANY, "worst_gain": ANY
+    }  # fmt: skip
+
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.comm, self.lattice = comm, lattice
         self.frames = self.most = self.now = self.far = self.gaining = 0
         self.worst_error = self.worst_gain = 0.0
 
-    def inverted(self, index: int, time: float, q: np.ndarray) -> int:
+    def inverted(self, index: int, time: float, q: Positions) -> int:
         """Count the cells inside out at q (l, 3) [m] (collective)."""
         self.now, position = worst_inverted(self.comm, self.lattice, q)
         if self.now and not self.frames:
@@ -40,11 +47,9 @@ class Monitors:
         """Take note of the estimated error of a frame's steps."""
         if not error <= FAR:
             if not self.far:
-                off = (
-                    f"{error:.2g} off its solution, relative to what forces moved"
-                    if np.isfinite(error)
-                    else "with no minimum near"
-                )
+                off = "with no minimum near"
+                if np.isfinite(error):
+                    off = f"{error:.2g} off its solution, relative to what forces moved"
                 log.warning(
                     "frame %d (t = %.6g s): its step ended %s; more solver.max_iterations, a solver.error in their "
                     "place, or a smaller time.step mend that",
@@ -53,7 +58,7 @@ class Monitors:
             self.far += 1
             self.worst_error = max(self.worst_error, error)
 
-    def overlaps(self, index: int, environment: Environment, q: np.ndarray, time: float, time_step: float) -> None:
+    def overlaps(self, index: int, environment: Environment, q: Positions, time: float, time_step: float) -> None:
         """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it
         (collective)."""
         new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
@@ -75,12 +80,6 @@ class Monitors:
                 )  # fmt: skip
             self.gaining += 1
             self.worst_gain = max(self.worst_gain, ledger.share)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        counts = dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT)
-        return {**counts, "worst_error": ANY, "worst_gain": ANY}
 
     def sum_up(self) -> None:
         """Say at the end of a run how often it was."""

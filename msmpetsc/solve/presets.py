@@ -21,25 +21,22 @@ from msmpetsc.solve.petsc.words import options_of, words_of
 class Preset:
     """about: when to use it. options: PETSc's, without the dash.
 
-    true_hessian : the Jacobian is the true Hessian of g, not the constant A
     projected    : so many iterations, of a step and of what follows a climb, are without its negative parts
-    start_from_b : CG starts from x = b, as in the paper's Algorithm 1
     extrapolate  : a step starts from the best of several guesses, not from y as published
-    iterations   : a fixed number of them is the method as published; None iterates to the error target
+    iterations   : a fixed number of them is the method as published; None: to the error target
     inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
-    kronecker    : A is factored as A (x) I_3, 3m x 3m
     chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
     """
 
     about: str
     options: dict[str, str]
-    true_hessian: bool = False
+    true_hessian: bool = False  # the Jacobian is the true Hessian of g, not the constant A
     projected: int = 0
-    start_from_b: bool = False
+    start_from_b: bool = False  # CG starts from x = b, as in the paper's Algorithm 1
     extrapolate: bool = True
     iterations: int | None = None
     inexact: bool = False
-    kronecker: bool = False
+    kronecker: bool = False  # A is factored as A (x) I_3, 3m x 3m
     chooses: bool = False
 
 
@@ -73,7 +70,7 @@ LOCAL_GLOBAL = {  # one plain iteration as the preconditioner of another SNES
     "npc_snes_linesearch_type": "basic",
     "npc_snes_max_it": "1",
     "npc_snes_norm_schedule": "none",
-    "npc_snes_divergence_tolerance": "-1",  # an impact may well begin with 1e4 times the residual of y
+    "npc_snes_divergence_tolerance": "-1",  # an impact may begin with 1e4 times y's residual
     **JACOBI_CG,
     "ksp_rtol": "1e-1",
 }
@@ -125,12 +122,6 @@ PRESETS = {
         inexact=True,
         chooses=True,
     ),
-    "newton-jacobi": Preset(
-        "The same with Jacobi's preconditioner, what newton itself takes for short steps of soft bodies",
-        NEWTON,
-        true_hessian=True,
-        inexact=True,
-    ),
     "newton-multigrid": Preset(
         "The same with multigrid on the lattice, what newton itself takes for all others",
         {**NEWTON, "pc_type": "mg"},
@@ -177,7 +168,7 @@ PRESETS = {
 
 # a user who chooses another type does not want what only goes with ours
 BOUND_TO_TYPE = {"pc_type": {"pc_factor_mat_solver_type"}, "ksp_type": {"ksp_norm_type"}}
-# these solve with A or the Hessian themselves: a plain iteration as their preconditioner has no place
+# these solve with A or the Hessian themselves, without a plain iteration as their preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "python", "vinewtonrsls", "vinewtonssls"}
 
 
@@ -211,7 +202,7 @@ def _made_of(name: str, added: Mapping[str, Any]) -> Preset:
 
 
 def set_defaults(preset: Preset, prefix: str = "", budget: int = 0) -> set[str]:
-    """Put the preset's options into PETSc's database where the user has set none; returns their names.
+    """Put the preset's options where the user has set none into PETSc's database; returns their names.
 
     SNES then does not give up before the ``budget`` of iterations is spent.
     """
@@ -243,17 +234,14 @@ def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     adapting &= set().union(*ours.values())
     lines = []
     for name, value in sorted(PETSc.Options().getAll().items()):
-        line = f"-{name} {_quoted(value)}".rstrip()
-        lines.append(
-            f"# {line}    the tightest that a step may need; given, it is the one" if name in adapting else line
-        )
+        quoted = f'"{value}"' if value and " " in value else value or ""
+        line = f"-{name} {quoted}".rstrip()
+        if name in adapting:
+            line = f"# {line}    the tightest that a step may need; given, it is the one"
+        lines.append(line)
     for names in ours.values():
         forget_defaults(names)
     return lines
-
-
-def _quoted(value: str | None) -> str:
-    return f'"{value}"' if value and " " in value else value or ""
 
 
 def forget_defaults(names: set[str]) -> None:
@@ -297,7 +285,7 @@ class SolverOptions:
 
     def value(self, name: str) -> str:
         """Value of an option, the user's or the preset's; "" where there is none."""
-        return PETSc.Options().getString(self.prefix + name, "")
+        return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
         """Leave the database as the user has it."""

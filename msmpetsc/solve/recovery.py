@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import ClassVar
 
 from msmpetsc.checkpoint import COUNT, Range
 from msmpetsc.comm import log
@@ -10,7 +11,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
@@ -20,7 +21,7 @@ ROBUST = "newton-projected"
 PREFIX = "fallback_"  # of the PETSc options of that
 WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
 
-MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # the string: prefix of its PETSc options
+MakeIntegrator = Callable[[Time, Solver, str], Integrator]  # str: prefix of its PETSc options
 
 
 class Recovery:
@@ -29,6 +30,8 @@ class Recovery:
     make    : makes an integrator
     balance : examines each step that one takes
     """
+
+    state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
 
     def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance):
         self.time, self.solver, self.make, self.balance = scene.time, scene.solver, make, balance
@@ -49,8 +52,7 @@ class Recovery:
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time``, after a ``failure`` of it if it was tried (collective). Raises
-        StepFailed."""
+        """Take the step that ends at ``time``, after a ``failure`` of it if any. Raises StepFailed."""
         if failure and self.on_failure == "stop":
             raise failure
         if not self.recovered:
@@ -63,11 +65,6 @@ class Recovery:
             result, after = self._take(0, state, time)
             return replace(result, cost=result.cost + Work(fallbacks=1)), after
         return self._in_pieces(state, time, max(self.level, 1) if failure else self.level)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"level": (0, DEEPEST), "recovered": COUNT}
 
     def sum_up(self) -> None:
         """Say at the end of a run how many steps were recovered."""
@@ -112,8 +109,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or the scene's own where that is static, or Verlet whose steps become
-        shorter."""
+        """Another integrator: implicit Euler's, or the scene's own where it is static, or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"
@@ -123,7 +119,6 @@ class Recovery:
         return self.make(time, self.solver, "")
 
     def destroy(self) -> None:
-        """Destroy the integrators (collective)."""
         for integrator in self.spare.values():
             integrator.destroy()
         self.spare.clear()

@@ -10,9 +10,12 @@ T is all of the run's time: so of a swing of frequency omega the second is its a
 that nothing holds the way |v| T. They are estimated as errors of steps are, once a step has moved little.
 """
 
+from typing import ClassVar
+
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.build import Model
 from msmpetsc.checkpoint import COUNT, LENGTH, Range
 from msmpetsc.comm import log
@@ -34,6 +37,13 @@ class Rest:
 
     has_come : whether it has
     """
+
+    state: ClassVar[dict[str, Range]] = {
+        "farthest": LENGTH,
+        "next": COUNT,
+        "wait": (1, LONGEST_WAIT),
+        "has_come": (0, 1),
+    }
 
     def __init__(self, comm: MPI.Comm, scene: Scene, model: Model, environment: Environment):
         self.comm, self.model, self.environment = comm, model, environment
@@ -61,13 +71,12 @@ class Rest:
             )  # fmt: skip
         return self.has_come
 
-    def _norm(self, moved: np.ndarray) -> float:
+    def _norm(self, moved: Rows) -> float:
         """|v|_M of displacements (l, 3) [m]."""
         own = moved[: self.model.lattice.owned]
         return float(np.sqrt(self.comm.allreduce(float(self.model.lattice.mass @ (own**2).sum(axis=1)))))
 
     def _is_at_rest(self, state: State, time: float, limit: float) -> bool:
-        """Whether both lengths are within the limit [m sqrt(kg)]."""
         lattice, touches = self.model.lattice.pin(self.environment.fixed_at(time)), self.environment.touches
         preset = find_preset(PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
@@ -81,13 +90,8 @@ class Rest:
         finally:
             stepper.destroy()
 
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"farthest": LENGTH, "next": COUNT, "wait": (1, LONGEST_WAIT), "has_come": (0, 1)}
 
-
-def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:
+def distance(stepper: Stepper, q: Positions, enough: float) -> float:
     """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there is no minimum
     (collective)."""
     functional = stepper.functional
@@ -96,7 +100,7 @@ def distance(stepper: Stepper, q: np.ndarray, enough: float) -> float:
     return stepper.control.estimate(iterate, functional.dual_norm(iterate.f), enough)
 
 
-def amplitude(stepper: Stepper, q: np.ndarray, v: np.ndarray) -> float:
+def amplitude(stepper: Stepper, q: Positions, v: Rows) -> float:
     """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in the norm of M;
     infinite where there is none (collective)."""
     functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work

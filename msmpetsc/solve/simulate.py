@@ -4,11 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
+from typing import ClassVar
 
+import numba
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import on_host, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import on_root
@@ -16,6 +19,8 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
+from msmpetsc.geometry.embedding import Embedding
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -23,17 +28,16 @@ from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.linear.surface import SurfaceMotion
 from msmpetsc.solve.monitors import Monitors
 from msmpetsc.solve.nonlinear.reference import PREFIX as REFERENCE
 from msmpetsc.solve.nonlinear.reference import PRESET
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.petsc.device import sender
 from msmpetsc.solve.petsc.events import STEPS
 from msmpetsc.solve.presets import Preset, find_preset
 from msmpetsc.solve.recovery import PREFIX as FALLBACK
 from msmpetsc.solve.recovery import ROBUST, Recovery
+from msmpetsc.solve.refused_options import refuse_bad_values, refuse_unused
 from msmpetsc.solve.rest import Rest
 from msmpetsc.solve.work import NO_WORK, Work
 
@@ -69,18 +73,15 @@ def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
 class Effort:
     """What the steps since the frame stored before took, and how far off those are whose true errors were measured."""
 
+    state: ClassVar[dict[str, Range]] = {"work": ANY, "true_error": ANY, "energy_error": ANY}
+
     work: Work = NO_WORK
     true_error: float = np.nan
     energy_error: float = np.nan
 
-    def measure(self, errors: np.ndarray) -> None:
+    def measure(self, errors: Rows) -> None:
         """Take note of a step whose true errors were measured."""
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        """Attributes that a checkpoint holds."""
-        return {"work": ANY, "true_error": ANY, "energy_error": ANY}
 
 
 class Simulation:
@@ -102,13 +103,13 @@ class Simulation:
         self.stored, self.stored_until = scene.stored, scene.stored_until
         self.trace: dict | None = None
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
-        make = partial(make_integrator, comm, model, self.environment)
+        make = partial(make_integrator, comm, self.environment)
         swings = scene.time.integrator != "implicit-euler"
         checks = scene.safety.checks
-        self.balance = EnergyBalance(comm, model.lattice, self.environment, self.elasticity, swings, checks)
+        self.balance = EnergyBalance(comm, self.environment, self.elasticity, swings, checks)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
-            self.adaptive = Adaptive(comm, model.lattice, self.environment, scene, make, self.balance)
+            self.adaptive = Adaptive(scene, make, self.balance)
         self.integrator = self.adaptive or make(scene.time, scene.solver, probes=probes)
         self.recovery = Recovery(scene, lambda time, solver, prefix: make(time, solver, prefix=prefix), self.balance)
         self.monitors = Monitors(comm, model.lattice)
@@ -131,7 +132,7 @@ class Simulation:
         """Yield the same, and None after the steps between: after each the run may stop, or be saved (collective)."""
         if self.step == 0:
             self._overlaps(0, 0.0)
-            self.balance.start(self.state, self.time_step)
+            self.balance.show(self.state.q, self.state.velocity(self.time_step), 0.0, self.state.sides)
             yield self._frame(0, self.state.q)
         while self.step < self.steps:
             with STEPS:
@@ -161,7 +162,7 @@ class Simulation:
         before, self.state = self.state, after
         self.effort.work += result.cost + Work(wall_time=perf_counter() - begin)
         self.time_error = result.time_error
-        if self.probes.asks(index) and not result.cost.is_of_recovery:
+        if self.probes.asks(index) and not result.cost.substeps + result.cost.fallbacks:  # not of recovery
             errors, trace = self.integrator.true_errors(index, result)
             self.effort.measure(errors)
             self.trace = trace or self.trace
@@ -175,7 +176,7 @@ class Simulation:
         return frame
 
     def _recovered(self, index: int, time: float, failure: StepFailed) -> tuple[StepResult, State]:
-        """A step that failed, taken another way (collective). Raises StepFailed, naming the step."""
+        """A failed step, taken another way (collective). Raises StepFailed, naming the step."""
         try:
             if self.recovery.is_on:
                 raise failure
@@ -219,7 +220,7 @@ class Simulation:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
 
-    def _frame(self, index: int, q: np.ndarray) -> Frame:
+    def _frame(self, index: int, q: Positions) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.balance.energies
         effort, gained = self.effort, self.state.ledger.since_frame
@@ -262,8 +263,46 @@ class Simulation:
         self.destroy()
 
     def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
         self.recovery.destroy()
         self.integrator.destroy()
         if self.surface:
             self.surface.destroy()
+
+
+class SurfaceMotion:
+    """The surface of a frame, W @ positions: this rank's rows of W; a PETSc scatter brings the nodes they need."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: Embedding):
+        columns, local = np.unique(embedding.indices, return_inverse=True)
+        self.starts, self.columns, self.weights = embedding.indptr, local.ravel(), embedding.weights
+        self.nodes = PETSc.Vec().createMPI((3 * lattice.owned, 3 * lattice.table.total), comm=comm)
+        self.needed = PETSc.Vec().createSeq(3 * len(columns), comm=PETSc.COMM_SELF)
+        index = PETSc.IS().createBlock(3, columns.astype(PETSc.IntType), comm=comm)
+        self.scatter = PETSc.Scatter().create(self.nodes, index, self.needed, None)
+        index.destroy()
+
+    def __call__(self, position: Positions) -> Rows:
+        """Surface points (v_local, 3) [m] for node positions (owned, 3) [m] (collective)."""
+        self.nodes.array[:] = position.ravel()
+        self.scatter.scatter(self.nodes, self.needed)
+        nodes = np.asarray(self.needed.array_r).reshape(-1, 3)
+        points = np.empty((len(self.starts) - 1, 3))
+        _weighted_sums(points, self.starts, self.columns, self.weights, nodes)
+        return points
+
+    def destroy(self) -> None:
+        for owner in (self.scatter, self.nodes, self.needed):
+            owner.destroy()
+
+
+@numba.njit(cache=True)
+def _weighted_sums(points: Positions, starts: Indices, columns: Indices, weights: Floats, nodes: Positions) -> None:
+    """Write W (in CSR form) times nodes (k, 3) into points (v, 3): as SciPy does, in three fifths of the time."""
+    for i in range(len(points)):
+        x = y = z = 0.0
+        for k in range(starts[i], starts[i + 1]):
+            weight, node = weights[k], columns[k]
+            x += weight * nodes[node, 0]
+            y += weight * nodes[node, 1]
+            z += weight * nodes[node, 2]
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z

@@ -5,26 +5,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Work:
-    """Work of one step, of the steps of a frame, or of any others; the sum of two is the work of both.
+    """Work of one step, of of a frame's steps, or of any others; the sum of two is the work of both.
 
     step_error : the greatest estimated relative error of the steps, which does not add up
-    iterations : of SNES; substeps of an explicit integrator
-    ksp_its    : KSP iterations of all of them, and of what examines their results
-    products   : with the Hessian, those at multigrid's finest level included
-    steps      : that stand
-    substeps   : shorter steps taken in place of one that failed
-    fallbacks  : steps solved by the robust method
-    wall_time  : [s]
     """
 
     step_error: float = 0.0
-    iterations: int = 0
-    ksp_its: int = 0
-    products: int = 0
-    steps: int = 0
-    substeps: int = 0
-    fallbacks: int = 0
-    wall_time: float = 0.0
+    iterations: int = 0  # of SNES; substeps of an explicit integrator
+    ksp_its: int = 0  # KSP iterations of all of them, and of what examines their results
+    products: int = 0  # with the Hessian, those at multigrid's finest level included
+    steps: int = 0  # that stand
+    substeps: int = 0  # shorter steps taken in place of one that failed
+    fallbacks: int = 0  # steps solved by the robust method
+    wall_time: float = 0.0  # [s]
 
     def __add__(self, other: "Work") -> "Work":
         error = max(self.step_error, other.step_error)
@@ -33,11 +26,6 @@ class Work:
     def __sub__(self, before: "Work") -> "Work":
         """What was done since, but for the error, which is of now."""
         return Work(self.step_error, *(getattr(self, name) - getattr(before, name) for name in COUNTED))
-
-    @property
-    def is_of_recovery(self) -> bool:
-        """Whether a step was taken another way than first tried."""
-        return self.substeps + self.fallbacks > 0
 
 
 NO_WORK = Work()

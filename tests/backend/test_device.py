@@ -1,6 +1,5 @@
 """--device and -mat_type, on a machine that has no GPU or whose GPU is not asked for."""
 
-import ctypes
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,7 +11,6 @@ from petsc4py import PETSc
 from msmpetsc.backend import cuda
 from msmpetsc.errors import InputError
 from msmpetsc.solve.petsc import device
-from msmpetsc.solve.petsc.library import petsc_library
 
 FALL = {"time": {"step": 0.01, "duration": 0.02}, "gravity": {"acceleration": [0, 0, -9.81]}}
 
@@ -50,47 +48,9 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
     assert done.returncode == 2 and "--device cuda and -mat_type aij contradict each other" in done.stderr
 
 
-def test_the_cpu_may_be_named(tmp_path: Path, msmpetsc):
-    done = msmpetsc(
-        1, "run", block_scene(tmp_path, **FALL), "-o", tmp_path / "out.h5", "--device", "cpu", "-mat_type", "aij"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize(
-    ("count", "says"),
-    [(lambda: 0, "no GPU is seen"), (lambda: 1 / 0, "no GPU is seen: division by zero"), (lambda: 2, None)],
-)
-def test_the_runtime_is_asked_for_a_gpu(count, says: str | None):
-    cupy = type("cupy", (), {"cuda": type("cuda", (), {"runtime": type("runtime", (), {"getDeviceCount": count})})})
-    with patch.dict("sys.modules", cupy=cupy):
-        assert cuda.missing() == says
-
-
 def test_a_package_that_is_not_there_is_named():
     with patch.dict("sys.modules", cupy=None):
         assert cuda.missing() == "cupy cannot be imported; pip install 'msmpetsc[cuda]' brings it"
-
-
-@pytest.mark.parametrize("knows", [True, False])
-@pytest.mark.parametrize("given", [None, "1"])
-def test_messages_are_staged_on_the_cpu_where_mpi_knows_no_gpus(options, knows: bool, given: str | None):
-    """But for a user who knows better. PETSc's own variable tells."""
-    aware = ctypes.c_bool.in_dll(petsc_library(), "use_gpu_aware_mpi")
-    before, aware.value = aware.value, True
-    options["mat_type"] = "aijcusparse"
-    if given:
-        options["use_gpu_aware_mpi"] = given
-    try:
-        with (
-            patch.object(device, "what_is_missing", lambda: None),
-            patch.object(cuda, "use_device", lambda rank: None),
-            patch.object(device, "_mpi_knows_gpus", lambda: knows),
-        ):
-            assert device.sender(MPI.COMM_SELF) is cuda.send
-        assert aware.value == bool(knows or given)
-    finally:
-        aware.value = before
 
 
 @pytest.mark.cuda

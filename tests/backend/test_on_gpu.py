@@ -3,14 +3,13 @@ no array of one place among those of the other, and nothing carried but what fra
 
 import importlib
 import json
-import operator
 import re
 import shutil
 import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +28,6 @@ from pretend_gpu import pretended
 
 import msmpetsc
 from msmpetsc.build import build_model
-from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
@@ -131,41 +129,6 @@ def test_frames_are_those_of_the_cpu(tmp_path: Path, case: str, on_gpu):
         energies = [[getattr(frame, name) for frame in frames] for frames in (there, here)]
         np.testing.assert_allclose(*energies, rtol=1e-5, atol=1e-9)
     assert [frame.inverted for frame in there] == [frame.inverted for frame in here]
-
-
-@on_a_gpu
-def test_multigrid_may_share_its_matrix_with_our_products(tmp_path: Path, on_gpu):
-    """cuSPARSE keeps what it prepared for a product with the matrix, which here has two."""
-    path = block_scene(tmp_path, **CASES["anderson"])
-    PETSc.Options()["pc_type"] = "gamg"
-    try:
-        here = play(path)
-        with on_gpu():
-            there = play(path)
-    finally:
-        del PETSc.Options()["pc_type"]
-    np.testing.assert_allclose(positions(there), positions(here), rtol=0, atol=1e-8)
-
-
-@on_a_gpu
-def test_true_errors_are_measured_there(tmp_path: Path, on_gpu):
-    path = block_scene(tmp_path, **{**FALL, **HELD, "solver": {"preset": "newton", "error": 1e-2}})
-    here = play(path, Probes(true_error=4))
-    with on_gpu():
-        there = play(path, Probes(true_error=4))
-    errors = [[frame.true_error for frame in frames if frame.index % 4 == 0 < frame.index] for frames in (there, here)]
-    assert min(errors[1]) > 0 and max(errors[1]) < 1e-2
-    np.testing.assert_allclose(*errors, rtol=1e-3)
-
-
-@on_a_gpu
-def test_a_step_that_fails_says_the_same(tmp_path: Path, on_gpu):
-    path, says = block_scene(tmp_path, **FAILING), []
-    for place in (nullcontext, on_gpu):
-        with place(), pytest.raises(StepFailed) as failure:
-            play(path)
-        says.append(re.sub(r"[-\d.]+(e[-+]\d+)?", "", str(failure.value)))
-    assert says[0] == says[1] and "worst at node" in says[0]
 
 
 @on_a_gpu
@@ -297,12 +260,6 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
             said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
             print(body.__name__, said)
             assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
-
-
-def test_cupy_has_the_functions_that_the_pretended_gpu_lets_steps_call():
-    cupy = pytest.importorskip("cupy", reason="no CuPy here: pip install 'msmpetsc[cuda]'")
-    for name in pretend_gpu.KNOWN:
-        assert operator.attrgetter(name)(cupy)
 
 
 @pytest.mark.slow

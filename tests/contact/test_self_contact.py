@@ -14,7 +14,6 @@ from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 
 from msmpetsc.build import Model, build_model
-from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.contact.surface.barrier import Barrier
 from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
@@ -23,9 +22,6 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.linear.explicit import explicit
-from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
 COMM = MPI.COMM_SELF
@@ -131,24 +127,6 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     bound = term.bound(q)
     assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
     assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
-
-
-def test_the_written_hessian_has_the_contacts_entries(model):
-    """Which couple nodes that no spring joins: `-ksp_view_mat` writes it."""
-    term, q = contact(model)
-    stepper = Stepper(COMM, model.lattice, T, find_preset("newton"), 1e-3, touches=True)
-    hessian, operator = stepper.jacobian.hessian, stepper.jacobian.operator
-    hessian.linearise(q, Contact([], model.lattice.owned, term))
-    x, y = operator.createVecs()
-    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
-    operator.mult(x, y)
-    found = y.duplicate()
-    matrix = explicit(operator, stepper.unknowns, hessian.coupled())
-    matrix.mult(x, found)
-    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
-    for owned in (matrix, x, y, found):
-        owned.destroy()
-    stepper.destroy()
 
 
 def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):

@@ -168,7 +168,7 @@ class Case:
         self.comm, self.lattice, self.q, self.time_step = comm, lattice, q, time_step
         self.unknowns = Unknowns(comm, lattice)
         self.elasticity = Elasticity(comm, lattice)
-        self.multigrid = Multigrid(comm, self.unknowns, self.elasticity, time_step, "")
+        self.multigrid = Multigrid(self.unknowns, self.elasticity, time_step, "")
         self.blocks = contact_blocks(lattice) if contact else np.empty((0, 9))
         self.multigrid.update(q, self.blocks)
         self.x, self.y = self.multigrid.operator.createVecs()
@@ -190,10 +190,10 @@ class Case:
             matrix[:, column] = np.concatenate(self.comm.allgather(self.unknowns.columns(self.y).T.ravel()))
         return matrix
 
-    def hessian(self, projected: bool = True, dtype: type = np.float64) -> np.ndarray:
+    def hessian(self) -> np.ndarray:
         """H = M + t^2 (Hessian of E), and of contact where there is: by its products."""
         hessian, t2 = TrueHessian(self.unknowns, self.elasticity, self.time_step), self.time_step**2
-        hessian.elastic = self.elasticity.hessian_at(self.q, projected, dtype)
+        hessian.elastic = self.elasticity.hessian_at(self.q, projected=True)
         matrix = self.dense(lambda x, y: hessian.mult(None, x, y))
         own = self.blocks[self.unknowns.free] if len(self.blocks) else np.zeros((self.unknowns.size, 9))
         for node, added in enumerate(np.concatenate(self.comm.allgather(own))):
@@ -222,16 +222,12 @@ class Case:
         own = csr_array((data, indices, indptr), shape=(len(indptr) - 1, matrix.getSize()[1])).toarray()
         return np.concatenate(self.comm.allgather(own))
 
-    def true_hessian(self) -> tuple[PETSc.Mat, TrueHessian]:
-        """The operator of CG: with its negative parts."""
-        hessian = TrueHessian(self.unknowns, self.elasticity, self.time_step)
-        hessian.linearise(self.q, None)
-        return python_matrix(self.unknowns, hessian, self.comm), hessian
-
     def iterations(self, rtol: float, rough: bool) -> int:
         """CG's on the true Hessian with the cycle, to this tolerance in the norm of the error, as newton's; of a step
         under weight, or of pushes that differ from node to node."""
-        operator, _ = self.true_hessian()
+        hessian = TrueHessian(self.unknowns, self.elasticity, self.time_step)
+        hessian.linearise(self.q, None)
+        operator = python_matrix(self.unknowns, hessian, self.comm)
         ksp = PETSc.KSP().create(self.comm)
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.setNormType(PETSc.KSP.NormType.NATURAL)
@@ -262,12 +258,10 @@ def hierarchy(
     time_step: float = 1 / 60,
     contact: bool = False,
     coarsest: int = 800,
-    options: dict[str, str] | None = None,
 ) -> Iterator[Case]:
     """The cycle as presets have it, with coarser grids until one has ``coarsest`` nodes or less."""
     database, before = PETSc.Options(), cycle.COARSEST
-    given = LATTICE_MULTIGRID | (options or {})
-    for name, value in given.items():
+    for name, value in LATTICE_MULTIGRID.items():
         database.setValue(name, value)
     cycle.COARSEST = coarsest
     case = None
@@ -278,5 +272,5 @@ def hierarchy(
         cycle.COARSEST = before
         if case:
             case.destroy()
-        for name in given:
+        for name in LATTICE_MULTIGRID:
             database.delValue(name)

@@ -126,7 +126,7 @@ def dressed(value):
     return Array(np.asarray(value)) if isinstance(value, (np.ndarray, np.generic)) else value
 
 
-class Memory(memory.Host):
+class Memory(memory.Memory):
     """PETSc's, of the CPU, looked at through arrays of the GPU."""
 
     def read(self, vector: PETSc.Vec) -> Array:

@@ -1,23 +1,19 @@
 """Steps as long as the motion allows: the error that is reached, and where steps become short or long."""
 
-import logging
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from block_scene import CELL, block_scene, play
+from block_scene import block_scene, play
 from conftest import run
 from mpi4py import MPI
 
-from msmpetsc.build import build_model
-from msmpetsc.comm import log
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.adaptive import between
-from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
+from msmpetsc.solve.integrators.adaptive import METHODS
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.simulate import refuse_bad_options
 
@@ -69,30 +65,6 @@ def test_the_local_error_of_a_swing(method: str, order: int):
         local = METHODS[method][1](x(1.0), v(1.0), after[0], after[1], wt)
         ratios.append(local / (after[0] - x(1 + wt)))
     assert abs(ratios[1] - 1) < 0.6 * abs(ratios[0] - 1) < 0.1
-
-
-def test_frames_within_a_step_are_of_third_order_and_meet_its_ends():
-    q_0, v_0, q_1, v_1 = np.random.default_rng(1).normal(size=(4, 5, 3))
-    for s, q, v in ((0.0, q_0, v_0), (1.0, q_1, v_1)):
-        found = between(q_0, v_0, q_1, v_1, 0.3, s)
-        np.testing.assert_allclose(found[0], q, atol=1e-14)
-        np.testing.assert_allclose(found[1], v, atol=1e-13)
-    errors = []
-    for t in (0.1, 0.05):
-        q, v = between(np.sin(1.0), np.cos(1.0), np.sin(1 + t), np.cos(1 + t), t, 0.3)
-        errors.append([abs(q - np.sin(1 + 0.3 * t)), abs(v - np.cos(1 + 0.3 * t))])
-    slopes = np.log2(np.divide(*errors))
-    assert slopes[0] > 3.8 and slopes[1] > 2.8
-
-
-def test_means_over_neighbours_keep_what_is_smooth_and_take_what_is_rough(tmp_path: Path):
-    model = build_model(MPI.COMM_SELF, load_scene(beam(tmp_path)))
-    mean, nodes = NeighbourMean(MPI.COMM_SELF, model.lattice), model.lattice.nodes
-    even, rough = np.ones_like(nodes), np.cos(np.pi / CELL * nodes.sum(axis=1))[:, None] * np.ones(3)
-    np.testing.assert_allclose(mean(even), even, rtol=1e-13)
-    assert np.linalg.norm(mean(np.sin(3 * nodes))) > 0.7 * np.linalg.norm(np.sin(3 * nodes))
-    assert np.linalg.norm(mean(rough)) < 0.02 * np.linalg.norm(rough)
-    mean.destroy()
 
 
 # ---- the error reached
@@ -166,14 +138,6 @@ def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path
     assert frames[-1].momentum[2] > 0
 
 
-def test_rest_lengthens_steps(tmp_path: Path):
-    """A hanging block that implicit Euler has brought to rest: four frames a step and more."""
-    _, frames = play(beam(tmp_path, "implicit-euler", step=0.1, duration=20.0, error=0.5))
-    steps = np.array([frame.steps for frame in frames])
-    assert steps[1:20].mean() > 4 * steps[-32:].mean()
-    assert steps[-32:].sum() < 8
-
-
 @pytest.mark.parametrize("stop", [0.1, 0.115])
 def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float):
     """At that time the nodes are still where they were led; a step of one length lets them go as it begins."""
@@ -187,56 +151,38 @@ def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float)
     assert (frames[-1].position[tip, 2] - model.lattice.nodes[tip, 2]).min() > 0.0201  # flung on
 
 
-def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    step, calls = Stepper.step, []
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Numbers of the calls of the solver that fail."""
+    step, calls, fails = Stepper.step, [], []
 
-    def failing(stepper: Stepper, *given, **named):
+    def counted(stepper: Stepper, *given, **named):
         calls.append(stepper)
-        if len(calls) in (6, 7):
+        if len(calls) in fails:
             raise StepFailed("did not converge: as the test has it; try nothing", "line search")
         return step(stepper, *given, **named)
 
-    monkeypatch.setattr(Stepper, "step", failing)
+    monkeypatch.setattr(Stepper, "step", counted)
+    return fails
+
+
+def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, failing: list[int]):
+    failing += [6, 7]
     _, frames = play(beam(tmp_path, error=0.1, duration=0.4))
     assert sum(frame.substeps for frame in frames) == 0  # nothing was left for [safety] to do
     assert len(frames) == 41
 
 
-def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_the_shortest_step_cannot_do_is_left_to_safety(tmp_path: Path, failing: list[int]):
     """The scene's step is then taken in pieces, and steps are chosen again after it."""
-    step, calls = Stepper.step, []
-
-    def failing(stepper: Stepper, *given, **named):
-        calls.append(stepper)
-        if len(calls) == 6:
-            raise StepFailed("did not converge: as the test has it; try nothing", "line search")
-        return step(stepper, *given, **named)
-
-    monkeypatch.setattr(Stepper, "step", failing)
+    failing += [6]
     scene = beam(tmp_path, error=0.1, shortest=STEP, duration=0.4, safety={"on_failure": "substep"})
     _, frames = play(scene)
     assert len(frames) == 41 and sum(frame.substeps for frame in frames) == 2
     assert sum(frame.steps for frame in frames[10:]) < 31
 
 
-def test_what_a_body_with_no_way_on_says_is_the_failure_of_the_shortest_step(tmp_path: Path, monkeypatch):
-    def failing(*given, **named):
-        raise StepFailed("did not converge: as the test has it; try nothing", "line search")
-
-    monkeypatch.setattr(Stepper, "step", failing)
-    with pytest.raises(StepFailed, match=r"^frame 1 "):
-        play(beam(tmp_path, error=0.1, duration=0.4))
-
-
-# ---- what is said and refused
-
-
-def test_a_run_says_its_steps_and_its_estimate(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    with caplog.at_level(logging.INFO, log.name):
-        log.propagate = True
-        play(beam(tmp_path, error=0.1, duration=0.4))
-    assert "steps of 9.77e-06 to 0.64 s, for an error of 0.1" in caplog.text
-    assert "of its size off" in caplog.text
+# ---- what is refused
 
 
 @pytest.mark.parametrize(

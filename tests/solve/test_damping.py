@@ -4,11 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import G, block_scene, play
-from mpi4py import MPI
-
-from msmpetsc.cli.main import main
-from msmpetsc.elasticity.energy import Elasticity
+from block_scene import block_scene, play
 
 ALPHA, STEP = 3.0, 1 / 64  # [1/s], [s]
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
@@ -45,15 +41,6 @@ def test_bdf2_converges_to_the_exponential_with_second_order(tmp_path: Path):
     assert (slopes > 1.7).all() and errors[-1] < 1e-3, (errors, slopes)
 
 
-def test_a_fall_comes_to_g_over_alpha(tmp_path: Path):
-    speed = velocities(damped(tmp_path, "implicit-euler", 16, alpha=50.0, gravity={"acceleration": [0, 0, -G]}))[:, 2]
-    expected = np.zeros(17)
-    for n in range(16):
-        expected[n + 1] = (expected[n] - STEP * G) / (1 + 50.0 * STEP)
-    np.testing.assert_allclose(speed, expected, rtol=1e-8, atol=1e-12)
-    assert speed[-1] == pytest.approx(-G / 50.0, rel=1e-3)
-
-
 @pytest.mark.parametrize("integrator", ["bdf2", "verlet"])
 def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator: str, caplog):
     swing = {"pin": [{"region": FOOT}], "start": {"velocity": [0.1, 0.0, 0.0]}}
@@ -66,42 +53,3 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
     expected = np.exp(-ALPHA * np.arange(60, 121) / 400)
     assert np.abs(ratio / expected - 1).max() < 0.1
     assert "nowhere" not in caplog.text
-
-
-@pytest.mark.parametrize("preset", ["newton", "anderson"])
-def test_a_step_satisfies_its_equation(tmp_path: Path, preset: str):
-    scene = damped(
-        tmp_path, "implicit-euler", 3, alpha=40.0, start={"scale": [1.0, 1.0, 1.2], "velocity": SPEED},
-        gravity={"acceleration": [0, 0, -G]}, solver={"preset": preset, "error": 1e-10},
-    )  # fmt: skip
-    model, frames = play(scene)
-    before, q, x = (frame.position for frame in frames[1:])
-    gradient, mass = np.zeros_like(x), model.lattice.mass[:, None]
-    Elasticity(MPI.COMM_SELF, model.lattice).add_gradient(x, gradient)
-    gradient[:, 2] += mass[:, 0] * G
-    inertia, drag = mass * (x - 2 * q + before), STEP * 40.0 * mass * (x - q)
-    residual = inertia + drag + STEP**2 * gradient
-    assert np.linalg.norm(residual) < 1e-5 * np.linalg.norm(drag)
-
-
-def test_no_damping_is_the_undamped_run_bit_for_bit(tmp_path: Path):
-    start = {"start": {"scale": [1.0, 1.0, 1.2]}}
-    for integrator in ("implicit-euler", "bdf2", "verlet"):
-        _, off = play(damped(tmp_path, integrator, 3, alpha=0.0, **start))
-        material = {"young_modulus": 1e5, "density": 1000.0}
-        time = {"step": STEP, "duration": 3 * STEP, "integrator": integrator}
-        _, absent = play(block_scene(tmp_path, time=time, material=material, **start))
-        assert all(np.array_equal(a.position, b.position) for a, b in zip(off, absent, strict=True))
-
-
-def test_adaptive_steps_are_damped_alike(tmp_path: Path):
-    swing = {"pin": [{"region": FOOT}], "start": {"velocity": [0.1, 0.0, 0.0]}}
-    _, fine = play(damped(tmp_path, "bdf2", 64, step=1 / 512, **swing))
-    _, chosen = play(damped(tmp_path, "bdf2", 8, step=1 / 64, time={"error": 1e-3}, **swing))
-    farthest = max(np.abs(frame.position - fine[0].position).max() for frame in fine)
-    assert np.abs(chosen[-1].position - fine[-1].position).max() < 0.02 * farthest
-
-
-def test_statics_refuse_it(tmp_path: Path, capsys):
-    assert main(["run", str(damped(tmp_path, "static", 1, pin=[{"region": FOOT}])), "-o", str(tmp_path / "x.h5")]) == 2
-    assert "material.damping" in capsys.readouterr().err

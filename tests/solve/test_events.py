@@ -2,23 +2,12 @@
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import pytest
 from block_scene import block_scene, play
 from conftest import run as on_ranks
-from petsc4py import PETSc
-
-from msmpetsc.cli.main import main
-from msmpetsc.errors import StepFailed
-from msmpetsc.results.reader import Result
-from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.petsc import events
-from msmpetsc.solve.simulate import Simulation
-from msmpetsc.study.metrics import of_frames
 
 FRAMES = 3
 SWINGS = {
@@ -60,19 +49,6 @@ def test_events_are_in_their_stages(run: tuple):
     assert {f"msmpetsc {name}" for name in names} <= set(stages["steps"])
     assert stages["output"]["msmpetsc output"][0] == 1 + FRAMES and "SNESSolve" in stages["reference"]
     assert not any(name.startswith("SNES") for stage in ("Main Stage", "output") for name in stages[stage])
-
-
-def test_the_set_up_is_over_when_steps_begin(tmp_path: Path, monkeypatch):
-    mark, advance = PETSc.Log.Event("mark of a test"), Simulation.advance
-
-    def marked(simulation: Simulation) -> Iterator:
-        with mark:
-            yield from advance(simulation)
-
-    monkeypatch.setattr(Simulation, "advance", marked)
-    words = block_scene(tmp_path, **SWINGS), "-o", tmp_path / "o.h5", "--measure", tmp_path / "m.json"
-    assert main(["run", *map(str, words)]) == 0
-    assert [mark.getPerfInfo(stage)["count"] for stage in (events.MAIN, events.SETUP.id)] == [1, 0]
 
 
 @pytest.mark.slow
@@ -123,39 +99,3 @@ def test_products_repeat_and_verlet_has_none(tmp_path: Path):
     first, again = ([frame.products for frame in play(block_scene(tmp_path, **SWINGS))[1]] for _ in range(2))
     assert first == again and first[0] == 0 and min(first[1:]) > 0
     assert {frame.products for frame in play(block_scene(tmp_path, **SWINGS), 'time.integrator="verlet"')[1]} == {0}
-
-
-@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
-def test_a_frame_has_the_products_of_all_its_steps(tmp_path: Path, monkeypatch, integrator: str):
-    """Those of the history that BDF2 begins with, and of a step that failed and was taken in two."""
-    taken, step = [], Stepper.step
-
-    def counted(self: Stepper, problem: StepProblem, *rest) -> StepResult:
-        if sum(taken) > 0 and len(taken) == (2 if integrator == "bdf2" else 1):
-            taken.append(0)
-            raise StepFailed("fails here", "diverged")
-        before = self.jacobian.hessian.products
-        result = step(self, problem, *rest)
-        taken.append(self.jacobian.hessian.products - before)
-        return result
-
-    monkeypatch.setattr(Stepper, "step", counted)
-    scene = block_scene(tmp_path, **SWINGS, safety={"on_failure": "substep"})
-    frames = play(scene, f'time.integrator="{integrator}"')[1]
-    assert sum(frame.products for frame in frames) == sum(taken) > 0 and frames[2].substeps == 2 and 0 in taken
-
-
-def test_a_file_without_products_is_read_and_gone_on_with(tmp_path: Path, msmpetsc):
-    """As an earlier version left it."""
-    path = tmp_path / "o.h5"
-    words = "run", block_scene(tmp_path, **SWINGS), "-o", path
-    assert msmpetsc(1, *words, "--frames", "2").returncode == 0
-    with h5py.File(path, "r+") as file:
-        del file["frames/products"]
-    with Result(path) as result:
-        assert "products" not in result.frames and len(result.frames.ksp_its) == 3
-    assert "products" not in of_frames(path, 1 / 60)
-    done = msmpetsc(1, "run", "--resume", path, "--frames", FRAMES, "--force")
-    assert done.returncode == 0, done.stderr
-    with Result(path) as result:
-        assert result.frames.products[-1] > 0 and len(result.frames.products) == 1 + FRAMES

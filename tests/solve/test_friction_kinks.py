@@ -4,14 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, block_scene
-from mpi4py import MPI
+from block_scene import CELL, block_scene, play
 
-from msmpetsc.build import build_model
-from msmpetsc.contact.obstacles.penalty import Contact, Secants
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.solve.nonlinear.jacobian import FrictionKinks
 
 PRESSING = {
     "shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8,
@@ -31,13 +27,7 @@ SLIDES = {  # it falls on the ground, slides a little and is pressed
 
 def iterations(path: Path) -> int:
     """Newton's, of all steps."""
-    scene = load_scene(path)
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        return sum(frame.iterations for frame in simulation.frames())
-
-
-def no_secants(contact: Contact, *_: np.ndarray) -> Secants:
-    return [None for _ in contact.states]
+    return sum(frame.iterations for frame in play(path)[1])
 
 
 def test_secants_of_friction_save_iterations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -46,6 +36,6 @@ def test_secants_of_friction_save_iterations(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(Contact, "passes_kinks", Contact.all_secant)
     monkeypatch.setattr(FrictionKinks, "see", lambda *_: None)
     secants_alone = iterations(path)
-    monkeypatch.setattr(Contact, "all_secant", no_secants)
+    monkeypatch.setattr(Contact, "all_secant", lambda contact, *_: [None for _ in contact.states])
     true_alone = iterations(path)
     assert with_secants < 0.95 * true_alone and with_secants < 0.5 * secants_alone

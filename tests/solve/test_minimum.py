@@ -26,7 +26,7 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.nonlinear import preconditioning
-from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -80,12 +80,9 @@ def play(path: Path, *overrides: str) -> list[Frame]:
     ("name", "preset"),
     [
         ("crushed", "newton"),
-        ("crushed", "fast-msm"),
-        ("pressed", "newton"),
         ("pressed", "newton-multigrid"),
         ("collapsed", "newton"),
         ("collapsed", "anderson"),
-        ("collapsed", "lbfgs"),
     ],
 )
 def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(tmp_path: Path, name: str, preset: str):
@@ -93,12 +90,6 @@ def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(tmp_path: 
     assert frames or preset == "anderson", "which may stop with status 3, as the others may not"
     for frame in frames:
         assert frame.true_error < 3 * frame.step_error and frame.step_error <= 1e-3, frame
-
-
-@pytest.mark.slow
-def test_chebyshev_does_not_stay_between_two_ways_to_buckle(tmp_path: Path):
-    frames = play(write_case(tmp_path, "pressed", preset="chebyshev"))
-    assert all(frame.true_error < 3 * frame.step_error for frame in frames)
 
 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
@@ -183,13 +174,6 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
     assert result.cost.step_error < 1e-3
 
 
-def test_a_body_that_is_not_compressed_is_not_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Stretched, it is convex for certain."""
-    monkeypatch.setattr(LowestCurvature, "lowest", None)
-    frames = play(write_case(tmp_path, "crushed"), "start.scale=[1.2, 1.2, 1.2]", "gravity.acceleration=[0,0,0]")
-    assert frames and frames[0].step_error <= 1e-3
-
-
 def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
     """Once only rounding moves it, by 1e-12 of its size, the estimate is as large as the motion, or 2.8 times that."""
     path = blocks.block_scene(
@@ -209,11 +193,6 @@ def test_rounding_is_an_error_and_no_zero(tmp_path: Path):
     for preset in ("newton", "anderson"):
         (frame,) = play(write_case(tmp_path, "crushed", preset=preset), "start.scale=[1,1,1]", "solver.error=1e-15")
         assert 1e-16 < frame.step_error < 1e-6 and frame.true_error > 0
-
-
-def test_a_body_at_rest_has_a_small_error(tmp_path: Path):
-    frames = play(write_case(tmp_path, "crushed"), "start.scale=[1,1,1]", "gravity.acceleration=[0,0,0]")
-    assert frames and frames[0].step_error < 1e-6
 
 
 PART = "part=[{region={half_space={point=[0.0,0.0,0.0], normal=[1,0,0]}}, young_modulus=%g}]"
@@ -239,18 +218,8 @@ def test_stiff_parts_are_solved_as_well_as_they_say(tmp_path: Path):
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(tmp_path: Path):
     """A sample of what scripts/error_study.py draws; it takes 500."""
     told = tmp_path / "rows.json"
-    command = [
-        sys.executable,
-        "-W",
-        "ignore",
-        ROOT / "scripts" / "error_study.py",
-        "--scenes",
-        "12",
-        "--seed",
-        "7",
-        "--json",
-        told,
-    ]
+    script = ROOT / "scripts" / "error_study.py"
+    command = [sys.executable, "-W", "ignore", script, "--scenes", "12", "--seed", "7", "--json", told]
     done = subprocess.run(command, capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = json.loads(told.read_text())

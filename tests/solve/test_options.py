@@ -1,7 +1,7 @@
 """PETSc's options are obeyed, or refused in one line before anything is built; the matrices they ask for are
 written."""
 
-from dataclasses import replace
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,10 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.options import refuse_bad_values, refuse_early, refuse_unused
-from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.initialise import _check_files
+from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset, shown_options
+from msmpetsc.solve.refused_options import refuse_early, refuse_unused
 
 T = 1 / 60
 COMM = MPI.COMM_SELF
@@ -38,34 +38,20 @@ NO_USE = {
     "ts_monitor": ("", "time.step"),
     "ts_dt": ("0.1", "time.step"),
     "ts_max_steps": ("3", "--frames"),
-    "ts_adapt_monitor": ("", "time.integrator"),
     "dm_view": ("", "cages.count"),
-    "da_grid_x": ("5", "cages.count"),
     "tao_monitor": ("", "solver.preset"),
     "snes_rtol": ("1e-3", "solver.error"),
-    "snes_atol": ("1e300", "solver.error"),
     "snes_stol": ("1e-8", "solver.error"),
-    "reference_snes_rtol": ("1e-3", "solver.error"),
     "fallback_snes_stol": ("1", "solver.error"),
-    "snes_convergence_test": ("skip", "solver.error"),
-    "snes_norm_schedule": ("none", "solver.error"),
-    "snes_divergence_tolerance": ("2", "solver.max_iterations"),
-    "snes_max_funcs": ("2", "solver.max_iterations"),
     "snes_force_iteration": ("", "solver.error"),
     "snes_lag_jacobian": ("2", "A is constant"),
-    "snes_lag_preconditioner_persists": ("1", "A is constant"),
     "snes_mf": ("", "spring by spring"),
-    "snes_mf_operator": ("", "spring by spring"),
     "snes_fd": ("", "spring by spring"),
-    "snes_fd_color": ("", "spring by spring"),
     "snes_type": ("newtontr", "newtonls"),
     "three_columns_pc_type": ("bjacobi", "-pc_"),
     "ksp_error_if_not_converged": ("", "status 3"),
     "ksp_monitor": ("binary:f.dat", "ascii:FILE"),
-    "ksp_view_diagonal_scale": ("", "not scaled"),
     "presett": ("newton", "did you mean '--preset'"),
-    "options_left": ("abc", "abc"),
-    "log_view": ("foo:bar", "foo"),
 }
 
 
@@ -87,34 +73,15 @@ def test_a_misspelt_option_is_told_with_the_nearest(petsc_options, name: str):
         refuse_unused(COMM, set(), at_end=True)
 
 
-def test_a_size_of_0_below_which_no_step_ends_is_what_presets_say(petsc_options):
-    petsc_options(snes_stol="0")
-    refuse_early(COMM, [])
-
-
-@pytest.mark.parametrize("name", ["ksp_rtol", "pc_type", "mat_type", "snes_type", "snes_max_it", "fallback_ksp_type"])
-def test_values_are_tried_before_there_is_anything_to_solve(petsc_options, name: str):
-    petsc_options(**{name: "nonsense"})
-    solvers = {"": (find_preset("newton"), 0), "fallback_": (find_preset("newton-projected"), 0)}
-    with pytest.raises(InputError, match="nonsense"):
-        refuse_bad_values(solvers)
-
-
 LINES = {  # of an options file -> whether PETSc can read it
     "-ksp_type cg": True,
-    "  -ksp_type cg # and more": True,
     "": True,
-    "# -ksp_type": True,
     '-log_view "a b"': True,
     "-shift -0.5": True,
     "alias -a -b": True,
     "ksp_type cg": False,
-    "% ksp_type cg": False,
     "-ksp_type cg -pc_type none": False,
-    "-ksp_view -pc_type": False,
     "-ksp_type cg jacobi": False,
-    "-3 4": False,
-    "-options_file gone": False,
 }
 
 
@@ -123,12 +90,8 @@ def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
     """For rank 0 alone reads it, and the others would wait for ever."""
     file = tmp_path / "options"
     file.write_text(f"-pc_type jacobi\n{line}\n")
-    words = ["-options_file", str(file)]
-    if LINES[line]:
-        _check_files(words)
-        return
-    with pytest.raises(InputError, match=r"line 2|gone: cannot be read"):
-        _check_files(words)
+    with nullcontext() if LINES[line] else pytest.raises(InputError, match="line 2"):
+        _check_files(["-options_file", str(file)])
 
 
 @pytest.mark.parametrize("words", [["-options_file"], ["-options_file", "-ksp_view"], ["-options_file", "/dev/null"]])
@@ -143,14 +106,12 @@ BEFORE_THE_MESH = {
     "-pc_type nonsense": "nonsense",
     "-options_file gone": "gone",
     "-malloc_debug abc": "abc",
-    "-log_view :/no/such/file": "/no/such/file",
     "--set time.integrator=verlet -ksp_type cg": "-ksp_type",
 }
 
 
 @pytest.mark.parametrize(
-    ("ranks", "options"),
-    [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone"), (2, "-ts_monitor")],
+    ("ranks", "options"), [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone")]
 )
 def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options: str):
     """Which is not there."""
@@ -214,24 +175,9 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
     assert seen >= {reasons.CONVERGED_SNORM_RELATIVE, reasons.CONVERGED_ITS}
 
 
-def test_newton_starts_its_solves_where_the_user_says(petsc_options):
-    petsc_options(ksp_initial_guess_nonzero="1")
-    lattice = beam()
-    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-6)
-    stepper.step(StepProblem(lattice.nodes, lattice.nodes, weight(lattice)))
-    assert stepper.ksp.getInitialGuessNonzero()
-    stepper.destroy()
-
-
 def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):
     petsc_options(ksp_type="chebyshev")
     assert all(result.cost.step_error <= 1e-3 for result in swing("newton", 2, error=1e-3))
-
-
-def test_what_python_code_of_the_users_raises_is_one_line(petsc_options):
-    petsc_options(snes_monitor_python="gone.monitor")
-    with pytest.raises(InputError, match="gone"):
-        refuse_bad_values({"": (find_preset("newton"), 0)})
 
 
 # Matrices
@@ -241,18 +187,12 @@ def read_matrix(path: Path) -> np.ndarray:
     """The first matrix of a PETSc binary file, dense."""
     from petsc4py import PETSc
 
-    viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSC_SELF())
+    viewer = PETSc.Viewer().createBinary(str(path), "r", comm=PETSc.COMM_SELF)
     matrix = PETSc.Mat().load(viewer)
     dense = matrix.convert("dense").getDenseArray().copy()
     viewer.destroy()
     matrix.destroy()
     return dense
-
-
-def PETSC_SELF():
-    from petsc4py import PETSc
-
-    return PETSc.COMM_SELF
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -285,44 +225,6 @@ def assert_is_like_a_hessian(matrix: np.ndarray, three: np.ndarray, atol: float)
     assert matrix.shape == three.shape and np.abs(matrix - three).max() > 1e-3
     np.testing.assert_allclose(matrix, matrix.T, atol=atol)
     assert np.linalg.eigvalsh(three - matrix).min() > -1e-2 * np.abs(three).max()
-
-
-def test_the_written_hessian_is_the_one_that_is_applied(tmp_path: Path):
-    """Under a stiffening law, with cells that resist, against products with it."""
-    from petsc4py import PETSc
-
-    from msmpetsc.solve.linear.explicit import explicit
-
-    lattice = replace(beam(), stiffening=2.0)
-    stepper = Stepper(COMM, lattice, T, find_preset("newton"), 1e-3)
-    q = lattice.nodes * [1, 1, 0.3]
-    stepper.jacobian.hessian.linearise(q, None)
-    matrix = explicit(stepper.jacobian.operator, stepper.unknowns)
-    x, y = stepper.jacobian.operator.createVecs()
-    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
-    stepper.jacobian.operator.mult(x, y)
-    found = y.duplicate()
-    matrix.mult(x, found)
-    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
-    for owned in (matrix, x, y, found):
-        owned.destroy()
-    stepper.destroy()
-    assert isinstance(matrix, PETSc.Mat)
-
-
-def test_matrices_of_two_ranks_are_those_of_one(tmp_path: Path):
-    scene = block_scene(tmp_path, **SCENE)
-    for ranks in (1, 2):
-        views = [f"-mat_view binary:A{ranks}", f"-ksp_view_pmat binary:P{ranks}", f"-ksp_view_mat binary:K{ranks}"]
-        words = " ".join(views).replace("binary:", f"binary:{tmp_path}/").split()
-        options = ("--preset", "newton-jacobi", "--frames", "1", *words)
-        done = run(ranks, *COMMAND, scene, "-o", tmp_path / f"{ranks}.h5", *options, timeout=60)
-        assert done.returncode == 0, done.stderr
-    for name in "AP":
-        one, two = (np.sort(np.linalg.eigvalsh(read_matrix(tmp_path / f"{name}{ranks}"))) for ranks in (1, 2))
-        np.testing.assert_allclose(one, two, rtol=1e-10)
-    one, two = (np.linalg.eigvalsh(read_matrix(tmp_path / f"K{ranks}")) for ranks in (1, 2))
-    np.testing.assert_allclose(one, two, rtol=1e-6)
 
 
 # What is shown

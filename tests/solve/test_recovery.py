@@ -3,7 +3,6 @@
 import tomllib
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene, load_scene
-from msmpetsc.solve.nonlinear.failure import REASON
+from msmpetsc.solve.nonlinear.error_control import REASON
 from msmpetsc.solve.simulate import Simulation
 from msmpetsc.study.distances import distance_of_shapes
 
@@ -57,10 +56,6 @@ class Played:
 
     def shape_error(self, mirror: tuple = (1, 1, 1)) -> float:
         return distance_of_shapes(self.last.position, self.lattice.nodes * mirror, self.lattice.mass)
-
-    def energy(self, frame: Frame) -> float:
-        """All but what the obstacles hold [J]."""
-        return frame.elastic + frame.potential + frame.kinetic
 
 
 @cache
@@ -103,17 +98,6 @@ def test_newton_survives(name: str):
     assert not played.words
     assert len(played.frames) == 1 + played.scene.time.steps
     assert all(np.isfinite(frame.position).all() for frame in played.frames)
-
-
-@pytest.mark.parametrize(
-    "name", [name for name in CASES if CASES[name]["file"] in ("hard/free.toml", "hard/clamped.toml")]
-)
-def test_no_energy_comes_from_nowhere(name: str):
-    """g(x_(n+1)) <= g(q_n) makes E_(n+1) <= E_n + K_n, the loads' potential counted in."""
-    frames = first_steps(name).frames
-    for before, after in pairwise(frames):
-        rounding = 1e-9 * max(abs(f.potential) + f.elastic for f in frames)
-        assert after.elastic + after.potential <= before.elastic + before.potential + before.kinetic * 1.001 + rounding
 
 
 # ---- bodies that come back to their rest shape
@@ -167,37 +151,6 @@ def test_it_hangs_at_rest(name: str):
     assert played.moved[far, 2].max() < -1e-3
 
 
-def test_the_beam_sags_less_than_a_thin_one_would():
-    """rho g L^4 / (8 E I) = 0.24 m by small deflections; the load turns the tip, which shortens its arm."""
-    played = play("beam")
-    far = played.lattice.nodes[:, 0] == 1
-    assert -0.24 < played.moved[far, 2].mean() < -0.15
-
-
-def test_a_heavy_half_falls_and_draws_the_other_along():
-    """Nearly freely: the light half weighs nothing against it."""
-    played = play("heavy half")
-    time, step = played.scene.time.duration, played.scene.time.step
-    far = played.lattice.nodes[:, 0] > 0.75
-    fallen = -0.5 * time * (time + step)  # implicit Euler's
-    assert played.last.position[far, 2].mean() == pytest.approx(fallen, rel=0.05)
-
-
-def test_bodies_apart_fall_on_their_own():
-    played = play("apart")
-    time, step, x = played.scene.time.duration, played.scene.time.step, played.lattice.nodes[:, 0]
-    fallen = played.last.position[x > 0.3] - played.lattice.nodes[x > 0.3]
-    np.testing.assert_allclose(fallen, np.tile([0, 0, -0.5 * time * (time + step)], (len(fallen), 1)), atol=1e-6)
-    assert np.abs(played.last.position - played.lattice.nodes)[x < 0.3].max() < 0.02
-
-
-def test_the_joint_of_two_bodies_does_not_come_apart():
-    for name in ("by a node", "by an edge"):
-        lattice, q = play(name).lattice, play(name).last.position
-        length = np.linalg.norm(q[lattice.springs[:, 0]] - q[lattice.springs[:, 1]], axis=1)
-        assert np.abs(length / lattice.rest_length - 1).max() < 0.4
-
-
 # ---- columns
 
 
@@ -239,10 +192,11 @@ def test_a_mirrored_body_stays_mirrored():
 
 
 @pytest.mark.parametrize("name", ["squeezed far", "pressed"])
-def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str):
+def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str, petsc_options):
     """At rest, without a spring strained much, some cells inside out. The same with law = "stiffening" comes back; with
     multigrid the one does so anyway."""
-    played = play(name, "solver.preset=newton-jacobi")
+    petsc_options(pc_type="jacobi")
+    played = play.__wrapped__(name)
     assert 0 < played.inverted(played.last) < len(played.lattice.cells)
     assert played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames) and played.shape_error() > 0.05
 
@@ -279,29 +233,20 @@ OTHERS = {
     "newton-multigrid": ["solver.preset=newton-multigrid"],
     "anderson": ["solver.preset=anderson"],
     "fast-msm": ["solver.preset=fast-msm", "solver.error=1e-2"],
-    "verlet": ["time.integrator=verlet"],
 }
 COMES_BACK = [
-    ("newton-multigrid", "stretched"), ("newton-multigrid", "squeezed"), ("newton-multigrid", "flat, stiffening"),
-    ("anderson", "stretched"), ("anderson", "squeezed"),
-    ("fast-msm", "stretched"), ("fast-msm", "squeezed"), ("fast-msm", "one cell, free"),
+    ("newton-multigrid", "stretched"), ("newton-multigrid", "flat, stiffening"),
+    ("anderson", "squeezed"), ("fast-msm", "stretched"), ("fast-msm", "one cell, free"),
 ]  # fmt: skip
 NOT_FINITE = REASON[-4]  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
 DIVERGES = [
     # A is no less than the Hessian of springs, but far from it where all are pressed: steps are small, or too long
     ("anderson", "flat", "DIVERGED_MAX_IT after 300 iterations"),
-    ("anderson", "cloud", "DIVERGED_MAX_IT after 300 iterations"),
-    ("anderson", "through", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
-    (
-        "anderson",
-        "pressed, stiffening",
-        "DIVERGED_MAX_IT after 300 iterations",
-    ),  # once it has left the saddle: it buckles
+    # once it has left the saddle: it buckles
+    ("anderson", "pressed, stiffening", "DIVERGED_MAX_IT after 300 iterations"),
     # A knows nothing of cells that resist or of stiffening springs, and no line search holds the steps back
-    ("anderson", "flat, stiffening", "DIVERGED_"),  # numbers that are not finite, or in PETSc 3.26 too many iterations
     ("anderson", "mirrored, stiffening", "DIVERGED_"),
-    ("fast-msm", "flat, stiffening", NOT_FINITE),
     ("fast-msm", "pressed, stiffening", NOT_FINITE),
 ]
 
@@ -329,28 +274,6 @@ def test_what_anderson_cannot_do_is_rescued(how: str, name: str):
     assert not played.words and played.shape_error() < 1e-4 and played.inverted(played.last) == 0  # it still swings
     rescued = [getattr(frame, f"{how}s") for frame in played.frames]
     assert max(rescued) > rescued[-1]  # less and less
-
-
-def test_the_robust_method_is_as_good():
-    """It comes to other minima of the cloud, and to the same where there is one."""
-    for name in ("cloud", "stiff half, stretched"):
-        played = play(name, "solver.preset=newton-projected", "time.duration=0.2")
-        assert not played.words and played.last.elastic < 0.01 * played.frames[0].elastic
-
-
-def test_verlet_keeps_the_energy_of_what_swings():
-    played = play("beam", *OTHERS["verlet"])
-    energies = np.array([played.energy(frame) for frame in played.frames])
-    assert np.abs(energies - energies[0]).max() < 0.01 * max(frame.elastic for frame in played.frames)
-
-
-def test_verlet_halves_its_substeps_where_cells_fold_over_each_other():
-    """A spring that is nearly of no length turns about within a substep: the limit of stability, which is that of small
-    swings, does not know of it."""
-    played = play("stretched", *OTHERS["verlet"])
-    energies = np.array([played.energy(frame) for frame in played.frames])
-    assert not played.words and np.ptp(energies) < 0.05 * energies[0] and energies.max() < 1.02 * energies[0]
-    assert played.frames[5].iterations > 1.5 * played.frames[1].iterations  # as many as needed there, not everywhere
 
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):

@@ -7,10 +7,7 @@ import pytest
 from block_scene import block_scene, play
 
 from msmpetsc.cli.main import main
-from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.presets import PRESETS
 
 SIDES = np.array([0.25, 0.25, 1.0])  # [m]: 2 x 2 x 8 cells, which swing in about 2.5 s
 HELD = {"pin": [{"region": {"box": [[-9, -9, -9], [9, 9, 0.01]]}}]}
@@ -104,9 +101,3 @@ def test_ranks_come_to_rest_together(tmp_path: Path, msmpetsc):
     assert done.returncode == 0, done.stderr
     with Result(path) as result:
         assert len(result.frames.time) == len(frames)
-
-
-def test_states_do_not_wait_for_rest(tmp_path: Path):
-    time = {"step": 1.0, "duration": 1.0, "integrator": "static", "until": "rest"}
-    with pytest.raises(InputError, match="each state is at rest"):
-        load_scene(beam(tmp_path, time, **HELD), (), PRESETS)

@@ -1,9 +1,8 @@
-"""scripts/setup with stand-ins for Python and apt, what `scripts/test` leaves out, and what scripts/bare refuses."""
+"""scripts/setup with stand-ins for Python and apt."""
 
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -63,25 +62,3 @@ def test_what_pip_says_is_shown_where_it_fails_and_the_next_start_tries_again(cl
     assert done.returncode == 1 and "Collecting packages\na warning\n" in done.stderr
     assert "this failed: .venv/bin/python -m pip install" in done.stderr
     assert set_up(clone).stdout == "setting up .venv\n"
-
-
-@pytest.mark.parametrize(
-    ("words", "run"),
-    [((), "1"), (("-x",), "1"), (("-m", "slow"), "2"), (("tests/test_a.py",), "12"), (("-k", "2"), "2")],
-)
-def test_slow_tests_are_run_where_they_are_chosen(tmp_path: Path, words: tuple, run: str):
-    (tmp_path / "tests").mkdir()
-    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path / "tests")
-    (tmp_path / "tests" / "helpers").symlink_to(ROOT / "tests" / "helpers")
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    quick, slow = "def test_1():\n    pass\n", "@pytest.mark.slow\ndef test_2():\n    pass\n"
-    (tmp_path / "tests" / "test_a.py").write_text(f"import pytest\n\n\n{quick}\n\n{slow}")
-    command = [sys.executable, "-m", "pytest", "-vv", *words]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert [n for n in "12" if f"test_{n} PASSED" in done.stdout] == list(run), done.stdout
-
-
-@pytest.mark.parametrize("words", [(), ("trixie",), ("--meshes", "/nowhere", "trixie", "x"), ("trixie", ROOT / "x")])
-def test_a_bare_system_needs_its_words(words: tuple):
-    done = subprocess.run([ROOT / "scripts" / "bare", *words], capture_output=True, text=True, timeout=30)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "scripts/bare: " in done.stderr

@@ -12,7 +12,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.errors import petsc_errors
+from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 
@@ -41,16 +41,6 @@ def test_free_fall_is_the_schemes_own(preset: str):
     fallen = swing(preset, 5, lattice)[-1].position - lattice.nodes
     tolerance = {"paper": 1e-8}.get(preset, 1e-12)
     np.testing.assert_allclose(fallen, np.tile(GRAVITY * T**2 * 15, (len(fallen), 1)), atol=tolerance)
-
-
-def test_a_lattice_at_rest_stays_at_rest():
-    lattice = beam()
-    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
-    q = lattice.nodes.copy()
-    for _ in range(3):
-        q = stepper.step(StepProblem(q, q, np.zeros((lattice.owned, 3)))).position
-    stepper.destroy()
-    np.testing.assert_allclose(q, lattice.nodes, atol=1e-14)
 
 
 def test_newton_solves_the_step_to_rounding(reference: list):
@@ -116,21 +106,6 @@ def test_a_budget_is_kept_and_the_error_reported():
     assert all(result.cost.iterations <= 4 for result in results) and results[-1].cost.step_error > 1e-12
 
 
-def test_a_budget_may_be_more_than_a_preset_allows_itself(petsc_options):
-    """A -snes_max_it of the user's stays what it is."""
-
-    def most(budget: int) -> int:
-        stepper = Stepper(COMM, beam(), T, find_preset("anderson"), max_iterations=budget)
-        found = stepper.snes.getTolerances()[3]
-        stepper.destroy()
-        return found
-
-    allowed = int(PRESETS["anderson"].options["snes_max_it"])
-    assert [most(budget) for budget in (1, allowed + 7)] == [allowed, allowed + 7]
-    petsc_options(snes_max_it="3")
-    assert most(allowed + 7) == 3
-
-
 def test_cg_and_cholesky_give_the_same_step(petsc_options):
     direct = swing("fast-msm", 4, error=1e-10)[-1].position
     petsc_options(ksp_type="cg", pc_type="icc", ksp_rtol="1e-12")
@@ -148,20 +123,6 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
 def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: dict[str, str]):
     petsc_options(**options)
     assert all(result.cost.step_error <= 1e-3 for result in swing(preset, 2, error=1e-3))
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"snes_type": "shell"}, "PETSc cannot take a step with these options: .*SNESShellSetSolve"),
-        ({"snes_type": "python", "snes_python_type": "gone.Gone"}, "PETSc refuses its options: No module named 'gone'"),
-    ],
-)
-def test_options_that_cannot_be_are_one_line(petsc_options, options: dict[str, str], said: str):
-    petsc_options(**options)
-    with pytest.raises(InputError, match=said) as refused:
-        swing("newton", 1)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_a_fault_of_ours_within_petsc_is_no_bad_option():
@@ -185,16 +146,6 @@ def test_a_preset_leaves_no_options_behind():
     for preset in PRESETS:
         swing(preset, 1)
     assert PETSc.Options().getAll() == before
-
-
-def test_pinned_nodes_do_not_move_and_are_no_unknowns(reference: list):
-    lattice = beam()
-    assert lattice.pinned.sum() == 9
-    for result in reference:
-        np.testing.assert_array_equal(result.position[lattice.pinned], lattice.nodes[lattice.pinned])
-    stepper = Stepper(COMM, lattice, T, find_preset("newton"))
-    assert stepper.jacobian.matrix.getSize()[0] == lattice.owned - 9
-    stepper.destroy()
 
 
 def test_A_is_M_plus_t2_L():

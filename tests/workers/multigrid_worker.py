@@ -1,9 +1,7 @@
-"""Multigrid on as many ranks as mpiexec gives, against that of one: multigrid_worker.py hierarchy | counts."""
-
-import sys
+"""Multigrid on as many ranks as mpiexec gives, against that of one."""
 
 import numpy as np
-from hierarchies import COMM, LATTICES, SHAPES, block, build, figure, hierarchy
+from hierarchies import COMM, LATTICES, SHAPES, build, hierarchy
 from mpi4py import MPI
 
 WORLD = MPI.COMM_WORLD
@@ -35,18 +33,6 @@ def compare_hierarchies() -> None:
             np.testing.assert_allclose(several, one, rtol=0, atol=accuracy * np.abs(one).max(), err_msg=name)
 
 
-def compare_counts() -> None:
-    """On three levels, to three digits: within one."""
-    for cells, pins in ((block(20, 4, 4), True), (block(9, 9, 9), False), (block(20, 20, 1), True), (figure(), False)):
-        for step in (1e-3, 1 / 60, 1.0):
-            found = []
-            for comm in (WORLD, COMM):
-                with hierarchy(comm, build(comm, cells, pins=pins), SHAPES["turned"], step, coarsest=60) as case:
-                    assert len(case.multigrid.levels) > 1
-                    found.append([case.iterations(1e-3, rough) for rough in (False, True)])
-            assert np.abs(np.subtract(*found)).max() <= 1, (step, found)
-
-
 if __name__ == "__main__":
-    {"hierarchy": compare_hierarchies, "counts": compare_counts}[sys.argv[1]]()
+    compare_hierarchies()
     print("same", flush=True)

@@ -2,13 +2,12 @@
 
 from mpi4py import MPI
 
-from msmpetsc.build import Model
 from msmpetsc.environment import Environment
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet
 
@@ -17,20 +16,13 @@ INTEGRATORS: Integrators = {"implicit-euler": ImplicitEuler, "bdf2": Bdf2, "verl
 
 
 def make_integrator(
-    comm: MPI.Comm,
-    model: Model,
-    environment: Environment,
-    time: Time,
-    solver: Solver,
-    *,
-    probes: Probes = Probes(),
-    prefix: str = "",
+    comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, probes: Probes = Probes(), prefix: str = ""
 ) -> Integrator:
-    """Integrator of a model as a scene's tables ``time`` and ``solver`` have it (collective).
+    """Return the integrator that a scene's tables ``time`` and ``solver`` ask for (collective).
 
     probes : what is to be measured of its steps
     prefix : of its PETSc options
 
     Raises InputError for PETSc options that do not go together, and for probes that it has nothing for.
     """
-    return INTEGRATORS[time.integrator](comm, model, environment, time, solver, probes, prefix)
+    return INTEGRATORS[time.integrator](comm, environment, time, solver, probes, prefix)

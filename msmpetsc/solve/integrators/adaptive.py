@@ -1,10 +1,17 @@
 """Steps as long as the motion allows: an integrator of steps of many lengths, powers of two apart.
 
-What a step adds to the error of the trajectory is its local error (local_error), and of nodes that bounce off in it,
-which do so at its end and not when they touch, a step times the velocity that they changed by, as the mean by mass:
-they push the rest of the body late. A penalty whose push on a node changes in a step may have done so early or late in
-it: that is counted just so, as a step times the change over the mass times a step. step_control adds all up and chooses
-the next step.
+What a step adds to the error of the trajectory is its local error: from positions q and velocities v at its two ends,
+
+    implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
+    BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
+
+Waves as short as a cell have the most of it and move next to nothing: an impact's would have each step resolve them,
+and so keep them, where longer steps damp them. So local errors are means over neighbours, taken a few times.
+
+Of nodes that bounce off in a step, which do so at its end and not when they touch, a step times the velocity that they
+changed by is added, as the mean by mass: they push the rest of the body late. A penalty whose push on a node changes in
+a step may have done so early or late in it: that is counted just so, as a step times the change over the mass times a
+step. step_control adds all up and chooses the next step.
 
 Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
 that BDF2 needs where the length changes. All methods are collective.
@@ -12,30 +19,69 @@ that BDF2 needs where the length changes. All methods are collective.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
-from msmpetsc.checkpoint import MOST_COUNT, Checkpoint, Range
+from msmpetsc.backend.arrays import Positions, Rows, like, to_host
+from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.integrators.local_error import METHODS, NeighbourMean
-from msmpetsc.solve.integrators.protocol import Integrator
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
+from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
 LOWEST, HIGHEST = -10, 6  # levels where the scene says nothing
 KEPT = 4  # integrators of as many lengths, those used last
 JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it yet
+SWEEPS = 4
+
+
+def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
+    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
+    return 0.5 * time_step * (w - v)
+
+
+def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
+    """The same of BDF2."""
+    return 1.6 * (x - q - 0.5 * time_step * (v + w))
+
+
+METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
+
+
+class NeighbourMean:
+    """Means over a node and all that springs join it to, ``SWEEPS`` times. All methods are collective."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice):
+        self.owned, self.field = lattice.owned, Ghosted(comm, lattice)
+        ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
+        rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
+        own = rows < lattice.owned  # all springs at them are known here
+        shape = lattice.owned, len(nodes)
+        joined = csr_array((np.ones(own.sum()), (rows[own], columns[own])), shape=shape)
+        self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
+
+    def __call__(self, vectors: Rows) -> Rows:
+        """Of (owned, 3)."""
+        for _ in range(SWEEPS):
+            self.field.values[: self.owned] = vectors
+            self.field.update()
+            vectors = like(vectors, self.weights @ to_host(self.field.values))
+        return vectors
+
+    def destroy(self) -> None:
+        self.field.destroy()
 
 
 def refuse_bad_steps(time: Time) -> None:
@@ -57,9 +103,7 @@ def levels_of(time: Time) -> tuple[int, int]:
     return max(lowest, -40), min(highest, 40)
 
 
-def between(
-    q_0: np.ndarray, v_0: np.ndarray, q_1: np.ndarray, v_1: np.ndarray, time_step: float, s: float
-) -> tuple[np.ndarray, np.ndarray]:
+def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
     """Positions and velocities at a share s of a step, by the cubic through those at its ends; s may lie outside."""
     t, r = time_step, 1 - s
     q = r * r * (1 + 2 * s) * q_0 + s * r * r * t * v_0 + s * s * (3 - 2 * s) * q_1 - s * s * r * t * v_1
@@ -67,27 +111,8 @@ def between(
     return q, v
 
 
-@dataclass
-class Taken:
-    """Steps taken so far.
-
-    steps, again      : that stand, and that were taken again shorter
-    shortest, longest : levels
-    """
-
-    steps: int = 0
-    again: int = 0
-    shortest: int = 99
-    longest: int = -99
-
-    def add(self, level: int) -> None:
-        """Count one that stands."""
-        self.steps += 1
-        self.shortest, self.longest = min(self.shortest, level), max(self.longest, level)
-
-
-class Adaptive:
-    """Takes the scene's steps (an Integrator) in steps of its own, shorter or longer ones.
+class Adaptive(Integrator):
+    """Takes the scene's steps in steps of its own, shorter or longer ones.
 
     States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time: the end of a step
     longer than the scene's. Their history is where the last step began.
@@ -100,31 +125,23 @@ class Adaptive:
 
     looks_back = True
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        environment: Environment,
-        scene: Scene,
-        make: Callable[[Time, Solver], Integrator],
-        balance: EnergyBalance,
-    ):
+    def __init__(self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance):
         refuse_bad_steps(scene.time)
         assert scene.time.error is not None
-        self.comm, self.lattice, self.environment, self.balance = comm, lattice, environment, balance
+        self.balance, self.comm = balance, balance.comm
+        self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
         self.order, self.local_error = METHODS[scene.time.integrator]
         self.levels, steps = levels_of(scene.time), scene.time.steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
-        self.ticks = Ticks(self.time_step, steps, self.levels[0], environment.events())
-        self.mean = NeighbourMean(comm, lattice)
+        self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
+        self.mean = NeighbourMean(self.comm, self.lattice)
         self.kept: dict[int, Integrator] = {}  # by level, that used last at the end
-        self.tick, self.last, self.taken = 0, 0, Taken()
-        self.mass = comm.allreduce(float(lattice.mass.sum()))
+        self.tick = self.last = 0
+        self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
 
     @property
     def unknowns(self) -> int:
-        """Free nodes of this rank."""
         return self._integrator_last().unknowns
 
     def set_up(self) -> None:
@@ -139,7 +156,7 @@ class Adaptive:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.kept[level] = self.make(time, self.solver)
             self.kept[level].set_up()
-            if self.taken.steps:
+            if self.tick:
                 self.kept[level].forget()  # as one that was kept and not used last
         elif level != next(reversed(self.kept)):
             self.kept[level] = self.kept.pop(level)
@@ -176,14 +193,15 @@ class Adaptive:
         return replace(total, position=q, previous=q - self.time_step * v)
 
     def _step(self, state: State) -> tuple[StepResult, State]:
-        """The next step that stands; those that do not are taken again, shorter. Raises StepFailed."""
+        """The next step that stands; others are taken again, shorter. Raises StepFailed."""
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:
             level = self._next_level(state)
-            before = self._begun(state, level, restarts)
+            before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
             try:
-                result, after, measure = self._try(before, level)
+                result, after = self.balance.step(self._integrator(level), before, end, self._length(level))
+                measure = self._measure(before, result, after, level)
                 stands = self.control.accepts(level, measure)
             except StepFailed:
                 stands = False
@@ -195,40 +213,29 @@ class Adaptive:
                 self.control.pay(level, measure)
                 result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
                 return self._taken(result, before, after, level)
-            self.taken.again += 1
 
     def _next_level(self, state: State) -> int:
-        """Of the step to be tried: no more than twice as long as the last, whose history it needs."""
+        """Of the next step: no more than twice as long as the last, whose history it needs."""
         most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
         return self.ticks.fitting(self.tick, most)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
-        """The state for a step of a level, with the history that it looks back to."""
         length, v = self._length(level), state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
             history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
         return replace(state, q_previous=state.q - length * v, history=history)
 
-    def _end(self, level: int) -> float:
-        """Time at which a step ends [s]."""
-        return self._reached(self.tick + self.ticks.length(level))
-
     def _reached(self, tick: int) -> float:
         """Time of a step that ends at a tick [s]: just before what begins or ends there."""
         return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
 
-    def _try(self, before: State, level: int) -> tuple[StepResult, State, Measure]:
-        """A step of a level, and what it shows."""
-        result, after = self.balance.step(self._integrator(level), before, self._end(level), self._length(level))
-        return result, after, self._measure(before, result, after, level)
-
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
-        """Of all ranks' nodes."""
         owned, t = slice(self.lattice.owned), self._length(level)
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
-        free = mass * ~self.environment.fixed_at(self._end(level))[owned]
+        end = self._reached(self.tick + self.ticks.length(level))
+        free = mass * ~self.environment.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
         local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
@@ -238,32 +245,23 @@ class Adaptive:
         late = t * (free @ np.sqrt((struck**2).sum(axis=1)))
         if self.environment.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)
-            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, self._end(level), t))
+            late += t**2 * ((free > 0) @ self.environment.change_of_push(*ends, end, t))
         sums += [mass @ (coming**2).sum(axis=1), late]
         error, motion, coming, late = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
         return Measure(math.sqrt(error) + late, math.sqrt(max(motion, 0.0 if self.control.motion else coming)))
 
     def _taken(self, result: StepResult, before: State, after: State, level: int) -> tuple[StepResult, State]:
-        """A step that stands, as the scene's step has it."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level
-        self.taken.add(level)
         history = after.history or (before.q, before.velocity(t))
         previous = result.position - T / t * (result.position - result.previous)
         result = replace(result, previous=previous)
         return result, replace(after, q_previous=after.q - T * after.velocity(t), history=history)
 
-    def follow(self) -> None:
-        """Refused before."""
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
-        """Unknown (NaN): a frame is no single step."""
-        return np.full(2, np.nan), None
-
     @property
     def state(self) -> dict[str, Range]:
-        return {"tick": (0, self.ticks.ticks), "last": self.levels, "taken": (-99, MOST_COUNT)}
+        return {"tick": (0, self.ticks.ticks), "last": self.levels}
 
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
@@ -286,14 +284,8 @@ class Adaptive:
         self._integrator_last().refuse_unused_options(at_end, awaited)
 
     def sum_up(self) -> None:
-        """Say at the end of a run what steps were taken, and how far off the motion may be."""
-        taken, control = self.taken, self.control
-        if taken.steps:
-            shortest, longest = self._length(taken.shortest), self._length(taken.longest)
-            log.info(
-                "%d steps of %.3g to %.3g s, %d taken again; the motion is some %.2g of its size off (time.error = %g)",
-                taken.steps, shortest, longest, taken.again, control.estimate, control.asked,
-            )  # fmt: skip
+        """Say at the end of a run how far off the motion may be."""
+        log.info("the motion is some %.2g of its size off (time.error = %g)", self.control.estimate, self.control.asked)
 
     def destroy(self) -> None:
         self.mean.destroy()

@@ -1,8 +1,11 @@
 """Contact faces of an implicit step: by which face each node is pushed out of an obstacle."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Indices, Mask, Positions
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -11,6 +14,7 @@ from msmpetsc.solve.petsc.events import CONTACT
 MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 
 
+@dataclass
 class ContactFaces:
     """Search for the faces of one step, from q to its end. All methods are collective.
 
@@ -18,34 +22,27 @@ class ContactFaces:
     again; from then on a node that has a face keeps it, so that this ends.
 
     q, y       : (l, 3) [m], as a StepProblem has them
-    time       : of the step's end [s]
-    before     : (o, l) faces when it began (environment); None: the nearest
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back
-    fixed      : (l,) bool, nodes that are no unknowns
     sides      : (o, l) faces of the problem to solve; once settled, those of the step
     is_settled : the problem solved last was the right one
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        environment: Environment,
-        q: np.ndarray,
-        y: np.ndarray,
-        *,
-        time: float,
-        time_step: float,
-        before: np.ndarray | None,
-        fixed: np.ndarray,
-        q_before: np.ndarray | None = None,
-    ):
-        self.comm, self.environment, self.q, self.y = comm, environment, q, y
-        self.time, self.time_step, self.before, self.fixed = time, time_step, before, fixed
-        self.q_before = q_before
-        self.solves, self.is_settled = 0, False
-        self.sides = self._crossed(y)
+    comm: MPI.Comm
+    environment: Environment
+    q: Positions
+    y: Positions
+    time: float  # of the step's end [s]
+    time_step: float
+    before: Indices | None  # (o, l) faces when it began (environment); None: the nearest
+    fixed: Mask  # (l,) bool, nodes that are no unknowns
+    q_before: Positions | None = None
 
-    def _crossed(self, end: np.ndarray) -> np.ndarray:
+    def __post_init__(self) -> None:
+        self.solves = 0
+        self.is_settled = False
+        self.sides = self._crossed(self.y)
+
+    def _crossed(self, end: Positions) -> Indices:
         """Sides (o, l) of nodes that go straight from q to ``end`` (l, 3) [m]."""
         with CONTACT:
             return self.environment.contact_faces(self.q, end, self.time, self.time_step, self.before, self.fixed)
@@ -56,7 +53,7 @@ class ContactFaces:
         contact = environment.contact(self.q, self.y, time, self.time_step, self.sides, self.q_before)
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
-    def compare(self, x: np.ndarray) -> None:
+    def compare(self, x: Positions) -> None:
         """Know the faces anew from the solution x (l, 3) [m]. Raises StepFailed where they do not settle."""
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
@@ -75,7 +72,7 @@ class ContactFaces:
             crossed[pressing] = np.where(sides > 0, sides, self.sides)[pressing]
         self.sides = crossed
 
-    def _differs(self, x: np.ndarray, sides: np.ndarray) -> bool:
+    def _differs(self, x: Positions, sides: Indices) -> bool:
         """Whether penalties press on any node at x otherwise with ``sides``."""
         if not (self.environment.has_sides and self.environment.penalties):
             return False

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.build import Model
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.environment import Environment
@@ -25,17 +25,18 @@ from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes, Trace
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.reference import PREFIX, Reference
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.options import refuse_unused
 from msmpetsc.solve.presets import find_preset
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 
-class ImplicitEuler:
-    """Implicit Euler's method (an Integrator); another solver takes over where an anchor lets go.
+class ImplicitEuler(Integrator):
+    """Implicit Euler's method; another solver takes over where an anchor lets go.
 
         v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1)
 
@@ -44,23 +45,14 @@ class ImplicitEuler:
 
     SHARE = 1.0  # tau / t
     STATIC = False  # M is no part of F
-    looks_back = False
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        model: Model,
-        environment: Environment,
-        time: Time,
-        solver: Solver,
-        probes: Probes = Probes(),
-        prefix: str = "",
+        self, comm: MPI.Comm, environment: Environment, time: Time, solver: Solver, probes: Probes, prefix: str
     ):
-        self.comm, self.model, self.environment, self.prefix = comm, model, environment, prefix
+        self.comm, self.environment, self.solver, self.probes, self.prefix = comm, environment, solver, probes, prefix
         self.time_step = time.step
-        self.damping = model.damping
+        self.damping = environment.damping
         self.tau = self._first_tau()
-        self.solver, self.probes = solver, probes
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
         self.problem: StepProblem | None = None  # of the step taken last
@@ -101,24 +93,14 @@ class ImplicitEuler:
         return replace(result, work=work), State(after, before, sides=sides)
 
     def _solve(
-        self, state: State, y: np.ndarray, time: float, time_step: float, q_before: np.ndarray | None = None
-    ) -> tuple[StepResult, np.ndarray]:
+        self, state: State, y: Positions, time: float, time_step: float, q_before: Positions | None = None
+    ) -> tuple[StepResult, Indices]:
         """The x that belongs to y, as it will be at ``time``, and the contact faces that it has.
 
         q_before : (l, 3) [m] one step before the state, of a step that looks so far back
         """
         fixed = self.stepper.lattice.pinned
-        faces = ContactFaces(
-            self.comm,
-            self.environment,
-            state.q,
-            y,
-            time=time,
-            time_step=time_step,
-            before=state.sides,
-            fixed=fixed,
-            q_before=q_before,
-        )
+        faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
         begun = self.stepper.work_so_far()
         while not faces.is_settled:
             self.problem = faces.problem()
@@ -131,7 +113,7 @@ class ImplicitEuler:
         self.trace = Trace()
         self.trace.follow(self.stepper)
 
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
+    def true_errors(self, index: int, result: StepResult) -> tuple[Floats, dict | None]:
         if self.reference is None:
             lattice = self.stepper.lattice
             self.reference = Reference(
@@ -148,7 +130,7 @@ class ImplicitEuler:
         solver = self.solver
         return Stepper(
             self.comm,
-            self.model.lattice.pin(self.environment.fixed_at(time)),
+            self.environment.lattice.pin(self.environment.fixed_at(time)),
             self.damped_tau,
             find_preset(solver.preset),
             solver.error,
@@ -235,7 +217,7 @@ class Bdf2(ImplicitEuler):
             q, v = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
         return result, State(result.position, before, (q, v), sides)
 
-    def _history(self, state: State, time: float) -> tuple[tuple[np.ndarray, np.ndarray], Work]:
+    def _history(self, state: State, time: float) -> tuple[tuple[Positions, Rows], Work]:
         """History that would have led to q and v with the acceleration of an implicit Euler step of tau from there,
         which is the true one but for a part of first order; the work that this takes."""
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)

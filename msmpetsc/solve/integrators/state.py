@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Indices, Positions, Rows
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosted import with_ghosts
@@ -14,20 +15,13 @@ HISTORY, SIDES = ("history_q", "history_v"), "sides"
 
 @dataclass(frozen=True)
 class Ledger:
-    """Energies that a run keeps account of [J].
+    """Energies that a run keeps account of [J]."""
 
-    put_in  : the most that the body had by right
-    gained  : from nowhere, and not lost since; negative where a swing may give back
-    steady  : the same without a known swing
-    since_frame : gained since the frame stored before
-    bounced : what nodes gained that bounced off its end
-    """
-
-    put_in: float = 0.0
-    gained: float = 0.0
-    steady: float = 0.0
-    since_frame: float = 0.0
-    bounced: float = 0.0
+    put_in: float = 0.0  # the most that the body had by right
+    gained: float = 0.0  # from nowhere, and not lost since; negative where a swing may give back
+    steady: float = 0.0  # the same without a known swing
+    since_frame: float = 0.0  # gained since the frame stored before
+    bounced: float = 0.0  # what nodes gained that bounced off its end
 
     @property
     def share(self) -> float:
@@ -44,17 +38,16 @@ class State:
     not what the frame shows, which is the step as it was solved.
 
     history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
-    ledger  : of energy, as the steps so far have filled it
     sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest
     """
 
-    q: np.ndarray
-    q_previous: np.ndarray
-    history: tuple[np.ndarray, np.ndarray] | None = None
-    sides: np.ndarray | None = None
-    ledger: Ledger = NO_ENERGY
+    q: Positions
+    q_previous: Positions
+    history: tuple[Positions, Rows] | None = None
+    sides: Indices | None = None
+    ledger: Ledger = NO_ENERGY  # of energy, as the steps so far have filled it
 
-    def velocity(self, time_step: float) -> np.ndarray:
+    def velocity(self, time_step: float) -> Rows:
         """(l, 3) [m/s]"""
         return (self.q - self.q_previous) / time_step
 
@@ -87,7 +80,7 @@ class State:
         return State(q, q_previous, history, sides, Ledger(**numbers))
 
 
-def _sides(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
+def _sides(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Indices:
     """(o, l) from the owned ones (owned, o), three at a time (collective)."""
     count = rows.shape[1]
     sides = np.zeros((count, len(lattice.nodes)), np.int8, like=lattice.nodes)

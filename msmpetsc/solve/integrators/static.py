@@ -8,25 +8,34 @@ that of a step, its F
 M only weighs errors. tau scales F, so that M^(-1) tau^2 (Hessian of E) has no eigenvalue below about 1 where the body
 is at rest: as a step's Hessian has none for its M, from which bounds on errors follow.
 
-Where the whole load cannot be brought on at once it comes on in load steps (solve.integrators.load_steps).
+Where the whole load cannot be brought on at once it comes on in load steps. A share s of it, 0 to 1, is the
+equilibrium under  f_ext + (1 - s) r,  r = grad E(x_0) - f_ext  what keeps the state before, x_0, where it is; obstacles
+press as they will, and anchors have gone a share s of their way. So it does not matter what has changed: a force, an
+anchor that lets go, an obstacle. Without inertia, what nothing holds has no equilibrium, and is refused.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.comm import log
-from msmpetsc.errors import StepFailed
+from msmpetsc.elasticity.locate import of_body, worst_inverted
+from msmpetsc.environment import Environment
+from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
-from msmpetsc.solve.integrators.load_steps import LoadPath, LoadSteps
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.integrators.support import refuse_free_bodies
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
+from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.work import Work
 
@@ -34,10 +43,118 @@ SLENDER = 10.0  # times as slow as sound passes the body: where tau is looked fo
 LOWEST = 10.0  # eigenvalue of M^(-1) tau^2 (Hessian of E) at rest
 WILL_DO = 1.0, 1e3  # eigenvalues for which no other tau is taken, for that takes another solver
 SOON = 30  # iterations of a load step that may still be halved
+SMALLEST = 2.0**-10  # of the load: the smallest load step
+MOST_FAILURES = 50  # of the load steps of one state
+SMALL = 2.0**-4  # of the load: a step no larger is not refused for what a smaller one may avoid
+
+
+class LoadSteps:
+    """Shares of a load that are tried one after another.
+
+    reached : share of the equilibrium found last
+    count   : load steps that were taken
+    """
+
+    def __init__(self) -> None:
+        self.reached, self.size, self.count, self.failures = 0.0, 1.0, 0, 0
+
+    @property
+    def share(self) -> float:
+        """The share to try next."""
+        return min(self.reached + self.size, 1.0)
+
+    @property
+    def may_be_refused(self) -> bool:
+        """Whether the next step is so large that smaller ones may well end better."""
+        return self.size > SMALL
+
+    def take(self) -> None:
+        """Know that the share has its equilibrium: the next step is twice as large."""
+        self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
+
+    def halve(self, failure: StepFailed) -> None:
+        """Know that the share failed. Raises StepFailed where it was of the smallest, or one of very many."""
+        self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
+        if self.size < SMALLEST or self.failures > MOST_FAILURES:
+            raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None
+
+
+@dataclass
+class LoadPath:
+    """Equilibria between a state and the next one. All methods are collective.
+
+    problem    : of the share taken last
+    sides      : (o, l) contact faces that it has
+    """
+
+    comm: MPI.Comm
+    stepper: Stepper
+    environment: Environment
+    state: State
+    time: float
+    time_step: float
+
+    def __post_init__(self) -> None:
+        self.base = self.state.q
+        self.target = self.environment.prescribed(self.base, self.time)
+        self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
+        self.sides = self.state.sides
+        self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
+        self.holding: Rows | None = None  # r (owned, 3) [N], once it is asked for
+        self.problem: StepProblem | None = None
+
+    def try_share(self, steps: LoadSteps) -> StepResult:
+        """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one with cells turned
+        inside out, which smaller steps may avoid."""
+        share, q = steps.share, self.known[-1][1]
+        fixed, time_step = self.stepper.lattice.pinned, self.time_step
+        if len(self.known) > 1:  # obstacles move in the first load step alone
+            time_step = 0.0
+        faces = ContactFaces(self.comm, self.environment, q, q, self.time, time_step, self.sides, fixed)
+        while not faces.is_settled:
+            problem = self._problem(faces.problem(), share)
+            result = self.stepper.step(problem, self._guess(problem, share))
+            faces.compare(result.position)
+        count, where = worst_inverted(self.comm, self.stepper.lattice, result.position)
+        if steps.may_be_refused and count > self.inverted:
+            raise StepFailed(f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted")
+        self.known = [self.known[-1], (share, result.position)]
+        self.problem, self.sides = problem, faces.sides
+        return result
+
+    def _problem(self, whole: StepProblem, share: float) -> StepProblem:
+        load, prescribed = whole.load, self.target
+        if share < 1:
+            if self.holding is None:
+                self.holding = self._holding(whole)
+            load = load + (1 - share) * self.holding
+            prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
+        return replace(whole, y=self.base, load=load, prescribed=prescribed)
+
+    def _holding(self, whole: StepProblem) -> Rows:
+        """The force (owned, 3) [N] that would keep the free nodes where they are."""
+        stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
+        functional.begin(replace(whole, y=self.base, prescribed=None))
+        stepper.unknowns.from_nodes(self.base, stepper.x)
+        f = functional.evaluate(stepper.x, stepper.work).f
+        holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
+        holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
+        return holding
+
+    def _guess(self, problem: StepProblem, share: float) -> Positions:
+        """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""
+        (share_before, before), (reached, q) = self.known[0], self.known[-1]
+        if reached == share_before:
+            return q
+        pinned, functional = self.stepper.lattice.pinned[:, None], self.stepper.functional
+        ahead = q + (share - reached) / (reached - share_before) * (q - before)
+        functional.begin(problem)
+        values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]
+        return ahead if values[1] < values[0] else q
 
 
 class Static(ImplicitEuler):
-    """States of equilibrium (an Integrator): that at ``time``, from the one a step before.
+    """States of equilibrium at the times of steps: that at ``time``, from the one a step before.
 
     Forces, anchors and obstacles are taken as they are then.
 
@@ -46,13 +163,11 @@ class Static(ImplicitEuler):
     """
 
     STATIC = True
-
-    def __init__(self, *arguments, **settings):
-        self.error = self.made_for = 0.0
-        super().__init__(*arguments, **settings)
+    state: ClassVar[dict[str, Range]] = {"error": ANY}
+    error = made_for = 0.0
 
     def _first_tau(self) -> float:
-        return SLENDER * transit_time(self.comm, self.model.lattice)
+        return SLENDER * transit_time(self.comm, self.environment.lattice)
 
     def _new_stepper(self, time: float) -> Stepper:
         self.made_for = time
@@ -60,20 +175,16 @@ class Static(ImplicitEuler):
 
     def set_up(self) -> None:
         """Make ready, and settle tau. Raises InputError for a body that is not held."""
-        refuse_free_bodies(self.comm, self.stepper.unknowns)
+        refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
-        lowest = self._lowest()
+        minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
+        minimum.estimate.linearise(rest)
+        lowest = minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]  # of M^(-1) tau^2 (Hessian of E), roughly
         if lowest > 0 and not WILL_DO[0] <= lowest <= WILL_DO[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
             self.stepper.destroy()
             self.stepper = self._new_stepper(self.made_for)
             self.stepper.set_up()
-
-    def _lowest(self) -> float:
-        """The lowest eigenvalue of M^(-1) tau^2 (Hessian of E) of the body at rest, roughly (collective)."""
-        minimum, rest = self.stepper.minimum, self.stepper.lattice.nodes
-        minimum.estimate.linearise(rest)
-        return minimum.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)[0]
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
@@ -92,7 +203,7 @@ class Static(ImplicitEuler):
     def _follow(self, path: LoadPath, time: float) -> StepResult:
         """Bring all of the load on, with as few load steps as may be. Raises StepFailed."""
         steps = LoadSteps()
-        while not steps.is_done:
+        while steps.reached < 1.0:
             try:
                 with self._hurried(steps.may_be_refused):
                     result = path.try_share(steps)
@@ -102,10 +213,6 @@ class Static(ImplicitEuler):
         if steps.count > 1:
             log.info("t = %.6g s: the load came on in %d steps", time, steps.count)
         return result
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"error": ANY}
 
     def save(self, checkpoint: Checkpoint) -> None:
         super().save(checkpoint)
@@ -135,3 +242,27 @@ def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
     sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
     mass, stiffness = comm.allreduce(sums)
     return float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
+
+
+def refuse_free_bodies(unknowns: Unknowns) -> None:
+    """Raise InputError for a body, or a part of one that no spring joins with the rest, that nothing holds, and where
+    no more than two nodes are held (collective)."""
+    bodies, lattice = bodies_of(unknowns), unknowns.lattice
+    held = "held at a point or two, about which it turns"
+    if bodies.free.any():
+        held = "held by nothing"
+    elif lattice.table.total - unknowns.total > 2:
+        return
+    what = "the body"
+    if len(bodies.free) > 1:
+        number = int(np.argmax(bodies.free))
+        rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
+        own = to_host(lattice.nodes[: lattice.owned])[rows]
+        sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
+        first = unknowns.comm.allreduce(int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN)
+        place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
+        what = f"a part {of_body(lattice, first)}of {int(sums[3])} nodes about ({place}) m at rest"
+    raise InputError(
+        f'time.integrator = "static": {what} is {held}: it has no equilibrium without inertia; pin it or lead it by an '
+        "anchor (contact does not count), or choose another integrator"
+    )

@@ -65,7 +65,7 @@ class StepControl:
         return max(0.5 * self.asked * motion * part + SHARE * max(saved, 0.0), FAIR * fair)
 
     def accepts(self, level: int, measure: Measure) -> bool:
-        """Whether a step of a level stands as it was taken; else the level for another try is set."""
+        """Whether a step of a level stands as it is; else the level for another try is set."""
         allowed = self.allowed(level, measure)
         if level == self.lowest or measure.error <= EXCESS * allowed:
             return True

@@ -17,13 +17,13 @@ which is none for a quadratic E. A step that gains too much is taken again, in t
 
 import sys
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest, like
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.build import Model
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.friction import Movers
@@ -31,45 +31,43 @@ from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.integrators.stability_limit import HighestMode
+from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
-from msmpetsc.solve.options import refuse_unused
+from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
 
 SAFETY = 0.8  # of the limit where a step starts: the Hessian changes within it
 RETRIES = 4  # of a step
-GAIN = 2e-3  # of a body's kinetic and elastic energy, from nowhere in a step: worth half the substep
+GAIN = 2e-3  # of all energy, from nowhere in a step: worth half the substep
 CREDIT = 0.1  # of it, that springs may lose and gain again
 EASED = 1 / 32  # of that: twice the substep, which gains from 4 to 16 times as much, will do again
 HALVINGS = 5  # of substeps, for what they gain
 MOST_SUBSTEPS = 1e6  # of a step
 ROUNDING = 1e-14  # of the energy below, that a step may gain
+SETTLED = 1e-3  # relative change of omega^2 by which the power iteration ends
+MOST_ITERATIONS = 100  # of it
 TORN = 100.0  # of the energy that presses every spring to a point: no body lives through that
 
 
-class Verlet:
-    """Velocity Verlet's method (an Integrator). ``time.substep`` may only shorten its substeps."""
+class Verlet(Integrator):
+    """Velocity Verlet's method. ``time.substep`` may only shorten its substeps."""
 
-    looks_back = False
+    state: ClassVar[dict[str, Range]] = {
+        "substep": (sys.float_info.min, np.inf),
+        "halvings": (0, HALVINGS),
+        "gained": FINITE,
+    }
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        model: Model,
-        environment: Environment,
-        time: Time,
-        _: Solver,
-        probes: Probes = Probes(),
-        _prefix: str = "",
-    ):
+    def __init__(self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, probes: Probes, _prefix: str):
         if probes != Probes():
             raise InputError("the true error and the trace are of a step that is solved: verlet has none")
-        self.comm, self.lattice, self.environment = comm, model.lattice, environment
+        self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(comm, self.lattice)
         self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
@@ -80,42 +78,25 @@ class Verlet:
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
         self.elastic = self.gradient[:owned]  # grad E without what obstacles push
         self.sides = environment.no_sides[:, :owned]
-        self.damping = model.damping
+        self.damping = environment.damping
         self.work = 0.0  # [J] in a step, of obstacles on this rank's nodes, friction aside, and of loads that change
         self.springs_work = 0.0  # [J] in a step, that the springs of this rank's nodes took in
         self.gained = 0.0  # [J] by the springs since the start, from nowhere and not lost since; negative: a credit
         self.halvings = 0  # of substeps, for what they gained
         self.end = 0.0  # of the step [s]
-        self.known: np.ndarray | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
+        self.known: Floats | None = None  # positions (l, 3) that ``gradient`` and the highest frequency are of
         self.anchors: int | None = None  # how many hold
         self.fixed = environment.fixed_at(self.time_step)[:owned]
         self.free = np.flatnonzero(~self.fixed)
-        springs = slice(self.lattice.springs_owned)
-        crushed = 0.5 * self.lattice.stiffness[springs] @ self.lattice.rest_length[springs] ** 2
-        self.most = TORN * comm.allreduce(crushed)  # [J]
+        self.most = TORN * comm.allreduce(crushing_energy(self.lattice))  # [J]
 
     @property
     def unknowns(self) -> int:
-        """Free nodes of this rank: pinned ones and led ones aside."""
         return int((~self.environment.fixed_at(self.time_step)[: self.lattice.owned]).sum())
-
-    def set_up(self) -> None:
-        """There is no matrix to make ready."""
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user, which have no use here (collective)."""
         refuse_unused(self.comm, set(), at_end, awaited)
-
-    def follow(self) -> None:
-        """Do nothing: an explicit step has no iterates."""
-
-    def true_errors(self, index: int, result: StepResult) -> tuple[np.ndarray, dict | None]:
-        """Unknown (NaN): an explicit step solves nothing."""
-        return np.full(2, np.nan), None
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"substep": (sys.float_info.min, np.inf), "halvings": (0, HALVINGS), "gained": FINITE}
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)
@@ -142,9 +123,10 @@ class Verlet:
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
             begun = self._squared_acceleration(start)
-            with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told by its energy
+            with np.errstate(over="ignore", invalid="ignore"):  # its energy tells of what runs away
                 self._take(count, start, time)
-            energy, dt = self._energy(), self.time_step / count
+            energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
+            dt = self.time_step / count
             after = pushed + self._elastic_squared() if energy <= self.most else np.inf
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
@@ -159,23 +141,19 @@ class Verlet:
         )
 
     def _begin(self, state: State, start: float) -> None:
-        """q, v and grad E of a state."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._hold(start)
         self.work = self.springs_work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
-            self._meet(state, start)
+            before = state.sides
+            if before is not None:
+                before = before[:, : self.lattice.owned]
+            self.sides = self.environment.contact_faces(self.q, self.q, start, 0.0, before, self.fixed)
             self._pull(start)
             self.highest.squared = 0.0
 
-    def _meet(self, state: State, time: float) -> None:
-        """The sides of a state."""
-        before = None if state.sides is None else state.sides[:, : self.lattice.owned]
-        self.sides = self.environment.contact_faces(self.q, self.q, time, 0.0, before, self.fixed)
-
     def _take(self, count: int, start: float, time: float) -> None:
-        """All substeps of a step."""
         self.known = None
         times = np.linspace(start, time, 1 + count).tolist()
         duration = 0.5 * (times[1] - start)
@@ -191,7 +169,7 @@ class Verlet:
             duration = end - begin
         self._kick(time, 0.5 * duration, begin, time)
 
-    def _is_to_halve(self, start: np.ndarray, energy: float) -> bool:
+    def _is_to_halve(self, start: Rows, energy: float) -> bool:
         """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and its substeps are now
         halved; they are doubled again for the next one where it gained next to nothing (collective). Where obstacles
         push, what springs seem to gain may be theirs."""
@@ -223,7 +201,6 @@ class Verlet:
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
-        """grad E at q, with what obstacles push."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
         self.elastic = self.gradient[: self.lattice.owned]
@@ -268,8 +245,7 @@ class Verlet:
             self.q[anchored] = prescribed[anchored]
 
     def _strike(self, begin: float, end: float) -> None:
-        """Know the faces that nodes come into contact by. The velocity of one that bounces off is what then led
-        it there."""
+        """Know the faces of contact. The velocity of a node that bounces off is what then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)
@@ -319,14 +295,75 @@ class Verlet:
     def _elastic_squared(self) -> float:
         return self.highest.squared_at(self.position.values)
 
-    def _energy(self) -> float:
-        """E of the springs [J] (collective)."""
-        return self.comm.allreduce(self.elasticity.energy(self.position.values))
+    def destroy(self) -> None:
+        for field in (self.position, self.velocity, self.highest):
+            field.destroy()
+
+
+class HighestMode:
+    """The mode of the greatest eigenvalue omega^2 [1/s^2] of M^(-1) (Hessian of E), by power iterations that go on
+    from the mode found last. ``squared`` is that omega^2, 0 while it is not known."""
+
+    def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
+        self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
+        self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
+        self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
+
+    def hold(self, fixed: Mask) -> None:
+        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
+        ranks."""
+        self.fixed = fixed
+        numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
+        self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
+        self.mode.values[: self.lattice.owned][fixed] = 0
+        self._normalise()
+        self.squared = 0.0
+
+    def squared_at(self, q: Positions) -> float:
+        """omega^2 of the springs at q (l, 3) [m] (collective).
+
+        Without the negative curvature across pressed springs, which is no oscillation and has no bound.
+        """
+        x, owned = self.mode.values, self.lattice.owned
+        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
+        for _ in range(MOST_ITERATIONS):
+            before = self.squared
+            product[:] = 0
+            hessian.add_product(x, product)
+            np.multiply(product[:owned], self.per_mass[:, None], out=x[:owned])
+            x[:owned][self.fixed] = 0
+            self.squared = self._normalise()  # |M^(-1) H x|_M for |x|_M = 1
+            if not abs(self.squared - before) > SETTLED * self.squared:
+                break
+        return self.squared
+
+    def _normalise(self) -> float:
+        """Make |x|_M = 1; returns what it was (collective)."""
+        x = self.mode.values[: self.lattice.owned]
+        size = np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
+        if size > 0:
+            x /= size
+        self.mode.update()
+        return size
 
     def destroy(self) -> None:
         """Collective."""
-        for field in (self.position, self.velocity, self.highest):
-            field.destroy()
+        self.mode.destroy()
+
+
+def explicit_limit(comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity) -> float:
+    """2 / omega [s] at rest: explicit steps are stable below it (collective)."""
+    highest = HighestMode(comm, lattice, elasticity)
+    highest.hold(lattice.pinned[: lattice.owned])
+    squared = highest.squared_at(lattice.nodes)
+    highest.destroy()
+    return 2 / np.sqrt(squared) if squared > 0 else np.inf
+
+
+def crushing_energy(lattice: Lattice) -> float:
+    """Return the energy [J] that presses every spring of this rank to a point."""
+    springs = slice(lattice.springs_owned)
+    return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
 @kernel

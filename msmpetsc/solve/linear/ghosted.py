@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Rows, like
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
@@ -34,7 +34,7 @@ class Ghosted:
             owner.destroy()
 
 
-def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: np.ndarray) -> np.ndarray:
+def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Rows:
     """(l, 3) from the owned ones (owned, 3) (collective)."""
     field = Ghosted(comm, lattice)
     field.values[: lattice.owned] = like(field.values, rows)

@@ -6,14 +6,16 @@ The scalar matrix A acts on the m x 3 block that a vector of unknowns is: one pr
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.contact.surface.term import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
-from msmpetsc.solve.linear.explicit import asks_for_entries, explicit
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT, count_flops
+from msmpetsc.solve.petsc.library import view_entries
 from msmpetsc.solve.petsc.memory import Memory
+
+SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)  # in a line, without entries
 
 
 class Block:
@@ -25,7 +27,7 @@ class Block:
         self.destroy = self.mat.destroy
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> Floats:
         """x, then y, then z; to be read or written at once."""
         return self.memory.values(self.mat)
 
@@ -35,13 +37,13 @@ class ContactBlocks:
 
     def __init__(self, unknowns: Unknowns, time_step: float):
         self.t2, self.unknowns = time_step**2, unknowns
-        self.parts: list[tuple[np.ndarray, np.ndarray]] = []  # rows of unknowns, their blocks (k, 3, 3)
+        self.parts: list[tuple[Indices, Rows]] = []  # rows of unknowns, their blocks (k, 3, 3)
         row = np.full(unknowns.lattice.owned, -1)
         row[to_host(unknowns.free)] = np.arange(unknowns.size)
         self.row = like(unknowns.free, row)
 
-    def linearise(self, contact: Contact | None, q: np.ndarray, true: bool, secants: Secants | None = None) -> None:
-        """Take the blocks at positions q, ``true`` ones, but for ``secants``, or such as go with A."""
+    def linearise(self, contact: Contact | None, q: Positions, true: bool, secants: Secants | None = None) -> None:
+        """Take the blocks at q, ``true`` ones, but for ``secants``, or such as go with A."""
         self.parts = []
         with CONTACT:
             for nodes, blocks in contact.hessian(q, true, secants) if contact else ():
@@ -63,17 +65,9 @@ class ContactBlocks:
 class Viewable:
     """A MATPYTHON context that can be written to a file: an empty one would be all that PETSc could make of it."""
 
-    unknowns: Unknowns
-
     def view(self, operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-        if asks_for_entries(viewer):
-            matrix = explicit(operator, self.unknowns, self.coupled())
-            matrix.view(viewer)
-            matrix.destroy()
-
-    def coupled(self) -> np.ndarray | None:
-        """The free nodes (m,) bool that it couples with others than those that springs join them with; None of none."""
-        return None
+        if viewer.getType() != PETSc.Viewer.Type.ASCII or viewer.getFormat() not in SUMMARIES:
+            view_entries(operator, viewer)
 
 
 class ThreeColumns(Viewable):
@@ -114,7 +108,7 @@ class TrueHessian(Viewable):
         self.products = 0
 
     def linearise(
-        self, q: np.ndarray, contact: Contact | None, projected: bool = False, secants: Secants | None = None
+        self, q: Positions, contact: Contact | None, projected: bool = False, secants: Secants | None = None
     ) -> None:
         """Take the Hessian at positions q (l, 3); ``projected`` leaves out its negative parts (elasticity.springs),
         ``secants`` the true curvature of some friction (contact.obstacles.penalty)."""
@@ -124,9 +118,6 @@ class TrueHessian(Viewable):
             if self.contact:
                 self.contact.linearise(contact, q, True, secants)
             self.surface = contact.surface.hessian(q, projected) if contact and contact.surface else None
-
-    def coupled(self) -> np.ndarray | None:
-        return self.surface.blocks[self.unknowns.free].any(axis=1) if self.surface else None
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         assert self.elastic is not None, "the Hessian was not linearised"

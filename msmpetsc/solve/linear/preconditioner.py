@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like
+from msmpetsc.backend.arrays import Floats, Positions, like
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -20,20 +20,17 @@ class Preconditioner:
     preconditioned with.
 
     matrix  : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
-    columns : 3, or 1 for A (x) I_3
     contact : what is added to its diagonal, if anything
     """
 
-    def __init__(
-        self, matrix: PETSc.Mat, memory: Memory, columns: int, prefix: str, contact: "ContactDiagonal | None" = None
-    ):
-        self.matrix, self.memory, self.columns, self.contact = matrix, memory, columns, contact
+    def __init__(self, matrix: PETSc.Mat, memory: Memory, prefix: str, contact: "ContactDiagonal | None" = None):
+        self.matrix, self.memory, self.contact = matrix, memory, contact
         self.blocks: list[Block] = []
         self.pc = PETSc.PC().create(matrix.comm)
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         return self.contact is not None and self.contact.follow(contact, q)
 
@@ -44,7 +41,7 @@ class Preconditioner:
         self.pc.setUp()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        if self.columns == 1:
+        if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
             self.pc.apply(x, y)
             return
         right, solution = self.blocks = self.blocks or self._create_blocks()
@@ -68,7 +65,7 @@ class Preconditioner:
 
 
 class ContactDiagonal:
-    """Diagonal of the matrix that is preconditioned: that of A, and what bounds the blocks of contact.
+    """Diagonal of the matrix that is preconditioned: that of A, and a bound on contact's blocks.
 
     A + t^2 bound is no less than A plus the blocks, so that a direct solve with it is a step downhill too.
 
@@ -83,7 +80,7 @@ class ContactDiagonal:
         self.own = unknowns.memory.read(self.vector).copy()
         self.added = np.zeros_like(self.own)
 
-    def follow(self, contact: Contact | None, q: np.ndarray) -> bool:
+    def follow(self, contact: Contact | None, q: Positions) -> bool:
         """Add the bound of contact at positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         lattice = self.unknowns.lattice
         bound = self._columns(contact.bound(q) if contact else np.zeros(lattice.owned, like=q))
@@ -92,12 +89,11 @@ class ContactDiagonal:
             self._add(bound)
         return changed
 
-    def _columns(self, bound: np.ndarray) -> np.ndarray:
-        """(k,) of a bound of each owned node [N/m]."""
+    def _columns(self, bound: Floats) -> Floats:
         free = bound[self.unknowns.free]
         return np.tile(free, len(self.own) // max(len(free), 1))
 
-    def _add(self, bound: np.ndarray) -> None:
+    def _add(self, bound: Floats) -> None:
         self.added = bound
         self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
         self.matrix.setDiagonal(self.vector)

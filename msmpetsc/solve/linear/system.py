@@ -1,4 +1,4 @@
-"""The constant matrix A = M + t^2 L as a PETSc matrix (paper Eq. 15-17, without the Kronecker factor).
+"""The constant A = M + t^2 L as a PETSc matrix (paper Eq. 15-17, without the Kronecker factor).
 
 A is scalar, m x m over the free nodes; solve.linear.operators lets it act on three coordinates at once.
 """
@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Array, Floats, like, to_host
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.limits import refuse_nonzeros
@@ -49,7 +49,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, columns: int 
     return matrix
 
 
-def diagonal_of(unknowns: Unknowns, time_step: float) -> np.ndarray:
+def diagonal_of(unknowns: Unknowns, time_step: float) -> Floats:
     """Return the diagonal of A (m,), of this rank's free nodes [kg], where the lattice's arrays are."""
     lattice, free = unknowns.lattice, to_host(unknowns.free)
     stiffness = np.zeros(len(lattice.nodes))
@@ -58,9 +58,7 @@ def diagonal_of(unknowns: Unknowns, time_step: float) -> np.ndarray:
     return like(unknowns.free, to_host(unknowns.inertia)[free] + time_step**2 * stiffness[free])
 
 
-def assembly_bytes(
-    nodes: float | np.ndarray, springs: float | np.ndarray, nonzeros: float | np.ndarray
-) -> float | np.ndarray:
+def assembly_bytes(nodes: float | Array, springs: float | Array, nonzeros: float | Array) -> float | Array:
     """Return the bytes that ``assemble`` has at once beside its arguments; numbers, or arrays of a number a rank.
 
     They are those of A with one column: row of each node; weight, ends and kept of each spring; of each nonzero rows,

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import Route
 from msmpetsc.lattice.lattice import Lattice
@@ -18,7 +18,7 @@ from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
 
 BALLAST = 1e-6  # of the mass
-BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node: a forecast of memory asks for them
+BYTES_OF_NODE = {"numbers": 8, "indices": 3 * 8}  # of a local node, for a forecast of memory
 
 
 class Unknowns:
@@ -37,8 +37,7 @@ class Unknowns:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, static: bool = False):
-        self.lattice, self.memory = lattice, memory_of(lattice.nodes)
-        self.static = static
+        self.comm, self.lattice, self.memory, self.static = comm, lattice, memory_of(lattice.nodes), static
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
@@ -56,36 +55,33 @@ class Unknowns:
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank
-        self.ghost_values, self.scatter = self._scatter_to(comm, self.indices[free_ghosts].ravel())
-
-    def _scatter_to(self, comm: MPI.Comm, sources: np.ndarray) -> tuple[PETSc.Vec, PETSc.Scatter]:
-        """Vector of this rank's ghosts, and the scatter that fills it from the ``sources`` in a vector of unknowns."""
-        values = PETSc.Vec().create(PETSc.COMM_SELF)
-        values.setSizes(len(sources))
-        values.setType(self.memory.vec_type)
-        vector = self.create_vector(comm)
+        sources = self.indices[free_ghosts].ravel()  # in a vector of unknowns
+        self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
+        vector = self.create_vector()
         index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
-        scatter = PETSc.Scatter().create(vector, index, values, None)
+        self.scatter = PETSc.Scatter().create(vector, index, self.ghost_values, None)
         index.destroy()
         vector.destroy()
-        return values, scatter
 
-    def create_vector(self, comm: MPI.Comm) -> PETSc.Vec:
-        """A new vector of unknowns (collective)."""
+    def create_vector(self) -> PETSc.Vec:
+        """Return a new vector of unknowns (collective)."""
+        return self._vector(self.comm, (3 * self.size, 3 * self.total))
+
+    def _vector(self, comm: MPI.Comm, sizes: int | tuple[int, int]) -> PETSc.Vec:
         vector = PETSc.Vec().create(comm)
-        vector.setSizes((3 * self.size, 3 * self.total))
+        vector.setSizes(sizes)
         vector.setType(self.memory.vec_type)
         return vector
 
-    def columns(self, vector: PETSc.Vec) -> np.ndarray:
+    def columns(self, vector: PETSc.Vec) -> Rows:
         """A vector of unknowns as (3, m), not to be written to."""
         return self.memory.read(vector).reshape(3, self.size)
 
-    def columns_to_write(self, vector: PETSc.Vec) -> np.ndarray:
+    def columns_to_write(self, vector: PETSc.Vec) -> Rows:
         """A vector of unknowns as (3, m), to be written to at once."""
         return self.memory.write(vector).reshape(3, self.size)
 
-    def to_nodes(self, vector: PETSc.Vec, nodes: np.ndarray) -> None:
+    def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
         """Write unknowns into the free rows, ghosts included, of ``nodes`` (l, 3) (collective)."""
         if self.has_ghosts:
             with GHOSTS:
@@ -94,11 +90,11 @@ class Unknowns:
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
 
-    def from_nodes(self, nodes: np.ndarray, vector: PETSc.Vec) -> None:
+    def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
         """Write the free owned rows of ``nodes`` (>= owned, 3) into the unknowns."""
         _collect(self.size, nodes, self.free, self.columns_to_write(vector))
 
-    def scaled_sum(self, a: np.ndarray, t2: float, b: np.ndarray, vector: PETSc.Vec) -> None:
+    def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b, of the free owned rows of (l, 3) arrays, into the unknowns."""
         _scaled_sum(self.size, self.inertia, a, t2, b, self.free, self.columns_to_write(vector))
 

@@ -2,7 +2,8 @@
 set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
 
 The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
-one has a preconditioner that is, too. The finest level is applied spring by spring, the first coarse one is summed so
+one has a preconditioner that is, too. The finest level is applied spring by spring in single precision, and smoothed
+with a block diagonal D, of which H is no more than twice. The first coarse one is summed spring by spring
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
 """
 
@@ -11,21 +12,21 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import to_host
-from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.backend.arrays import Positions, Rows, to_host
+from msmpetsc.backend.kernel import kernel
+from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import decode_morton
 from msmpetsc.lattice.initial_state import uniform
-from msmpetsc.solve.linear.operators import python_matrix
+from msmpetsc.solve.linear.operators import Viewable, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.bodies import bodies_of
-from msmpetsc.solve.multigrid.fine import DiagonalBlocks, ProjectedHessian
+from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import RAISED, GalerkinSum, set_block_size
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grid_indices, grids, interpolation
 from msmpetsc.solve.petsc import memory
+from msmpetsc.solve.petsc.events import FINE, count_flops
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev, square_restricts_transposed
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
@@ -33,6 +34,7 @@ LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range b
 FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound); thrice for D's own diagonal
 SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
 ITERATIONS = 10  # of these
+BLOCK = 15  # operations of a product with a 3 x 3 block
 
 
 @dataclass(frozen=True)
@@ -52,32 +54,35 @@ class Multigrid:
     levels : the coarse ones, the finest of them first
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
+    def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.unknowns, self.prefix, self.owned = unknowns, prefix, ExitStack()
-        self.bodies = bodies_of(comm, unknowns)
+        self.bodies = bodies_of(unknowns)
         self.fine = ProjectedHessian(unknowns, elasticity, time_step**2)
-        self.operator = python_matrix(unknowns, self.fine, comm)
+        self.operator = python_matrix(unknowns, self.fine, unknowns.comm)
         self.owned.callback(self.operator.destroy)
         try:
-            self.sum, self.levels = self._create_levels(comm, elasticity, time_step**2)
+            self.sum, self.levels = self._create_levels(elasticity, time_step**2)
         except InputError:
             self.owned.close()
             raise
         smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
         self.bounds = [FINEST * (3 if smoother == PETSc.PC.Type.JACOBI else 1)] + [0.0] * (len(self.levels) - 1)
-        self.pc = PETSc.PC().create(comm)
+        self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
 
-    def _create_levels(self, comm: MPI.Comm, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
-        unknowns = self.unknowns
+    def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
+        unknowns, comm = self.unknowns, self.unknowns.comm
         size, everywhere = unknowns.size, grid_indices(unknowns)
         apart = self.bodies.apart(comm, everywhere)
         ijk = (everywhere + [1, 0, 0] * apart[:, None])[to_host(unknowns.free)]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         coarse = grids(comm, ijk, unknowns.total, COARSEST, asked - 1 if asked > 1 else None)
+        if asked and asked < 2:
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has two levels or more")
         if asked and asked != len(coarse) + 1:
-            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {_possible(asked, len(coarse))}")
-        galerkin = GalerkinSum(comm, unknowns, elasticity, t2, coarse[0], everywhere, apart)
+            most = f"{len(coarse) + 1} at most, for a coarser grid would not be much smaller"
+            raise InputError(f"-{self.prefix}pc_mg_levels {asked}: this lattice has {most}")
+        galerkin = GalerkinSum(unknowns, elasticity, t2, coarse[0], everywhere, apart)
         rows, sizes = np.arange(size)[:, None] + size * np.arange(3), (3 * size, 3 * unknowns.total)
         levels: list[Level] = []
         for grid in coarse:
@@ -89,7 +94,7 @@ class Multigrid:
             rows = 3 * np.arange(len(ijk))[:, None] + np.arange(3)
         return galerkin, levels
 
-    def update(self, q: np.ndarray, contact: np.ndarray) -> None:
+    def update(self, q: Positions, contact: Rows) -> None:
         """Build the hierarchy at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.fine.update(q, contact)
         self.operator.assemble()
@@ -130,7 +135,6 @@ class Multigrid:
             yield "matptap_backend_cpu", "true"  # on an H100 PETSc 3.26's own product of two sparse matrices was 0
 
     def _create_cycle(self) -> None:
-        """Make PCMG know the levels."""
         pc, top = self.pc, len(self.levels)
         pc.setOptionsPrefix(self.prefix)
         pc.setOperators(self.operator)
@@ -170,10 +174,6 @@ class Multigrid:
         self.owned.close()
 
 
-def _possible(asked: int, coarse: int) -> str:
-    return "two levels or more" if asked < 2 else f"{coarse + 1} at most, for a coarser grid would not be much smaller"
-
-
 def greatest_eigenvalue(level: Level) -> float:
     """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective)."""
     x, b = level.matrix.createVecs()
@@ -190,3 +190,102 @@ def greatest_eigenvalue(level: Level) -> float:
     for owned in (ksp, x, b):
         owned.destroy()
     return greatest
+
+
+class ProjectedHessian(Viewable):
+    """H = M + t^2 (projected Hessian of E, and of contact) at the positions that the hierarchy was built at.
+
+    It is positive definite whatever these are (a context of MATPYTHON).
+
+    products : so far
+    """
+
+    def __init__(self, unknowns: Unknowns, elasticity: Elasticity, t2: float):
+        self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
+        lattice = unknowns.lattice
+        self.v = np.zeros_like(lattice.nodes, dtype=np.float32)  # pinned nodes stay zero
+        self.product = np.empty_like(self.v)
+        self.elastic: Hessian | None = None  # until ``update``
+        self.products, self.q = 0, lattice.nodes
+        self.contact = np.empty((0, 9), like=lattice.nodes)
+        self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
+
+    def update(self, q: Positions, contact: Rows) -> None:
+        """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
+        self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
+        unknowns, blocks = self.unknowns, self._half_bound()
+        invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
+
+    def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
+        """Write that of D, for -mg_levels_pc_type jacobi."""
+        unknowns, (blocks, contact) = self.unknowns, (self._half_bound(), self.contact)
+        acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
+        own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
+        unknowns.columns_to_write(diagonal)[:] = own
+
+    def _half_bound(self) -> Rows:
+        blocks = np.zeros((len(self.q), 9), like=self.q)
+        self.elasticity.add_half_bound(self.q, blocks)
+        return blocks
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = H x."""
+        assert self.elastic is not None, "the hierarchy was not built"
+        self.products += 1
+        with FINE:
+            self.unknowns.to_nodes(x, self.v)
+            self.product[:] = 0
+            self.elastic.add_product(self.v, self.product)
+            if len(self.contact):
+                add_node_blocks(len(self.contact), self.contact, self.v, self.product)
+            self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
+            count_flops(self.elasticity.flops.product + (BLOCK + 3) * len(self.contact))
+
+
+class DiagonalBlocks:
+    """Inverse of the 3 x 3 diagonal blocks of the finest level (a context of PCPYTHON)."""
+
+    def __init__(self, hessian: ProjectedHessian):
+        self.hessian = hessian
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        unknowns = self.hessian.unknowns
+        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, unknowns.columns_to_write(y))
+        count_flops(BLOCK * unknowns.size)
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")
+
+
+@kernel
+def add_node_blocks(first, count, step, blocks, v, product):
+    for i in range(first, count, step):
+        for r in range(3):
+            for c in range(3):
+                product[i, r] += blocks[i, 3 * r + c] * v[i, c]
+
+
+@kernel
+def apply_blocks(first, count, step, x, inverse, y):
+    for i in range(first, count, step):
+        a, b, c = x[0, i], x[1, i], x[2, i]
+        for r in range(3):
+            y[r, i] = inverse[i, 3 * r] * a + inverse[i, 3 * r + 1] * b + inverse[i, 3 * r + 2] * c
+
+
+@kernel
+def invert_blocks(first, count, step, blocks, free, mass, contact, t2, inverse):
+    for i in range(first, count, step):
+        node = free[i]
+        m, d = mass[node], blocks[node]
+        a, b, c = t2 * d[0], t2 * d[1], t2 * d[2]
+        e, f, g = t2 * d[4], t2 * d[5], t2 * d[8]
+        if len(contact):
+            p = contact[node]
+            a, b, c, e, f, g = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2], e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
+        a, e, g = a + m, e + m, g + m
+        u, v, w = e * g - f * f, c * f - b * g, b * f - c * e
+        over = 1.0 / (a * u + b * v + c * w)
+        inverse[i, 0], inverse[i, 1], inverse[i, 2] = over * u, over * v, over * w
+        inverse[i, 3], inverse[i, 4], inverse[i, 5] = over * v, over * (a * g - c * c), over * (b * c - a * f)
+        inverse[i, 6], inverse[i, 7], inverse[i, 8] = over * w, over * (b * c - a * f), over * (a * e - b * b)

@@ -6,14 +6,13 @@ cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C);
 being turned inside out, t^2 times its curvature times G G^T, G the slopes of its volume at the cell's corners.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import like, on_host, to_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
@@ -30,14 +29,14 @@ RAISED = 1 + 1e-5  # diagonals: few fine nodes in a coarse cell leave its column
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])  # of corners: the upper triangle of a cell's matrix
 
 
-def _weights() -> np.ndarray:
+def _weights() -> Rows:
     """Weights (28, 8) of a coarse cell's corners at each of its 27 fine nodes; none where one is held."""
     ijk = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
     along = np.where(CORNERS[None] > 0, ijk[:, None, :] / 2, 1 - ijk[:, None, :] / 2)
     return np.concatenate([along.prod(axis=2), np.zeros((1, 8))])
 
 
-def _products(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _products(weights: Rows) -> tuple[Indices, Indices, Floats]:
     """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i + 1] of pairs and
     their factors."""
     factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
@@ -51,33 +50,24 @@ OF_SPRINGS = _products((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8
 OF_NODES = _products(WEIGHTS)
 
 
-@dataclass(frozen=True)
-class ByCell:
-    """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]].
+class ByCell(NamedTuple):
+    """Things of a rank ordered by the coarse cell they lie in: those of cell i are order[start[i] : start[i + 1]]."""
 
-    code : of each, in that order, where its ends or corners are in that cell
-    """
-
-    start: np.ndarray
-    order: np.ndarray
-    code: np.ndarray
+    start: Indices
+    order: Indices
+    code: Indices  # of each, in that order, where its ends or corners are in that cell
 
     @classmethod
-    def of(cls, cells: np.ndarray, keys: np.ndarray, code: np.ndarray, which: np.ndarray) -> "ByCell":
+    def of(cls, cells: Indices, keys: Indices, code: Indices, which: Indices) -> "ByCell":
         """keys : ascending ones of all cells; cells (n,) the key of each thing; which (n,) its number."""
         by_cell = np.argsort(cells, kind="stable")
         start = np.searchsorted(cells[by_cell], keys, side="left")
         start = np.append(start, len(cells)).astype(np.int32)
         return cls(start, which[by_cell].astype(np.int32), code[by_cell].astype(np.uint8))
 
-    @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What kernels take."""
-        return self.start, self.order, self.code
-
-    def near(self, array: np.ndarray) -> "ByCell":
+    def near(self, array: Array) -> "ByCell":
         """Return the same in the memory that an array is in."""
-        return ByCell(like(array, self.start), like(array, self.order), like(array, self.code))
+        return ByCell(*(like(array, part) for part in self))
 
 
 class GalerkinSum:
@@ -93,13 +83,12 @@ class GalerkinSum:
 
     def __init__(
         self,
-        comm: MPI.Comm,
         unknowns: Unknowns,
         elasticity: Elasticity,
         t2: float,
         grid: CoarseGrid,
-        ijk: np.ndarray,
-        apart: np.ndarray,
+        ijk: Indices,
+        apart: Indices,
     ):
         lattice = unknowns.lattice
         self.unknowns, self.elasticity, self.t2 = unknowns, elasticity, t2
@@ -112,9 +101,9 @@ class GalerkinSum:
         diagonal = np.flatnonzero((first == second) & (first >= 0))
         upper = np.flatnonzero(first != second)
         self.diagonal, self.upper = (like(lattice.nodes, a) for a in (diagonal, upper))
-        self.matrix = self._create_matrix(comm, grid, first, second, upper)
+        self.matrix = self._create_matrix(grid, first, second, upper)
 
-    def _pairs(self, grid: CoarseGrid, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _pairs(self, grid: CoarseGrid, keys: Indices) -> tuple[Indices, Indices, Indices]:
         """Global numbers (b,), (b,) of the pairs of nodes that have a block; which a cell adds to, (c, 36), -1 none."""
         number = grid.table.find(encode_morton(decode_morton(keys)[:, None, :] + CORNERS))
         first, second = number[:, PAIRS[:, 0]], number[:, PAIRS[:, 1]]
@@ -126,9 +115,8 @@ class GalerkinSum:
             places[exists] = shared
         return pairs // grid.table.total, pairs % grid.table.total, places
 
-    def _create_matrix(
-        self, comm: MPI.Comm, grid: CoarseGrid, first: np.ndarray, second: np.ndarray, upper: np.ndarray
-    ) -> PETSc.Mat:
+    def _create_matrix(self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices) -> PETSc.Mat:
+        comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
         matrix = PETSc.Mat().create(comm=comm)
         matrix.setSizes((grid.sizes, grid.sizes))
@@ -142,17 +130,17 @@ class GalerkinSum:
         set_block_size(matrix)
         return matrix
 
-    def update(self, q: np.ndarray, contact: np.ndarray) -> None:
+    def update(self, q: Positions, contact: Rows) -> None:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
         (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
         law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.ballast
-        add_springs(count, q, *self.springs.arrays, *law, self.t2, *self.of_springs, self.places, symmetric)
-        add_nodes(count, *self.nodes.arrays, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
+        add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
+        add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
         if self.elasticity.cells:
             law = self.elasticity.cells.law
-            add_resistance(count, q, *self.cells.arrays, *law, self.t2, self.weights, self.places, values)
+            add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
         values[self.diagonal[:, None], [[0, 4, 8]]] *= RAISED
         set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
 
@@ -165,8 +153,8 @@ def set_block_size(matrix: PETSc.Mat) -> None:
 
 
 def _by_cell(
-    unknowns: Unknowns, elasticity: Elasticity, ijk: np.ndarray, apart: np.ndarray
-) -> tuple[np.ndarray, ByCell, ByCell, ByCell]:
+    unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, apart: Indices
+) -> tuple[Indices, ByCell, ByCell, ByCell]:
     """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and resisting cells."""
     lattice = unknowns.lattice
     held, free = to_host(lattice.pinned), to_host(unknowns.free)

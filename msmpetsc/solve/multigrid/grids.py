@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import to_host
+from msmpetsc.backend.arrays import Indices, Mask, to_host
 from msmpetsc.comm import SortedKeys
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
@@ -33,25 +33,25 @@ class CoarseGrid:
         return 3 * len(self.table.keys), 3 * self.table.total
 
 
-def grid_indices(unknowns: Unknowns) -> np.ndarray:
+def grid_indices(unknowns: Unknowns) -> Indices:
     """Return the grid index (l, 3) of each local node, ghosts included."""
     lattice = unknowns.lattice
     nodes, keys = to_host(lattice.nodes), lattice.table.keys
     if not len(nodes):
         return np.empty((0, 3), np.int64)
-    # the first node of its body that this rank owns: it owns one, for a spring joins ghosts with such
+    # the first node of its body that this rank owns: a spring joins ghosts with such a node
     first = np.maximum(lattice.first_of_body[lattice.body] - lattice.table.first, 0)
     return decode_morton(keys[first]) + np.rint((nodes - nodes[first]) / lattice.cell_size).astype(np.int64)
 
 
-def parents_of(ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def parents_of(ijk: Indices) -> tuple[Indices, Mask]:
     """Return the Morton keys (n, 8) of the coarse nodes that grid indices (n, 3) are interpolated from, and which of
     them are needed, (n, 8) bool: those of a corner that lies beyond an even index have no weight."""
     needed = ~((CORNERS[None] > 0) & (ijk[:, None, :] % 2 == 0)).any(axis=2)
     return encode_morton(ijk[:, None, :] // 2 + CORNERS * (ijk[:, None, :] % 2)), needed
 
 
-def coarse_grid(comm: MPI.Comm, ijk: np.ndarray) -> CoarseGrid:
+def coarse_grid(comm: MPI.Comm, ijk: Indices) -> CoarseGrid:
     """Return the nodes that the unknown ones at grid indices (n, 3) are interpolated from (collective).
 
     Raises InputError for more of them than PETSc can number.
@@ -62,7 +62,7 @@ def coarse_grid(comm: MPI.Comm, ijk: np.ndarray) -> CoarseGrid:
     return grid
 
 
-def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
+def grids(comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
     """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
 
     There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a coarser one would
@@ -79,7 +79,7 @@ def grids(comm: MPI.Comm, ijk: np.ndarray, total: int, coarsest: int, count: int
 
 
 def interpolation(
-    comm: MPI.Comm, ijk: np.ndarray, rows: np.ndarray, row_sizes: tuple[int, int], grid: CoarseGrid, mat_type: str
+    comm: MPI.Comm, ijk: Indices, rows: Indices, row_sizes: tuple[int, int], grid: CoarseGrid, mat_type: str
 ) -> PETSc.Mat:
     """Return P (AIJ), from the values at a grid to those at finer nodes (collective).
 

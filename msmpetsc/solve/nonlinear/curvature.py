@@ -11,13 +11,13 @@ other steps the mode found last is followed in a few iterations.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest, like, to_host
+from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.operators import TrueHessian
@@ -27,12 +27,12 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 MOST = 100  # iterations of a long search
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
-MORE = 1.25  # times the compression of the last long search: time for another, for modes come and go
+MORE = 1.25  # times the compression of the last long search: modes may have come
 ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
 
-Block = tuple[np.ndarray, np.ndarray]  # directions (k, n), and what H makes of them
+Block = tuple[Rows, Rows]  # directions (k, n), and what H makes of them
 
 
 class Alarm(IntEnum):
@@ -62,14 +62,12 @@ UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 class Compression:
     """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of its contacts with
     itself included; whether a cell resists.
-
-    inertia : M is part of H, which outweighs what is not positive in the rest
     """
 
     greatest: float
     total: float
     resists: bool
-    inertia: bool = True
+    inertia: bool = True  # M is part of H, which outweighs what is not positive in the rest
 
     @property
     def is_harmless(self) -> bool:
@@ -95,23 +93,25 @@ class LowestCurvature:
     preconditioner : of the step's linear solves, or multigrid for a long search
     """
 
+    state: ClassVar[dict[str, Range]] = {"searched": ANY, "knows_mode": (0, 1)}
+
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.unknowns, self.memory = functional.comm, functional.unknowns, functional.memory
         self.its = 0  # of all searches so far, one product with H each
-        self.known: tuple[StepProblem | None, np.ndarray, Compression] = (None, np.empty(0), NONE)  # the last asked for
+        self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
-        self.mode: np.ndarray | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
         self.knows_mode = False  # in the last checkpoint
         self.vectors: list[PETSc.Vec] | None = None
-        self.rigid: np.ndarray | None = None  # motions (6, n) that are left out
+        self.rigid: Rows | None = None  # motions (6, n) that are left out
 
     @property
     def effort(self) -> SearchEffort:
         """Effort that a search takes with this preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
-    def compression(self, q: np.ndarray) -> Compression:
+    def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
         problem, at, known = self.known
         same = problem is self.functional.problem and bool(np.array_equal(at, q))
@@ -120,7 +120,7 @@ class LowestCurvature:
             self.known = self.functional.problem, q, known
         return known
 
-    def _compression(self, q: np.ndarray) -> Compression:
+    def _compression(self, q: Positions) -> Compression:
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
         concavity, contact = elasticity.concavity(q)[free], functional.problem.contact
@@ -132,8 +132,8 @@ class LowestCurvature:
         return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
 
     def lowest(
-        self, q: np.ndarray, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
-    ) -> tuple[float, np.ndarray]:
+        self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
+    ) -> tuple[float, Floats]:
         """Lowest eigenvalue of M^(-1) H that a search comes to, and a direction (n,) of about that curvature.
 
         q       : positions (l, 3) [m] that H was linearised at last
@@ -146,7 +146,7 @@ class LowestCurvature:
         else:
             its = self.effort.followed
             values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
-        if not np.isfinite(values[0]):  # springs of no length: a cusp, from which any way leads down
+        if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
         self.mode = modes[0].copy()
@@ -154,15 +154,13 @@ class LowestCurvature:
             return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
         return values[0], self.mode
 
-    def _way_down(self, modes: np.ndarray) -> np.ndarray:
+    def _way_down(self, modes: Rows) -> Floats:
         """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
         which of them rounding has made the first, so that it goes the same way on any ranks."""
-        direction = self._sum(to_host((modes * self.functional.mass) @ self._random(1)[0]))
+        direction = self.comm.allreduce(to_host((modes * self.functional.mass) @ self._random(1)[0]))
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
-    def _search_at_length(
-        self, q: np.ndarray, hint: PETSc.Vec | None, effort: SearchEffort
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
         """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
         rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
         of all of them."""
@@ -177,25 +175,25 @@ class LowestCurvature:
         rigid, self.rigid = [] if self.rigid is None else [self.rigid], None
         return self._iterate(np.concatenate([modes, *known, *rigid]), effort.block, MOST, effort.least // 2)
 
-    def _random(self, count: int) -> np.ndarray:
+    def _random(self, count: int) -> Rows:
         """Something of each mode (count, n), the same for any number of ranks, little of the stiff ones."""
         lattice, free = self.functional.lattice, to_host(self.unknowns.free)
         numbers = lattice.global_numbers[: lattice.owned][free]
         seeds = lattice.table.total * np.arange(count)
         random = np.stack([uniform(numbers + seed).T.ravel() - 0.5 for seed in seeds])
-        return self._unit(self._preconditioned(like(self.functional.mass, random)))
+        return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
 
-    def _iterate(self, start: np.ndarray, block: int, most: int, least: int) -> tuple[np.ndarray, np.ndarray]:
+    def _iterate(self, start: Rows, block: int, most: int, least: int) -> tuple[Floats, Rows]:
         """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l, n), and theirs
         (k, n)."""
         size, mass = min(block, len(start)), self.functional.mass
-        values, (x, last) = self._ritz((start, self._product(start)), size)
+        values, (x, last) = self._ritz((start, self._of_each(self.hessian.mult, start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
             residuals /= self._greatest(residuals)  # which single precision can hold
-            w = self._unit(self._without_rigid(self._preconditioned(residuals)))
-            blocks = [x, (w, self._product(w)), *([] if last is None else [last])]
+            w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
+            blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
             values, (x, last) = self._ritz((span, products), size)
             lowest.append(values[0])
@@ -207,24 +205,27 @@ class LowestCurvature:
                 break
         return values, x[0]
 
-    def _ritz(self, block: Block, size: int) -> tuple[np.ndarray, tuple[Block, Block | None]]:
+    def _ritz(self, block: Block, size: int) -> tuple[Floats, tuple[Block, Block | None]]:
         """The lowest curvatures in the span of a block, ascending (size,); their directions, of unit length in M, and
         of each what it has of all but the first ``size`` directions: how it moved (Rayleigh and Ritz)."""
         span, products = block
-        grams = self._sum(np.stack([to_host(span @ products.T), to_host((span * self.functional.mass) @ span.T)]))
+        own = [span @ products.T, (span * self.functional.mass) @ span.T]
+        grams = self.comm.allreduce(np.stack([to_host(gram) for gram in own]))
         sizes, parts = np.linalg.eigh(grams[1])
         kept = sizes > DEPENDENT * max(sizes[-1], TINY)
         parts = parts[:, kept] / np.sqrt(sizes[kept])
         values, turns = np.linalg.eigh(parts.T @ (0.5 * (grams[0] + grams[0].T)) @ parts)
         parts = (parts @ turns)[:, :size].T
-        best = tuple(like(a, parts) @ a for a in block)
+        on_device = like(span, parts)
+        best = on_device @ span, on_device @ products
         if len(span) <= size:
             return values[:size], (best, None)
-        moved = tuple(like(a, parts[:, size:]) @ a[size:] for a in block)
-        lengths = np.maximum(self._lengths(moved[0]), TINY)
-        return values[:size], (best, tuple(a / like(a, lengths)[:, None] for a in moved))
+        rest = like(span, parts[:, size:])
+        moved = rest @ span[size:]
+        lengths = like(span, np.maximum(self._lengths(moved), TINY))[:, None]
+        return values[:size], (best, (moved / lengths, rest @ products[size:] / lengths))
 
-    def _rigid_motions(self, q: np.ndarray) -> np.ndarray | None:
+    def _rigid_motions(self, q: Positions) -> Rows | None:
         """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
         are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
@@ -236,28 +237,20 @@ class LowestCurvature:
             motions[3 + c, (c + 1) % 3], motions[3 + c, (c + 2) % 3] = -columns[(c + 2) % 3], columns[(c + 1) % 3]
         motions = motions.reshape(6, -1)
         for _ in range(2):  # once more, for what the first left of rounding
-            sizes, parts = np.linalg.eigh(self._sum(to_host((motions * self.functional.mass) @ motions.T)))
+            sizes, parts = np.linalg.eigh(self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T)))
             kept = sizes > DEPENDENT * sizes[-1]
             motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions
         return motions
 
-    def _without_rigid(self, directions: np.ndarray) -> np.ndarray:
+    def _without_rigid(self, directions: Rows) -> Rows:
         if self.rigid is None:
             return directions
-        parts = self._sum(to_host((directions * self.functional.mass) @ self.rigid.T))
+        parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ self.rigid.T))
         return directions - like(directions, parts) @ self.rigid
 
-    def _product(self, directions: np.ndarray) -> np.ndarray:
-        """H of each."""
-        return self._of_each(self.hessian.mult, directions)
-
-    def _preconditioned(self, directions: np.ndarray) -> np.ndarray:
-        """P^(-1) of each."""
-        return self._of_each(self.preconditioner.apply, directions)
-
-    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: np.ndarray) -> np.ndarray:
+    def _of_each(self, act: Callable[[None, PETSc.Vec, PETSc.Vec], None], directions: Rows) -> Rows:
         if self.vectors is None:
-            self.vectors = [self.unknowns.create_vector(self.comm) for _ in range(2)]
+            self.vectors = [self.unknowns.create_vector() for _ in range(2)]
         source, product = self.vectors
         results = np.empty_like(directions)
         for direction, result in zip(directions, results, strict=True):
@@ -266,27 +259,19 @@ class LowestCurvature:
             result[:] = self.memory.read(product)
         return results
 
-    def _unit(self, directions: np.ndarray) -> np.ndarray:
+    def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
 
-    def _greatest(self, directions: np.ndarray) -> np.ndarray:
+    def _greatest(self, directions: Rows) -> Rows:
         """Greatest number (k, 1) of each of some directions (k, n)."""
         own = np.array([greatest(np.abs(direction)) for direction in directions])
         most = np.empty_like(own)
         self.comm.Allreduce(own, most, MPI.MAX)
         return like(directions, np.maximum(most, TINY)[:, None])
 
-    def _lengths(self, directions: np.ndarray) -> np.ndarray:
-        return np.sqrt(self._sum(to_host(directions**2 @ self.functional.mass)))
-
-    def _sum(self, values: np.ndarray) -> np.ndarray:
-        """Sum over all ranks."""
-        return self.comm.allreduce(values)
-
-    @property
-    def state(self) -> dict[str, Range]:
-        return {"searched": ANY, "knows_mode": (0, 1)}
+    def _lengths(self, directions: Rows) -> Floats:
+        return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store the mode and what was searched: another long search at each checkpoint would cost a tenth of a run."""
@@ -305,7 +290,6 @@ class LowestCurvature:
             self.mode = rows[self.unknowns.free].T.ravel()
 
     def forget(self) -> None:
-        """Know nothing of the steps before."""
         self.searched, self.mode = NONE, None
 
     def destroy(self) -> None:

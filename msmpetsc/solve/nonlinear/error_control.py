@@ -8,7 +8,11 @@ error.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions
+from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
+from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
@@ -19,35 +23,37 @@ FULL_STEP_ERROR = 1e-5  # below it g, quadratic in the error, has no digits left
 KNOWN = 0.8  # of the error that would do: one that is known to be less needs no closer estimate
 FIRST_RATIO = 5.0  # of the bound on the error to the error, before any was estimated
 LEAST_RATIO = 10.0  # taken, however near they were: an estimate that comes too early is the next solve's start
-EARLY = 2.0  # a step is first estimated when its error is thought to be this many times what would do
+EARLY = 2.0  # times the error that would do: when a step is first estimated
 LOOSEST = 0.3  # ksp_rtol
 SHARE = 0.5  # of the error that would do, left to the linear solve
-CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was enough to doubt: asked for next, and at the most
+CLOSER, CLOSEST = 0.1, 1e-3  # of the error that was doubted: asked for next, and at the most
+NOT_FINITE = -4  # DIVERGED_FNORM_NAN; PETSc 3.25 has another name for it
+KINDS = {
+    PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "line search",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "linear solve",
+    NOT_FINITE: "not finite",
+    -14: "not finite",  # from PETSc 3.25 on: DIVERGED_OBJECTIVE_NANORINF
+}
+REASON = {value: name for name, value in vars(PETSc.SNES.ConvergedReason).items() if isinstance(value, int)}
+KSP_REASON = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() if isinstance(value, int)}
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What a solve has come to, as far as is known at its last iterate.
 
-    goal        : relative error to come to; 0 where a budget of iterations ends the step
-    error       : of the last iterate, estimated or bounded
-    bound       : on it
-    residual    : |F|_(M^-1) of the last iterate
-    early       : how many times the goal an error may be to be estimated
     corrected   : the last iterate's error was estimated, so that its Newton correction is known
-    alarm       : where something has shown a negative curvature
-    at_rounding : F is nothing but rounding
     doubts      : how often the step came to a point that is no minimum, or farther from one than it seemed
     """
 
-    goal: float = 0.0
-    error: float = np.inf
-    bound: float = np.inf
-    residual: float = np.inf
-    early: float = EARLY
+    goal: float = 0.0  # relative error to come to; 0 where a budget of iterations ends the step
+    error: float = np.inf  # of the last iterate, estimated or bounded
+    bound: float = np.inf  # on it
+    residual: float = np.inf  # |F|_(M^-1) of the last iterate
+    early: float = EARLY  # how many times the goal an error may be to be estimated
     corrected: bool = False
-    alarm: Alarm = Alarm.NOWHERE
-    at_rounding: bool = False
+    alarm: Alarm = Alarm.NOWHERE  # where something has shown a negative curvature
+    at_rounding: bool = False  # F is nothing but rounding
     doubts: int = 0
 
     @property
@@ -61,28 +67,20 @@ class Outcome:
         return self.bound < FULL_STEP_ERROR and (self.corrected or not self.doubts)
 
 
+@dataclass(eq=False)
 class ErrorControl:
-    """Judges the iterates of one stepper. All methods that are given an iterate are collective.
+    """Judges the iterates of one stepper. All methods that are given an iterate are collective."""
 
-    error    : relative error at which a step is done; None where a budget of iterations ends it
-    tightest : ksp_rtol that no linear solve goes below
-    """
-
-    def __init__(
-        self,
-        functional: StepFunctional,
-        estimate: ErrorEstimate,
-        curvature: LowestCurvature,
-        rounding: Rounding,
-        error: float | None,
-        tightest: float,
-    ):
-        self.functional, self.estimate, self.curvature, self.rounding = functional, estimate, curvature, rounding
-        self.target, self.tightest = error or 0.0, tightest
-        self.ratio = FIRST_RATIO  # of bound to error in the last estimate
+    functional: StepFunctional
+    estimate: ErrorEstimate
+    curvature: LowestCurvature
+    rounding: Rounding
+    target: float  # relative error at which a step is done; 0 where a budget of iterations ends it
+    tightest: float  # ksp_rtol that no linear solve goes below
+    ratio: float = FIRST_RATIO  # of bound to error in the last estimate
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
-        """What is known at an iterate: its error, only a bound on it while that is far too large."""
+        """What is known at an iterate: its error, or a bound on it while that is far too large."""
         residual, distance = self.functional.dual_norm(iterate.f), self.functional.distance(iterate.q)
         at_rounding, alarm = self.rounding.is_all_of(iterate.f), min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(before, residual=residual, at_rounding=at_rounding, alarm=alarm, corrected=False)
@@ -128,10 +126,47 @@ class ErrorControl:
             return None
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
-    def final_error(self, error: float, at_rounding: bool, q: np.ndarray) -> float:
+    def final_error(self, error: float, at_rounding: bool, q: Positions) -> float:
         """Relative error of the step that came to q (l, 3) [m], rounding included. Raises StepFailed."""
         return self.rounding.added_to(error, self.functional.distance(q), at_rounding)
 
     def forget(self) -> None:
-        """Know nothing of the steps before."""
         self.ratio = FIRST_RATIO
+
+
+def not_converged(
+    snes: PETSc.SNES, ksp: PETSc.KSP, now: Outcome, iterations: int, worst: str, true_hessian: bool
+) -> StepFailed:
+    """SNES gave up after ``iterations``.
+
+    worst        : words of where_worst
+    true_hessian : newton's presets, which another one would not help
+    """
+    reason, kind = REASON.get(snes.reason, str(snes.reason)), KINDS.get(snes.reason, "iterations")
+    preset = "" if true_hessian else "another preset (newton), "
+    advice = f'a smaller time.step, {preset}a looser solver.error, or safety.on_failure = "substep"'
+    if kind == "linear solve":
+        reason += f" (KSP {KSP_REASON.get(ksp.reason, str(ksp.reason))} after {ksp.its} its)"
+        advice = "a looser -ksp_rtol, a larger -ksp_max_it, or another -pc_type"
+    return StepFailed(
+        f"did not converge: {reason} after {iterations} iterations, residual |F| = {now.residual:.2e}, "
+        f"relative error {now.error:.2e}{worst}; try {advice}",
+        kind,
+    )
+
+
+def no_minimum(now: Outcome, worst: str) -> StepFailed:
+    """All that the step came to was no minimum, or farther from one than it seemed."""
+    seen = "a saddle or a fold" if np.isinf(now.error) else "a point farther from its solution than it seemed"
+    return StepFailed(
+        f"did not come to a minimum: it came to {seen} {now.doubts} times, residual |F| = {now.residual:.2e}{worst}; "
+        "try a smaller time.step, or another preset (newton)",
+        "no minimum",
+    )
+
+
+def where_worst(functional: StepFunctional, iterate: Iterate) -> str:
+    """Words on where F pulls farthest, and on what is inside out (collective)."""
+    comm, lattice = functional.comm, functional.lattice
+    node = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
+    return f", worst at {node}{describe_inverted(comm, lattice, iterate.q)}"

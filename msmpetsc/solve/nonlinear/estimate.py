@@ -14,6 +14,7 @@ and that are together an error that will do; their sum is then the estimate.
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -28,8 +29,7 @@ MOST = 512
 
 
 class ErrorEstimate:
-    """Estimates |x - x*|_M of a step; ``correction`` is the e of the last estimate, ``residual`` what F - H e is
-    left."""
+    """Estimates |x - x*|_M of a step; of the last estimate ``correction`` is e, ``residual`` F - H e."""
 
     def __init__(
         self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner, prefix: str
@@ -48,7 +48,7 @@ class ErrorEstimate:
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setNormType(PETSc.KSP.NormType.NATURAL)
         self.ksp.setComputeEigenvalues(True)
-        pc = self.ksp.getPC()  # its own, for a PC knows its operator, around the same preconditioner
+        pc = self.ksp.getPC()  # its own around the same context, for a PC knows its operator
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
         self.ksp.setOperators(self.operator, self.operator)
@@ -63,7 +63,7 @@ class ErrorEstimate:
         will_do : an error bounded by that need not be known better
         lowest  : eigenvalue of M^(-1) H, as far as is known
 
-        Infinite where the Hessian is not positive definite: there no linear correction shows the way.
+        Infinite where the Hessian is not positive definite: no linear correction shows the way.
         """
         self.right_side, self.bound, self.enough = iterate.f, bound, enough
         self.lowest, self.lengths = min(lowest, 1.0), {}
@@ -84,7 +84,7 @@ class ErrorEstimate:
             return length + left
         return length * max(length / half, 1.0) if half > 0 else length
 
-    def linearise(self, q: np.ndarray) -> None:
+    def linearise(self, q: Positions) -> None:
         """Take the Hessian at positions q (l, 3) [m]."""
         self.preconditioner.prepare(q, self.functional.problem.contact)
         self.hessian.linearise(q, self.functional.problem.contact)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Positions, Rows, like, to_host
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
@@ -19,9 +19,9 @@ class FirstGuess:
         self.functional, self.extrapolate = functional, extrapolate
         lattice, unknowns = functional.lattice, functional.unknowns
         self.holds = unknowns.total < lattice.table.total  # some nodes are no unknowns
-        self.corrections: list[np.ndarray] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
+        self.corrections: list[Positions] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
-    def best(self) -> np.ndarray:
+    def best(self) -> Positions:
         """The start (l, 3) [m] of the step that the functional has begun (collective).
 
         Besides y, as published: the free flight y + t^2 M^(-1) f_ext, exact where no spring is stretched;
@@ -45,7 +45,7 @@ class FirstGuess:
         best = guesses[int(np.argmin(values))]
         return best if met else self._without_crossing(best)
 
-    def _without_crossing(self, guess: np.ndarray) -> np.ndarray:
+    def _without_crossing(self, guess: Positions) -> Positions:
         """The guess, or as much of the way there, beside the body's own as a whole, as leads to no crossing.
 
         Raises StepFailed where anchors alone lead the surface through itself.
@@ -67,7 +67,7 @@ class FirstGuess:
             "contact",
         )
 
-    def learn(self, x: np.ndarray) -> None:
+    def learn(self, x: Positions) -> None:
         """The step has come to x (l, 3) [m]."""
         self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
@@ -75,12 +75,12 @@ class FirstGuess:
         """Know nothing of the steps before."""
         self.corrections = []
 
-    def _held(self, guess: np.ndarray) -> np.ndarray:
+    def _held(self, guess: Positions) -> Positions:
         """The guess, but with the held nodes where they will be."""
         lattice = self.functional.lattice
         return np.where(lattice.pinned[:, None], self.functional.problem.fixed, guess) if self.holds else guess
 
-    def _drift(self, moved: np.ndarray) -> np.ndarray | float:
+    def _drift(self, moved: Rows) -> Floats | float:
         """Mean by mass (3,) of a free body's displacements (l, 3) [m]; 0 if some nodes are held."""
         if self.holds:
             return 0.0

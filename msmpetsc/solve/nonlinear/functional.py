@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest
 from msmpetsc.contact.obstacles.penalty import Contact
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -21,41 +21,38 @@ from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT, count_flops
 class StepProblem:
     """Data of one implicit step.
 
-    q          : q_n (l, 3) [m], ghosts included
-    y          : where the nodes would be without forces (l, 3) [m]
-    load       : f_ext (owned, 3) [N]
-    contact    : penalties that press on the nodes in this step
     prescribed : q_n with the anchored nodes where they will be (l, 3) [m]; None if they stay
     """
 
-    q: np.ndarray
-    y: np.ndarray
-    load: np.ndarray
-    contact: Contact | None = None
-    prescribed: np.ndarray | None = None
+    q: Positions  # q_n (l, 3) [m], ghosts included
+    y: Positions  # where the nodes would be without forces (l, 3) [m]
+    load: Rows  # f_ext (owned, 3) [N]
+    contact: Contact | None = None  # penalties that press on the nodes in this step
+    prescribed: Positions | None = None
 
     @property
-    def fixed(self) -> np.ndarray:
+    def fixed(self) -> Positions:
         """Positions (l, 3) [m] whose rows of fixed nodes hold at the end of the step."""
         return self.q if self.prescribed is None else self.prescribed
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """Point that a solver came to: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
+    """Point of a solver: its positions q (l, 3) [m], ghosts included, and F there [kg m]."""
 
-    q: np.ndarray
+    q: Positions
     f: PETSc.Vec
 
 
 class StepFunctional:
     """g of the problem given to ``begin``. All methods are collective.
 
-    Positions are (l, 3) [m], ghosts included; PETSc's vectors are of unknowns (solve.linear.unknowns).
+    Positions are (l, 3) [m], ghosts included; vectors are of unknowns (solve.linear.unknowns).
     """
 
     def __init__(self, comm: MPI.Comm, unknowns: Unknowns, elasticity: Elasticity, time_step: float):
-        self.comm, self.unknowns, self.elasticity, self.t2 = comm, unknowns, elasticity, time_step**2
+        self.comm, self.unknowns, self.elasticity = comm, unknowns, elasticity
+        self.time_step, self.t2 = time_step, time_step**2
         self.lattice, self.memory = unknowns.lattice, unknowns.memory
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
         self.per_mass = 1 / self.mass
@@ -69,7 +66,7 @@ class StepFunctional:
         self.problem = problem
         self.extent = self.comm.allreduce(greatest(np.abs(problem.q)), MPI.MAX)
 
-    def positions(self, x: PETSc.Vec) -> np.ndarray:
+    def positions(self, x: PETSc.Vec) -> Positions:
         """Positions (l, 3) [m] of unknowns x, the fixed nodes where the problem has them."""
         q = self.problem.fixed.copy()
         self.unknowns.to_nodes(x, q)
@@ -90,7 +87,7 @@ class StepFunctional:
             count_flops(self.elasticity.flops.gradient)
         return Iterate(q, f)
 
-    def value(self, q: np.ndarray, met: bool = False) -> float:
+    def value(self, q: Positions, met: bool = False) -> float:
         """g of positions q (l, 3) but for a constant of the step [kg m^2]: to compare guesses that are far apart.
 
         met : self-contact included, which has a value only where no two triangles cross
@@ -105,7 +102,7 @@ class StepFunctional:
         inertia = 0.5 * self._inner(moved, moved)
         return self.comm.allreduce(inertia + self.t2 * acting)
 
-    def change(self, q: np.ndarray, base: np.ndarray) -> tuple[float, float]:
+    def change(self, q: Positions, base: Positions) -> tuple[float, float]:
         """g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3); a difference that keeps its digits."""
         problem, owned = self.problem, slice(self.lattice.owned)
         with ENERGY:
@@ -131,7 +128,7 @@ class StepFunctional:
         contact = self.problem.contact
         return contact is not None and contact.surface is not None and contact.surface.presses(self.problem.q)
 
-    def free_share(self, base: np.ndarray, q: np.ndarray) -> float:
+    def free_share(self, base: Positions, q: Positions) -> float:
         """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""
         contact = self.problem.contact
         if contact is None or contact.surface is None:
@@ -139,7 +136,7 @@ class StepFunctional:
         with CONTACT:
             return contact.surface.free_share(base, q)
 
-    def _inner(self, a: np.ndarray, b: np.ndarray) -> float:
+    def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""
         return float(np.vdot(self.unknowns.inertia[:, None] * a, b))
 
@@ -151,12 +148,12 @@ class StepFunctional:
         """|f|_(M^-1); of F it bounds |x - x*|_M where E is convex, for there the Hessian of g is at least M."""
         return float(np.sqrt(self.comm.allreduce(float(self.memory.read(f) ** 2 @ self.per_mass))))
 
-    def pull(self, f: PETSc.Vec) -> tuple[np.ndarray, np.ndarray]:
+    def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
         """The free nodes, local numbers, and |F| / m of each [m]: how far each is pulled from where it is."""
         columns = (self.memory.read(f) * self.per_mass).reshape(3, -1)
         return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
-    def distance(self, q: np.ndarray, correction: PETSc.Vec | None = None) -> float:
+    def distance(self, q: Positions, correction: PETSc.Vec | None = None) -> float:
         """|q - e - y|_M over the free nodes, e a ``correction`` of q: what errors of the step are relative to."""
         free = self.unknowns.free
         columns = (q[free] - self.problem.y[free]).T.ravel()

@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import KNOWN
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
@@ -21,25 +21,19 @@ from msmpetsc.solve.nonlinear.rounding import Rounding
 
 CONVEX = 0.5  # lowest eigenvalue of M^(-1) H: below it, the first estimate may have missed too much
 SMALL = 0.3  # of the first correction: a second one that is more shows that g is no parabola there
-DOUBTFUL = 30.0  # times what both say may then be the error: it was seen 10 times as large in a valley
+DOUBTFUL = 30.0  # times what both say may be the error: 10 times were seen in a valley
 SLOPE = 0.25  # over what the curvature makes of it on the first move: less, as of a symmetric body, may be rounding
 FIRST_MOVE, MOVES = 1e-3, 24  # off a saddle [cells]; doubled so often while g falls
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a point x.
+    """Verdict on a point x."""
 
-    error      : relative, of x; infinite where no estimate can be had
-    direction  : (n,) of negative curvature; None where there is none
-    curvature  : of it, an eigenvalue of M^(-1) H
-    is_minimum : that will do
-    """
-
-    error: float
-    direction: np.ndarray | None = None
-    curvature: float = 1.0
-    is_minimum: bool = False
+    error: float  # relative, of x; infinite where no estimate can be had
+    direction: Floats | None = None  # (n,) of negative curvature; None where there is none
+    curvature: float = 1.0  # of it, an eigenvalue of M^(-1) H
+    is_minimum: bool = False  # that will do
 
 
 class Minimum:
@@ -87,8 +81,7 @@ class Minimum:
         return Verdict(self._second_estimate(nearer, first, rest, enough, value))
 
     def _estimate_closely(self, x: PETSc.Vec) -> bool:
-        """Estimate the error of x without an early end, which says little where g is hardly convex; whether it could be
-        had."""
+        """Estimate the error of x, where g is hardly convex, without an early end; whether it could be."""
         iterate = self.functional.evaluate(x, self.f)
         return bool(np.isfinite(self.estimate(iterate, self.functional.dual_norm(self.f), np.inf)))
 
@@ -132,7 +125,7 @@ class Minimum:
             return falls
         return self._descend(x, verdict.direction, verdict.curvature) or falls
 
-    def _descend(self, x: PETSc.Vec, direction: np.ndarray, curvature: float) -> bool:
+    def _descend(self, x: PETSc.Vec, direction: Floats, curvature: float) -> bool:
         """Move x along a direction (n,) of negative curvature; whether g falls that way."""
         functional = self.functional
         base = functional.evaluate(x, self.f).q

@@ -8,20 +8,133 @@ hundred iterations for, has multigrid of its own meanwhile.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log
 from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.preconditioner import Preconditioner
-from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.cycle import Multigrid
+from msmpetsc.solve.multigrid.free_bodies import Translations
+from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG
 LONG = 40  # iterations of Jacobi's that take longer than a few of multigrid's and its set-up
 USUAL = 0.1  # ksp_rtol
 LARGE = 3000  # free nodes: from there on a search with multigrid is the faster
+USUAL_PACE = 2.5  # iterations a digit with a hierarchy of the present: what the one at rest is held against
+WORTH = 10.0  # iterations that a new hierarchy takes the time of
 MASSLESS = 1e9  # t^2 k / m: where nothing is held, the mass that alone says where a body goes is lost in rounding
+
+
+class LatticePreconditioner:
+    """The cycle (a PCPYTHON context), and how its hierarchy serves. All methods are collective.
+
+    translations : of bodies that nothing holds, kept exactly while ``is_free``; None where all are held
+    is_first : there is none yet
+    pace     : iterations a digit of the first solve with it; None before that
+    wasted   : iterations since then that were more than that
+    is_stale : a new one is due
+    """
+
+    def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
+        self.unknowns = unknowns
+        with GRIDS:
+            self.multigrid = Multigrid(unknowns, elasticity, time_step, prefix)
+        bodies = self.multigrid.bodies
+        self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
+        self.is_first = True
+        self.pace: float | None = None
+        self.wasted = 0.0
+        self.is_stale, self.is_free = True, False
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """The projected Hessian."""
+        return self.multigrid.operator
+
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
+        """See to it that there is a hierarchy that serves; whether it is a new one, at positions q (l, 3) [m]."""
+        due = self.is_stale
+        self.is_free = self._is_free(q, contact)
+        if due:
+            self._build(q.copy(), self._blocks(q, contact))
+        return due
+
+    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies that nothing holds as wholes to where forces balance, from q, or unknowns x, where F is f."""
+        if self.translations and self._is_free(q, contact):
+            columns = self.unknowns.columns_to_write(x)
+            columns -= self.translations.of(self.unknowns.columns(f))
+
+    def learn(self, its: int, rtol: float) -> None:
+        """A linear solve took so many iterations to a relative tolerance; none say nothing.
+
+        A hierarchy is kept until what it has cost would have paid for a new one: at worst that is twice the least.
+        """
+        if its == 0:
+            return
+        digits = max(-np.log10(rtol), 0.1)
+        if self.pace is None:
+            self.pace = its / digits
+        self.wasted += max(its - self.pace * digits, 0.0)
+        self.is_stale |= self.wasted > WORTH
+
+    def _build(self, q: Positions, contact: Rows) -> None:
+        with HIERARCHY:
+            self.multigrid.update(q, contact)
+        self.pace = None
+        if self.is_first:
+            self.pace = USUAL_PACE
+        self.wasted = 0.0
+        self.is_first = self.is_stale = False
+
+    def _is_free(self, q: Positions, contact: Contact | None) -> bool:
+        """Whether no obstacle presses on a node at positions q (l, 3) [m]: translations then meet nothing but mass."""
+        if self.translations is None or contact is None:
+            return self.translations is not None
+        if contact.surface and len(self.multigrid.bodies.free) > 1 and contact.surface.presses(q):
+            return False  # of one body alone it moves the middle no more than springs do
+        pressed = any(len(nodes) for nodes, _ in contact.hessian(q, True))
+        return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
+
+    def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
+        lattice = self.unknowns.lattice
+        blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
+        for nodes, added in contact.hessian(q, False) if contact else ():
+            blocks[nodes] += added.reshape(-1, 9)
+        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+        return blocks + surface.blocks if surface else blocks
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        """The options are read when the levels are there."""
+
+    def setUp(self, _: PETSc.PC) -> None:
+        self.multigrid.pc.setUp()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        with CYCLE:
+            if self.translations and self.is_free:
+                self.translations.around(self.multigrid.pc, x, y)
+            else:
+                self.multigrid.pc.apply(x, y)
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        self.multigrid.pc.view(viewer)
+
+    def forget(self) -> None:
+        """Know nothing of the steps before: a new hierarchy is due."""
+        self.is_stale = self.is_first = True
+
+    def destroy(self) -> None:
+        self.multigrid.destroy()
 
 
 def expected_iterations(ratio: float) -> float:
@@ -39,37 +152,34 @@ class Preconditioned:
         self.preconditioner.in_use.matrix.view(viewer)
 
 
+@dataclass(eq=False)
 class StepPreconditioner:
     """The one in use (a PCPYTHON context). All methods are collective.
 
     make_of_matrix, make_multigrid : make them where they are needed
-    kind    : -pc_type; multigrid is taken where that is mg
     chooses : between the two, by ``ratio``, the greatest t^2 k / m of a node, and by the iterations seen
-    nodes   : free ones, on all ranks
     """
 
-    def __init__(
-        self,
-        make_of_matrix: Callable[[], Preconditioner],
-        make_multigrid: Callable[[], LatticePreconditioner],
-        kind: str,
-        chooses: bool,
-        ratio: float,
-        nodes: int,
-    ):
-        self.make_multigrid, self.chooses = make_multigrid, chooses
-        self.is_large, self.is_searching = nodes >= LARGE, False
+    make_of_matrix: Callable[[], Preconditioner]
+    make_multigrid: Callable[[], LatticePreconditioner]
+    kind: str  # -pc_type; multigrid is taken where that is mg
+    chooses: bool
+    ratio: float
+    nodes: int  # free ones, on all ranks
+
+    def __post_init__(self) -> None:
+        self.is_searching = False
         self.for_searches: LatticePreconditioner | None = None
         self.of_matrix: Preconditioner | None = None
         self.multigrid: LatticePreconditioner | None = None
-        self.is_chosen = kind == MULTIGRID  # multigrid, for the steps
-        expected = expected_iterations(ratio)
-        if kind == MULTIGRID:
-            self.multigrid = make_multigrid()
-        elif chooses and expected > LONG:
-            self._choose(f"t^2 k / m = {ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
+        self.is_chosen = self.kind == MULTIGRID  # multigrid, for the steps
+        expected = expected_iterations(self.ratio)
+        if self.is_chosen:
+            self.multigrid = self.make_multigrid()
+        elif self.chooses and expected > LONG:
+            self._choose(f"t^2 k / m = {self.ratio:.3g}: Jacobi's would take some {expected:.0f} iterations")
         else:
-            self.of_matrix = make_of_matrix()
+            self.of_matrix = self.make_of_matrix()
 
     @property
     def in_use(self) -> Preconditioner | LatticePreconditioner:
@@ -88,14 +198,15 @@ class StepPreconditioner:
         return sum(lattice.multigrid.fine.products for lattice in (self.multigrid, self.for_searches) if lattice)
 
     @contextmanager
-    def searching(self, q: np.ndarray, contact: Contact | None) -> Iterator[None]:
+    def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
         """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
         smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
-        if self.is_chosen or not (self.chooses and self.is_large):
+        if self.is_chosen or not self.chooses or self.nodes < LARGE:
             yield
             return
         self.for_searches = self.for_searches or self.make_multigrid()
-        self.for_searches.build_anew(q, contact)
+        self.for_searches.is_stale = True
+        self.for_searches.prepare(q, contact)
         self.is_searching = True
         try:
             yield
@@ -108,13 +219,12 @@ class StepPreconditioner:
             log.info("preconditioner: multigrid on the lattice (%s a solve; -pc_type jacobi keeps to it)", reason)
             self.multigrid = self.make_multigrid()
 
-    def prepare(self, q: np.ndarray, contact: Contact | None) -> bool:
+    def prepare(self, q: Positions, contact: Contact | None) -> bool:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, q: np.ndarray, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes, from positions q (l, 3) [m] or unknowns x where F is f, to where their forces balance,
-        where linear solves would not."""
+    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Move bodies as wholes to where their forces balance, where linear solves would not."""
         if self.multigrid and self.is_chosen:
             self.multigrid.balance(q, contact, f, x)
 

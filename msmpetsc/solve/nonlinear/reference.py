@@ -3,6 +3,7 @@
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice
@@ -25,7 +26,7 @@ class Reference:
             )
             self.stepper.set_up()
 
-    def errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
+    def errors(self, problem: StepProblem, positions: list[Positions]) -> Rows:
         """(k, 2) of positions (l, 3) [m] that came near the step's solution x* (collective), NaN where x* is not found.
 
         Relative position error |x - x*|_M / |y - x*|_M and energy error (g(x) - g*) / (g(y) - g*).
@@ -37,7 +38,7 @@ class Reference:
             log.warning("the true error of a step is not known: its reference %s", failure)
             return np.full((len(positions), 2), np.nan)
 
-    def _errors(self, problem: StepProblem, positions: list[np.ndarray]) -> np.ndarray:
+    def _errors(self, problem: StepProblem, positions: list[Positions]) -> Rows:
         self.stepper.forget()  # what is measured does not depend on what was measured before
         exact = self.stepper.step(problem, positions[-1]).position
         start = self._distances(problem.y, exact)
@@ -46,7 +47,7 @@ class Reference:
         errors[:, 0] = [self.stepper.control.rounding.added_to(error, start[0]) for error in errors[:, 0]]
         return errors
 
-    def _distances(self, x: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    def _distances(self, x: Positions, exact: Positions) -> Floats:
         """|x - x*|_M and g(x) - g*."""
         stepper = self.stepper
         stepper.unknowns.from_nodes(x - exact, stepper.x)

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import greatest
+from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
@@ -22,7 +22,7 @@ class Rounding:
     diagonal : (m,) of A, of each free node of this rank [kg]
     """
 
-    def __init__(self, functional: StepFunctional, diagonal: np.ndarray):
+    def __init__(self, functional: StepFunctional, diagonal: Floats):
         self.functional, self.comm = functional, functional.comm
         self.rows = np.tile(ROUNDINGS * diagonal, 3)  # of F [kg m] for each metre of a coordinate
         stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))

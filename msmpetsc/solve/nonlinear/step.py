@@ -4,29 +4,35 @@
 import ctypes
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
-from msmpetsc.solve.nonlinear.error_control import DEFAULT_ERROR, ErrorControl, Outcome
+from msmpetsc.solve.nonlinear.error_control import (
+    DEFAULT_ERROR,
+    NOT_FINITE,
+    ErrorControl,
+    Outcome,
+    no_minimum,
+    not_converged,
+    where_worst,
+)  # fmt: skip
 from msmpetsc.solve.nonlinear.estimate import ErrorEstimate
-from msmpetsc.solve.nonlinear.failure import NOT_FINITE, no_minimum, not_converged, where_worst
 from msmpetsc.solve.nonlinear.first_guess import FirstGuess
-from msmpetsc.solve.nonlinear.friction_kinks import FrictionKinks
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
-from msmpetsc.solve.nonlinear.jacobian import Jacobian
+from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
 from msmpetsc.solve.nonlinear.rounding import Rounding
-from msmpetsc.solve.petsc.errors import petsc_errors
 from msmpetsc.solve.petsc.events import LOCAL
-from msmpetsc.solve.petsc.library import total_iterations
+from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
@@ -39,73 +45,65 @@ INDEFINITE = PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
 class StepResult:
     """Result of one step.
 
-    position   : (l, 3) [m], ghosts included
-    previous   : (l, 3) [m], such that the velocity is (position - previous) / t
-    cost       : of the step
-    work       : of obstacles that struck this rank's nodes [J]
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
-    static     : a state of equilibrium, not a motion
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     """
 
-    position: np.ndarray
-    previous: np.ndarray
-    cost: Work
-    work: float = 0.0
+    position: Positions  # (l, 3) [m], ghosts included
+    previous: Positions  # (l, 3) [m], such that the velocity is (position - previous) / t
+    cost: Work  # of the step
+    work: float = 0.0  # of obstacles that struck this rank's nodes [J]
     explicit: bool = False
     swing: float = 0.0
-    static: bool = False
+    static: bool = False  # a state of equilibrium, not a motion
     time_error: float = np.nan
 
 
+@dataclass(eq=False)
 class Stepper:
     """Solver of the steps of one lattice and time step; all PETSc objects it makes are destroyed by ``destroy``.
 
     error          : relative error at which a step is done; None for the preset's own rule
     max_iterations : a budget instead of a promise: the step is taken as it is then
-    touches        : whether steps may have a ``contact``
-    prefix         : of its PETSc options
-    static         : what is looked for is an equilibrium: M weighs errors and nothing else
     observer       : called with the positions (l, 3) [m] of each iterate, when its error is known
 
     Raises InputError for PETSc options that do not go together (collective).
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        lattice: Lattice,
-        time_step: float,
-        preset: Preset,
-        error: float | None = None,
-        max_iterations: int | None = None,
-        touches: bool = False,
-        prefix: str = "",
-        static: bool = False,
-    ):
-        self.lattice, self.preset = lattice, preset
-        self.budget = max_iterations or (preset.iterations if error is None else None) or 0
-        if error is None and not self.budget:
-            error = DEFAULT_ERROR
-        self.observer: Callable[[np.ndarray], None] | None = None
+    comm: MPI.Comm
+    lattice: Lattice
+    time_step: float
+    preset: Preset
+    error: float | None = None
+    max_iterations: int | None = None
+    touches: bool = False  # whether steps may have a ``contact``
+    prefix: str = ""  # of its PETSc options
+    static: bool = False  # what is looked for is an equilibrium: M weighs errors and nothing else
+    observer: Callable[[Positions], None] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.budget = self.max_iterations or 0
+        if self.error is None and not self.budget:
+            self.budget = self.preset.iterations or 0
         self.projected = False  # whether newton's Hessian is, at the moment
         self.outcome = Outcome()  # of the solve in progress, as its last iterate has it
         self.iterations = 0  # of all steps so far
-        self.base = np.empty_like(lattice.nodes)  # positions that g is compared with
+        self.base = np.empty_like(self.lattice.nodes)  # positions that g is compared with
         self.kinks, self.owned = FrictionKinks(), ExitStack()
-        self.unknowns = Unknowns(comm, lattice, static)
+        self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
-        self.functional = StepFunctional(comm, self.unknowns, Elasticity(comm, lattice), time_step)
-        self.first_guess = FirstGuess(self.functional, preset.extrapolate)
-        self.options = SolverOptions(preset, prefix, self.budget)
+        elasticity = Elasticity(self.comm, self.lattice)
+        self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
+        self.first_guess = FirstGuess(self.functional, self.preset.extrapolate)
+        self.options = SolverOptions(self.preset, self.prefix, self.budget)
         try:
             with petsc_errors("PETSc refuses its options"):
-                self.jacobian = self._create_jacobian(comm, time_step, touches)
+                self.jacobian = Jacobian(self.functional, self.preset, self.options, self.touches, self.owned)
                 self.x, self.work = (self._keep(self.jacobian.operator.createVecRight()) for _ in range(2))
                 self.has_npc = self.options.is_given("npc_snes_type")  # a plain iteration that preconditions SNES
-                self.snes, self.ksp = self._create_solvers(comm, touches)
-                self.control, self.minimum = self._create_control(error)
+                self.snes, self.ksp = self._create_solvers()
+                self.control, self.minimum = self._create_control()
         except InputError:
             self.destroy()
             raise
@@ -114,17 +112,9 @@ class Stepper:
         self.owned.callback(owned.destroy)
         return owned
 
-    def _create_jacobian(self, comm: MPI.Comm, time_step: float, touches: bool) -> Jacobian:
-        preset = self.preset
-        flags = {"true_hessian": preset.true_hessian, "kronecker": preset.kronecker, "chooses": preset.chooses}
-        elasticity = self.functional.elasticity
-        return Jacobian(
-            comm, self.unknowns, elasticity, time_step, self.owned, **flags, touches=touches, options=self.options
-        )
-
-    def _create_solvers(self, comm: MPI.Comm, touches: bool) -> tuple[PETSc.SNES, PETSc.KSP]:
+    def _create_solvers(self) -> tuple[PETSc.SNES, PETSc.KSP]:
         """SNES, and the KSP of its own or, where it has one, of the SNES that preconditions it."""
-        snes, prefix = self._keep(PETSc.SNES().create(comm)), self.options.prefix
+        snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
         inner = self._keep(snes.getNPC()) if self.has_npc else snes
         ksp = self._keep(inner.getKSP())
@@ -136,7 +126,7 @@ class Stepper:
         snes.setFunction(self._residual, self._keep(self.x.duplicate()))
         snes.setJacobian(self._linearise, self.jacobian.operator, self.jacobian.pmat)
         snes.setObjective(self._objective)
-        if touches:
+        if self.touches:
             snes.setLineSearchPreCheck(self._shorten)
         snes.setConvergenceTest(self._converged)
         if self.preset.start_from_b:
@@ -144,15 +134,18 @@ class Stepper:
         snes.setFromOptions()
         return snes, ksp
 
-    def _create_control(self, error: float | None) -> tuple[ErrorControl, Minimum]:
+    def _create_control(self) -> tuple[ErrorControl, Minimum]:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
-        estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.options.prefix))
+        estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
         curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
         rounding = Rounding(functional, jacobian.diagonal)
         minimum = self._keep(Minimum(functional, estimate, curvature, rounding))
+        error = self.error
+        if error is None and not self.budget:
+            error = DEFAULT_ERROR
         tightest = self.ksp.getTolerances()[0]
-        return ErrorControl(functional, estimate, curvature, rounding, error, tightest), minimum
+        return ErrorControl(functional, estimate, curvature, rounding, error or 0.0, tightest), minimum
 
     def set_up(self) -> None:
         """Build the preconditioner (a factorisation, for Cholesky) before the first step needs it.
@@ -165,7 +158,7 @@ class Stepper:
             self.ksp.setOperators(self.jacobian.operator, self.jacobian.pmat)
             self.ksp.setUp()
 
-    def step(self, problem: StepProblem, start: np.ndarray | None = None) -> StepResult:
+    def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
         """Solve one step.
 
         start : a first guess (l, 3) [m]; the best of several if None
@@ -185,8 +178,7 @@ class Stepper:
             error = self.control.final_error(verdict.error, outcome.at_rounding, q)
             return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
 
-    def _begin(self, problem: StepProblem, start: np.ndarray | None) -> None:
-        """Put the first guess into x."""
+    def _begin(self, problem: StepProblem, start: Rows | None) -> None:
         self.functional.begin(problem)
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
@@ -223,7 +215,7 @@ class Stepper:
         """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
 
         Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
-        if its very first direction has negative curvature it climbs, and the line search says so: the
+        if its very first direction has negative curvature it climbs, as the line search says: the
         projected Hessian takes over for some iterations (_linearise).
         """
         self.outcome = outcome
@@ -231,8 +223,9 @@ class Stepper:
             return self.outcome
         self.projected = self.preset.projected > 0
         self._forget_pairs()
+        climbs = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
-        while self._climbs() and iterations < most:
+        while self.preset.true_hessian and self.snes.reason == climbs and iterations < most:
             self.projected = True
             its = self._run_snes()
             iterations += its
@@ -289,16 +282,11 @@ class Stepper:
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
 
-    def _climbs(self) -> bool:
-        return self.preset.true_hessian and self.snes.reason == PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
-
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
-        """F at x, in ``work``."""
         with LOCAL:
             return self.functional.evaluate(x, self.work)
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """F for SNES."""
         with LOCAL:
             self.functional.evaluate(x, f)
 
@@ -399,8 +387,7 @@ class Stepper:
             self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
 
     def _abandon(self) -> None:
-        """After an error within PETSc its objects may be in the middle of something, and crash when they are
-        destroyed: they stay, even when the interpreter ends."""
+        """Keep PETSc's objects for ever: after an error within it they may crash when they are destroyed."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 

@@ -3,11 +3,11 @@
 import ctypes
 from collections.abc import Callable
 
-import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
+from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError
 from msmpetsc.solve.petsc.library import petsc_library
@@ -31,7 +31,7 @@ def choose(comm: MPI.Comm, device: str | None) -> None:
     sender(comm)
 
 
-def sender(comm: MPI.Comm) -> Callable[[np.ndarray], np.ndarray]:
+def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
     """Function that takes arrays to where runs compute (collective).
 
     Raises InputError on all ranks where that is a GPU and one of them has none, or PETSc has no CUDA.

@@ -42,7 +42,7 @@ def begun(stage: PETSc.Log.Stage) -> ExitStack:
 
 def seconds(event: str) -> float:
     """Seconds that this rank spent in an event, in all stages of the run."""
-    return sum(PETSc.Log.Event(event).getPerfInfo(stage)["time"] for stage in OF_THE_RUN)
+    return float(sum(PETSc.Log.Event(event).getPerfInfo(stage)["time"] for stage in OF_THE_RUN))
 
 
 def count(event: str) -> int:

@@ -1,11 +1,14 @@
-"""PETSc started with the user's options, once: it reads most of those that are not of a solver only then."""
+"""PETSc started with the user's options, once: it reads most of those that are not of a solver only then.
+
+One that runs already is lent others for the time of a run.
+"""
 
 import ctypes
 import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -15,12 +18,12 @@ from mpi4py import MPI
 
 from msmpetsc.comm import on_root
 from msmpetsc.errors import InputError, printable
+from msmpetsc.solve.petsc.words import options_of
 
 FILE_OPTIONS = ("-options_file", "-options_file_yaml")
-RC_FILES = (".petscrc", "petscrc")  # of the working folder; the first of the home folder, too
 OPTION = re.compile(r"--?[A-Za-z]")
+READ_BY_OBJECTS = re.compile(r"(^|_)(snes|ksp|pc|mat|vec|mg|sub|eps|st)_")  # whenever one is made
 TOKEN = re.compile(r'"[^"]*"?|\S+')
-MOST_NESTED = 20  # option files within each other
 
 
 def initialise(comm: MPI.Comm, words: list[str]) -> None:
@@ -30,7 +33,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
     Raises InputError for option files that cannot be read, and for values that PETSc refuses at its start.
     """
-    on_root(comm, lambda: _check_files(words))  # rank 0 alone reads them: the others would wait for it
+    on_root(comm, lambda: _check_files(words))  # rank 0 alone reads them: others would wait
     failed = None
     with _captured_stderr() as text:
         try:
@@ -45,47 +48,32 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
 def _check_files(words: list[str]) -> None:
     """Raise InputError for the first option file that PETSc could not read."""
-    words = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
-    if "-skip_petscrc" not in words:
-        for path in [Path.home() / RC_FILES[0], *map(Path, RC_FILES)]:
-            if path.is_file():
-                _check_file(str(path), "", 0)
-    for option, value in pairwise([*words, ""]):
-        if option in FILE_OPTIONS:
-            _check_file(value, option, 0)
+    words = [*os.environ.get("PETSC_OPTIONS", "").split(), *words, ""]
+    for option, name in pairwise(words):
+        if option not in FILE_OPTIONS:
+            continue
+        where = f"{option} {printable(name)}"
+        if not name or OPTION.match(name):
+            raise InputError(f"{option}: names no file")
+        if not Path(name).is_file() or not os.access(name, os.R_OK):
+            raise InputError(f"{where}: is no file that can be read")
+        if option == FILE_OPTIONS[0]:
+            _check_lines(where, Path(name).read_text(errors="replace").splitlines())
 
 
-def _check_file(name: str, option: str, depth: int) -> None:
-    where = f"{option} {printable(name)}".strip()
-    if not name or OPTION.match(name):
-        raise InputError(f"{option}: names no file")
-    path = Path(name)
-    if path.exists() and not path.is_file():  # what a pipe holds can be read only once
-        raise InputError(f"{where}: is a folder, a pipe or a device, not a file")
-    try:
-        lines = path.read_text(errors="replace").splitlines()
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read: {error.strerror}") from None
-    if option == FILE_OPTIONS[1]:
-        return
+def _check_lines(where: str, lines: list[str]) -> None:
+    """Raise InputError for a line that is no option, with or without a value, nor an alias."""
     for number, line in enumerate(lines, 1):
         tokens = TOKEN.findall(line.partition("#")[0])
-        if not _is_an_option(tokens):
+        value = tokens[1] if len(tokens) > 1 else ""
+        is_alias = tokens[:1] == ["alias"] and len(tokens) == 3
+        is_option = len(tokens) <= 2 and all(map(OPTION.match, tokens[:1])) and not re.match("-[A-Za-z]", value)
+        if not is_alias and not is_option:
             raise InputError(f"{where}: line {number} is no option with its value: {printable(line.strip(), 60)}")
-        if tokens[:1] == [FILE_OPTIONS[0]] and depth < MOST_NESTED:
-            _check_file(tokens[-1] if len(tokens) > 1 else "", FILE_OPTIONS[0], depth + 1)
-
-
-def _is_an_option(tokens: list[str]) -> bool:
-    """Whether PETSc takes the tokens of a line: an option, with or without a value; an alias; nothing."""
-    if not tokens or (tokens[0] == "alias" and len(tokens) == 3):
-        return True
-    value = tokens[1] if len(tokens) > 1 else ""
-    return bool(OPTION.match(tokens[0])) and len(tokens) <= 2 and not re.match("-[A-Za-z]", value)
 
 
 def _message(text: str) -> str:
-    """Subject of an error that PETSc printed: its last line before the one on where to find help."""
+    """Subject of an error that PETSc printed: its last line before that on where to find help."""
     lines = re.findall(r"^\[\d+\]PETSC ERROR: (.+)$", text.partition("PETSC ERROR: See ")[0], re.MULTILINE)
     return printable(lines[-1].strip(), 200) if lines else ""
 
@@ -106,3 +94,47 @@ def _captured_stderr() -> Iterator[list[str]]:
             os.close(kept)
             file.seek(0)
             text[0] = file.read().decode(errors="replace")
+
+
+def is_running() -> bool:
+    """Return whether this process has started PETSc."""
+    module = sys.modules.get("petsc4py.PETSc")
+    return module is not None and module.Sys.isInitialized() and not module.Sys.isFinalized()
+
+
+def start_for_runs(comm: MPI.Comm, words: Sequence[str]) -> None:
+    """Start PETSc, if it does not run, with those options that it reads only then (collective).
+
+    The others are for ``lent_options``, which takes them back.
+    """
+    if not is_running():
+        at_start = [(name, value) for name, value in options_of(words).items() if not READ_BY_OBJECTS.search(name)]
+        initialise(comm, [word for name, value in at_start for word in (f"-{name}", value) if word])
+
+
+@contextmanager
+def lent_options(comm: MPI.Comm, words: Sequence[str]) -> Iterator[None]:
+    """Start PETSc with these options; if it runs already, lend it them for the time of the block (collective).
+
+    Raises InputError for options that a PETSc that runs would not read any more.
+    """
+    if not is_running():
+        initialise(comm, list(words))
+        yield
+        return
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    before, options = database.getAll(), options_of(words)
+    for name, value in options.items():
+        if not READ_BY_OBJECTS.search(name) and (name not in before or (before[name] or "") != value):
+            raise InputError(f"-{name}: PETSc runs already, and reads this at its start only: give it to the first run")
+    try:
+        for name, value in options.items():
+            database.setValue(name, value or None)
+        yield
+    finally:
+        for name in database.getAll().keys() - before.keys():
+            database.delValue(name)
+        for name, value in before.items():
+            database.setValue(name, value or None)

@@ -1,21 +1,26 @@
-"""PETSc's C functions that petsc4py lacks."""
+"""PETSc's C functions that petsc4py lacks, and its errors as the one line of an InputError."""
 
 import ctypes
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Array, Floats, Indices
+from msmpetsc.errors import InputError, StepFailed, did_you_mean
+
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
+NOT_CONVERGED = 91  # PETSC_ERR_NOT_CONVERGED, of an inner solver that was asked for it
 
 
 @cache
 def petsc_library() -> ctypes.CDLL:
-    """Return PETSc's library, opened once."""
-    return ctypes.CDLL(PETSc.__file__)  # petsc4py's extension; its symbols include those of libpetsc
+    """Return PETSc's library, opened once; what it prints may come by Python, whose lock is kept therefore."""
+    return ctypes.PyDLL(PETSc.__file__)  # petsc4py's extension has those of libpetsc, too
 
 
 def total_iterations(ksp: PETSc.KSP) -> int:
@@ -26,8 +31,7 @@ def total_iterations(ksp: PETSc.KSP) -> int:
 
 
 def dense_pointer(matrix: PETSc.Mat) -> int:
-    """Address of this rank's numbers of a dense matrix, on the GPU if it has them there
-    (MatDenseGetArrayAndMemType)."""
+    """Address of a rank's numbers of a dense matrix, maybe on a GPU (MatDenseGetArrayAndMemType)."""
     library, handle, array, kind = petsc_library(), ctypes.c_void_p(matrix.handle), ctypes.c_void_p(), ctypes.c_int()
     library.MatDenseGetArrayAndMemType(handle, ctypes.byref(array), ctypes.byref(kind))
     pointer = array.value or 0
@@ -35,32 +39,25 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
     return pointer
 
 
-def open_viewer(option: str) -> None:
-    """Open and close the viewer that an option of the user's names (PetscOptionsGetViewer) (collective).
-
-    Raises PETSc.Error where there is no such viewer, or its file cannot be written.
-    """
-    library, viewer, kind, is_set = petsc_library(), ctypes.c_void_p(), ctypes.c_int(), ctypes.c_int()
-    world = ctypes.c_void_p.in_dll(library, "PETSC_COMM_WORLD")
-    wanted = (world, None, None, f"-{option}".encode(), *map(ctypes.byref, (viewer, kind, is_set)))
-    newer = hasattr(library, "PetscOptionsCreateViewer")  # its name from PETSc 3.22 on
-    create = library.PetscOptionsCreateViewer if newer else library.PetscOptionsGetViewer
-    error = create(*wanted) or library.PetscViewerDestroy(ctypes.byref(viewer))
-    if error:
-        raise PETSc.Error(error)
+def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+    """View an operator that is only known by its products with all its entries, of one product a column
+    (MatComputeOperator) (collective)."""
+    library, matrix = petsc_library(), ctypes.c_void_p()
+    _check(library.MatComputeOperator(ctypes.c_void_p(operator.handle), b"aij", ctypes.byref(matrix)))
+    _check(library.MatView(matrix, ctypes.c_void_p(viewer.handle)))
+    _check(library.MatDestroy(ctypes.byref(matrix)))
 
 
-def preallocate_coo(matrix: PETSc.Mat, rows: np.ndarray, columns: np.ndarray) -> None:
-    """Say which entries ``set_values_coo`` will set, by their global indices (n,); negative ones are left out, those
-    named twice are added (MatSetPreallocationCOO) (collective)."""
+def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
+    """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left out, those named
+    twice are added (MatSetPreallocationCOO) (collective)."""
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
     count = ctypes.c_int64(len(rows))  # PetscCount
     _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
 
 
-def set_values_coo(matrix: PETSc.Mat, values: np.ndarray) -> None:
-    """Set those entries; values (n,) on the CPU or, of a matrix that is there, on a GPU (MatSetValuesCOO)
-    (collective)."""
+def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
+    """Set those entries to values (n,), on a GPU if the matrix is there (MatSetValuesCOO) (collective)."""
     _check(petsc_library().MatSetValuesCOO(ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)))
 
 
@@ -77,8 +74,7 @@ def replaced_option(name: str, value: str) -> Iterator[None]:
 
 
 def set_chebyshev(ksp: PETSc.KSP, least: float, greatest: float) -> None:
-    """Give Chebyshev's method the eigenvalues that it damps between; no matter for other methods
-    (KSPChebyshevSetEigenvalues)."""
+    """Give Chebyshev's method, if it is, what it damps between (KSPChebyshevSetEigenvalues)."""
     bounds = ctypes.c_double(greatest), ctypes.c_double(least)
     _check(petsc_library().KSPChebyshevSetEigenvalues(ctypes.c_void_p(ksp.handle), *bounds))
 
@@ -100,7 +96,7 @@ def square_restricts_transposed() -> bool:
     return is_transposed
 
 
-def _address(array: np.ndarray) -> ctypes.c_void_p:
+def _address(array: Array) -> ctypes.c_void_p:
     on_gpu = getattr(array, "__cuda_array_interface__", None)
     return ctypes.c_void_p(on_gpu["data"][0] if on_gpu else array.ctypes.data)
 
@@ -108,3 +104,46 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
 def _check(error: int) -> None:
     if error:
         raise PETSc.Error(error)
+
+
+@contextmanager
+def petsc_errors(
+    what: str, abandon: Callable[[], None] = lambda: None, further: type[Exception] = ImportError
+) -> Iterator[None]:
+    """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
+
+    ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
+    option made that an error, becomes StepFailed.
+
+    abandon : called after such an error
+    further : more exceptions that come of options here
+    """
+    try:
+        yield
+    except (PETSc.Error, ImportError, further) as error:
+        # No other name for it: a frame that holds an exception is held by it, and PETSc's objects with both, for ever.
+        # Of newer petsc4py, what Python code within PETSc raised is the cause of its own error.
+        cause = error.__cause__
+        if cause is not None and not isinstance(cause, (PETSc.Error, ImportError, further)):
+            raise cause  # noqa: B904 (the error itself, not another)
+        abandon()
+        if getattr(error, "ierr", 0) == NOT_CONVERGED:
+            raise StepFailed(f"did not converge: {last_words(error)}", "linear solve") from None
+        raise InputError(f"{what}: {last_words(cause or error)}") from None
+
+
+def last_words(error: BaseException) -> str:
+    """Message of a PETSc error, without the calls it came through."""
+    lines = str(error).splitlines()
+    said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
+    words = said[-1] if said else lines[0]
+    return words + _nearest_type(words)
+
+
+def _nearest_type(words: str) -> str:
+    """Return the nearest type of solver where there is none: ", did you mean 'pipecg'?"."""
+    wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
+    if wanted is None:
+        return ""
+    types = getattr(PETSc, wanted[1]).Type
+    return did_you_mean(wanted[2], [name for name in vars(types).values() if isinstance(name, str)])

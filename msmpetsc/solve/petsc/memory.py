@@ -4,70 +4,59 @@ Both forms do the same: hand out the numbers of a vector as an array, without a 
 blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
 """
 
-from typing import Protocol
-
 import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
-from msmpetsc.backend.arrays import on_host
+from msmpetsc.backend.arrays import Floats, on_host
 from msmpetsc.solve.petsc.library import dense_pointer
 
 
-class Memory(Protocol):
-    """types: PETSc's names of vectors and matrices there."""
+class Memory:
+    """The CPU's.
 
-    vec_type: str
-    mat_type: str
+    types : PETSc's names of vectors and matrices there
+    """
 
-    def read(self, vector: PETSc.Vec) -> np.ndarray:
-        """This rank's numbers, not to be written to."""
-
-    def write(self, vector: PETSc.Vec) -> np.ndarray:
-        """This rank's numbers, to be written to at once; reading them as well is allowed."""
-
-    def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
-        """A vector of all ranks' arrays (n,), which it keeps its numbers in."""
-
-    def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
-        """A dense matrix; rows: of this rank, of all."""
-
-    def values(self, dense: PETSc.Mat) -> np.ndarray:
-        """This rank's part of a dense matrix, column after column (columns * rows,), to be read or written at once."""
-
-
-class Host:
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 
-    def read(self, vector: PETSc.Vec) -> np.ndarray:
-        return vector.array_r
+    def read(self, vector: PETSc.Vec) -> Floats:
+        """Return this rank's numbers, not to be written to."""
+        return np.asarray(vector.array_r)
 
-    def write(self, vector: PETSc.Vec) -> np.ndarray:
-        return vector.array
+    def write(self, vector: PETSc.Vec) -> Floats:
+        """Return this rank's numbers, to be written to at once; reading them as well is allowed."""
+        return np.asarray(vector.array)
 
-    def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
+    def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
+        """Return a vector of all ranks' arrays (n,), which it keeps its numbers in."""
         return PETSc.Vec().createWithArray(array, (len(array), None), comm=comm)
 
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
+        """Return a dense matrix; rows: of this rank, of all."""
         return _ready(PETSc.Mat().createDense((rows, (None, columns)), comm=comm))
 
-    def values(self, dense: PETSc.Mat) -> np.ndarray:
-        return dense.getDenseArray().T.reshape(-1)
+    def values(self, dense: PETSc.Mat) -> Floats:
+        """Return this rank's part of a dense matrix, column after column, to be read or written at once."""
+        return np.asarray(dense.getDenseArray().T.reshape(-1))
 
 
-class Cuda:
-    """Pointers are given back at once, as petsc4py does for DLPack: PETSc then knows that the GPU has the last word,
-    and what is written later is in the same stream as all of PETSc's work, the default one."""
+class CudaMemory(Memory):
+    """A GPU's.
+
+    Pointers are given back at once, as petsc4py does for DLPack: PETSc then knows that the GPU has the last word, and
+    what is written later is in the same stream as all of PETSc's work, the default one.
+    """
 
     vec_type, mat_type = PETSc.Vec.Type.CUDA, PETSc.Mat.Type.AIJCUSPARSE
 
-    def read(self, vector: PETSc.Vec) -> np.ndarray:
+    def read(self, vector: PETSc.Vec) -> Floats:
         return self._view(vector, "r")
 
-    def write(self, vector: PETSc.Vec) -> np.ndarray:
+    def write(self, vector: PETSc.Vec) -> Floats:
         return self._view(vector, "rw")
 
-    def over(self, array: np.ndarray, comm: PETSc.Comm) -> PETSc.Vec:
+    def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
         return PETSc.Vec().createCUDAWithArrays(
             cudahandle=array.data.ptr,  # type: ignore[attr-defined]  # CuPy's
             size=(len(array), None),
@@ -77,10 +66,10 @@ class Cuda:
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
         return _ready(PETSc.Mat().createDenseCUDA((rows, (None, columns)), comm=comm))
 
-    def values(self, dense: PETSc.Mat) -> np.ndarray:
+    def values(self, dense: PETSc.Mat) -> Floats:
         return cuda.view(dense_pointer(dense), dense.getLocalSize()[0] * dense.getSize()[1])
 
-    def _view(self, vector: PETSc.Vec, mode: str) -> np.ndarray:
+    def _view(self, vector: PETSc.Vec, mode: str) -> Floats:
         pointer = vector.getCUDAHandle(mode)
         vector.restoreCUDAHandle(pointer, mode)
         return cuda.view(pointer, vector.getLocalSize())
@@ -92,8 +81,8 @@ def _ready(dense: PETSc.Mat) -> PETSc.Mat:
     return dense
 
 
-HOST, CUDA = Host(), Cuda()
+HOST, CUDA = Memory(), CudaMemory()
 
 
-def memory_of(array: np.ndarray) -> Memory:
+def memory_of(array: Floats) -> Memory:
     return HOST if on_host(array) else CUDA

@@ -3,7 +3,6 @@ lattice."""
 
 import numpy as np
 import pytest
-from conftest import WORKERS
 from hierarchies import COMM, SHAPES, block, build, figure, hierarchy
 
 TOLERANCE = 3e-2  # -ksp_rtol of newton's presets
@@ -36,8 +35,3 @@ def test_few_iterations_at_any_step_and_fineness(name: str, shape: str):
     print(name, shape, *(each.T.tolist() for each in found))
     assert np.max(found) <= MOST[name]
     assert (found[-1] - found[0]).max() <= GROWTH
-
-
-def test_counts_of_three_ranks_are_those_of_one(on_ranks):
-    done = on_ranks(3, WORKERS / "multigrid_worker.py", "counts")
-    assert done.returncode == 0 and done.stdout.count("same") == 3, done.stdout + done.stderr

@@ -16,8 +16,7 @@ SCENE = {
 OBEYED = [
     "-pc_mg_levels 2", "-pc_mg_levels 3 -pc_mg_cycle_type w", "-mg_levels_ksp_max_it 2", "-mg_coarse_pc_type cholesky",
     "-pc_mg_type additive", "-pc_mg_type full", "-mg_levels_ksp_type richardson", "-mg_coarse_redundant_pc_type lu",
-    "-ksp_view", "-pc_mg_log -log_view", "-mg_levels_2_ksp_max_it 3 -pc_mg_levels 3",
-    "-matptap_via scalable -pc_mg_levels 3",
+    "-ksp_view", "-pc_mg_log -log_view", "-matptap_via scalable -pc_mg_levels 3",
 ]  # fmt: skip
 REFUSED = {
     "-pc_mg_levels 1": "two levels or more",

@@ -14,9 +14,8 @@ from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.multigrid import cycle
-from msmpetsc.solve.multigrid.preconditioner import LatticePreconditioner
 from msmpetsc.solve.nonlinear import preconditioning
-from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner, StepPreconditioner
 from msmpetsc.solve.simulate import Simulation
 
 COMM = MPI.COMM_SELF
@@ -43,18 +42,12 @@ def pressed(preset: str, **tables) -> dict:
     return scene(preset, mesh=mesh, start=start, obstacle=PRESSING) | tables
 
 
+BDF2 = {"step": 0.02, "duration": 0.02 * STEPS, "integrator": "bdf2"}
 CASES = {
-    "held": scene("newton-multigrid", pin=HELD),
-    "pressed": pressed("newton-multigrid"),
-    "led and let go": scene("newton-multigrid", pin=HELD, anchor=LED),
-    "bdf2, pressed": pressed(
-        "newton-multigrid", time={"step": 0.02, "duration": 0.02 * STEPS, "integrator": "bdf2"}
-    ),
     "stiffening, pressed": pressed("newton-multigrid", material=SOFT | {"law": "stiffening"}),
-    "switched, held": scene("newton", pin=HELD),
+    "bdf2, pressed": pressed("newton-multigrid", time=BDF2),
+    "led and let go": scene("newton-multigrid", pin=HELD, anchor=LED),
     "switched, pressed": pressed("newton"),
-    "switched, led and let go": scene("newton", pin=HELD, anchor=LED),
-    "substep": pressed("newton-multigrid", safety={"on_failure": "substep"}),
     "fallback": pressed(
         "fast-msm", safety={"on_failure": "fallback"}, start={"velocity": [0.1, 0, -10.0]},
         solver={"preset": "fast-msm", "error": 1e-6},
@@ -67,7 +60,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several coarse levels; hierarchies that are given up soon; newton that changes over after a few steps."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
     monkeypatch.setattr(simulate, "REMEMBERED", 3)
-    monkeypatch.setattr("msmpetsc.solve.multigrid.preconditioner.WORTH", 1.0)
+    monkeypatch.setattr(preconditioning, "WORTH", 1.0)
     monkeypatch.setattr(preconditioning, "LONG", 4)
     monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
 
@@ -78,7 +71,7 @@ def assert_equal(found: dict, expected: dict) -> None:
         assert np.array_equal(found[name], expected[name], equal_nan=True) if expected[name] is not None else True, name
 
 
-QUICK = {"pressed", "stiffening, pressed", "switched, pressed", "fallback"}  # each takes some five seconds
+QUICK = {"stiffening, pressed", "switched, pressed", "fallback"}  # each takes some five seconds
 
 
 @pytest.mark.parametrize(
@@ -112,12 +105,10 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", [pytest.param("pressed", marks=pytest.mark.slow), "chosen, led and let go"])
-def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, name: str, ranks: int):
+def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, ranks: int):
     """By the command line, on several coarse levels."""
     stiff = {"young_modulus": 1e9, "density": 1000.0}
-    chosen = scene("newton", pin=HELD, anchor=LED, material=stiff)
-    path = block_scene(tmp_path, **(pressed("newton-multigrid") if name == "pressed" else chosen))
+    path = block_scene(tmp_path, **scene("newton", pin=HELD, anchor=LED, material=stiff))
     for step, file in ((6, "x.h5"), (-1, "whole.h5")):
         done = on_ranks(ranks, WORKERS / "stop_worker.py", step, "run", path, "-o", tmp_path / file, "-pc_mg_levels", 3)
         assert done.returncode == 0, done.stderr

@@ -6,7 +6,7 @@ from conftest import WORKERS
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.solve.multigrid.grids import grid_indices, grids, parents_of
+from msmpetsc.solve.multigrid.grids import grid_indices, grids
 
 
 @pytest.mark.parametrize("pins", [False, True])
@@ -29,14 +29,6 @@ def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
             np.testing.assert_allclose((p @ values.ravel()).reshape(-1, 3), fine @ slopes + at_origin, rtol=1e-12)
             assert (p != 0).any(axis=0).all()  # no coarse node without fine ones
             fine = ijk
-
-
-def test_a_node_has_the_parents_around_it():
-    keys, needed = parents_of(np.array([[2, 4, 6], [3, 4, 6], [3, 5, 6], [3, 5, 7]]))
-    np.testing.assert_array_equal(needed.sum(axis=1), [1, 2, 4, 8])
-    parents = decode_morton(keys[3][needed[3]])
-    np.testing.assert_array_equal(np.unique(parents, axis=0), 1 + np.array([0, 1, 2]) + np.argwhere(np.ones((2, 2, 2))))
-    np.testing.assert_array_equal(decode_morton(keys[0][needed[0]]), [[1, 2, 3]])
 
 
 @pytest.mark.parametrize(
@@ -70,5 +62,5 @@ def test_grid_indices_are_those_of_the_keys(name: str):
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_hierarchies_of_several_ranks_are_those_of_one(on_ranks, ranks: int):
     """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
-    done = on_ranks(ranks, WORKERS / "multigrid_worker.py", "hierarchy")
+    done = on_ranks(ranks, WORKERS / "multigrid_worker.py")
     assert done.returncode == 0 and done.stdout.count("same") == ranks, done.stdout + done.stderr

@@ -7,7 +7,7 @@ from lattices import cages_of
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.lattice.lattice import build_lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
-from msmpetsc.solve.multigrid.preconditioner import USUAL_PACE, WORTH, LatticePreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import WORTH, LatticePreconditioner
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def kept(petsc_options):
     """A preconditioner with a hierarchy of the lattice at rest, and another one asked for at turned positions."""
     lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), 1000.0, young_modulus=2e5)
     unknowns = Unknowns(COMM, lattice)
-    one = LatticePreconditioner(COMM, unknowns, Elasticity(COMM, lattice), 0.02, "", False)
+    one = LatticePreconditioner(unknowns, Elasticity(COMM, lattice), 0.02, "")
     one.prepare(lattice.nodes, None)
     yield one, SHAPES["turned"](lattice.nodes)
     one.destroy()
@@ -43,9 +43,3 @@ def test_it_is_given_up_when_it_has_cost_as_much_as_a_new_one(kept):
         assert not preconditioner.is_stale
     preconditioner.learn(7, 1e-1)
     assert preconditioner.prepare(q, None) and preconditioner.wasted == 0 and preconditioner.pace is None
-
-
-def test_that_at_rest_is_held_against_the_usual(kept):
-    preconditioner, q = kept
-    preconditioner.learn(round(USUAL_PACE + WORTH) + 1, 1e-1)
-    assert preconditioner.prepare(q, None)

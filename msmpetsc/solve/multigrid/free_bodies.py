@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import like, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
 from msmpetsc.comm import Route, SortedKeys
 from msmpetsc.geometry.grid import LIMIT
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -23,16 +23,12 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 
 @dataclass(frozen=True)
 class Bodies:
-    """Bodies of a lattice.
+    """Bodies of a lattice."""
 
-    number : (l,) of each local node's body; -1 where it is held
-    free   : (b,) bool of each body, whether no spring holds it
-    """
+    number: Indices  # (l,) of each local node's body; -1 where it is held
+    free: Mask  # (b,) bool of each body, whether no spring holds it
 
-    number: np.ndarray
-    free: np.ndarray
-
-    def apart(self, comm: MPI.Comm, ijk: np.ndarray) -> np.ndarray:
+    def apart(self, comm: MPI.Comm, ijk: Indices) -> Indices:
         """Return how far each local node's body is to be moved along the grid's first axis, (l,), so that no two have a
         coarse cell in common; 0 where the grid has no room for that, and of what is held (collective).
 
@@ -43,15 +39,15 @@ class Bodies:
         return np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
 
 
-def bodies_of(comm: MPI.Comm, unknowns: Unknowns) -> Bodies:
+def bodies_of(unknowns: Unknowns) -> Bodies:
     """Return the bodies of a lattice (collective)."""
-    lattice = unknowns.lattice
+    comm, lattice = unknowns.comm, unknowns.lattice
     moves, springs = ~to_host(lattice.pinned), lattice.springs
     both, either = moves[springs].all(axis=1), moves[springs].any(axis=1)
     joined = springs[both]
     graph = coo_array((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2)
     part = connected_components(graph, directed=False)[1]
-    name = _names(comm, unknowns, part)
+    name = _names(unknowns, part)
     table = SortedKeys(comm, name[: lattice.owned][moves[: lattice.owned]])
     number = np.where(moves, table.find(np.where(moves, name, -1)), -1)
     held = np.zeros(table.total, bool)
@@ -61,12 +57,12 @@ def bodies_of(comm: MPI.Comm, unknowns: Unknowns) -> Bodies:
     return Bodies(number, ~held)
 
 
-def _names(comm: MPI.Comm, unknowns: Unknowns, part: np.ndarray) -> np.ndarray:
+def _names(unknowns: Unknowns, part: Indices) -> Indices:
     """The least global number (l,) in the body of each node; ``part`` (l,) that of this rank it belongs to.
 
     Ranks that have parts of one body tell each other until none learns of a lesser number.
     """
-    lattice = unknowns.lattice
+    comm, lattice = unknowns.comm, unknowns.lattice
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     name, is_new = lattice.global_numbers, True
@@ -88,14 +84,14 @@ class Translations:
     of_body : (b,) of each free body [kg]
     """
 
-    def __init__(self, comm: MPI.Comm, unknowns: Unknowns, bodies: Bodies):
-        self.comm, self.unknowns, self.count = comm, unknowns, int(bodies.free.sum())
+    def __init__(self, unknowns: Unknowns, bodies: Bodies):
+        self.unknowns, self.count = unknowns, int(bodies.free.sum())
         rank = np.where(bodies.free, np.cumsum(bodies.free) - 1, self.count)
         self.body = like(unknowns.lattice.nodes, rank[bodies.number[to_host(unknowns.free)]])
         self.mass = unknowns.lattice.mass[unknowns.free]
         self.of_body = self._sums(self.mass[None])[0]
 
-    def of(self, forces: np.ndarray) -> np.ndarray:
+    def of(self, forces: Rows) -> Rows:
         """Return T (T^T M T)^-1 T^T f, (3, m), of f (3, m)."""
         moved = self._sums(forces) / self.of_body
         return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))[:, self.body]
@@ -111,7 +107,7 @@ class Translations:
         moved = unknowns.columns_to_write(y)
         moved += whole - self.of(self.mass * moved)
 
-    def _sums(self, rows: np.ndarray) -> np.ndarray:
+    def _sums(self, rows: Rows) -> Floats:
         """Sums (r, b) over each free body's nodes of rows (r, m)."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
-        return self.comm.allreduce(np.array(own).reshape(len(rows), self.count))
+        return self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))

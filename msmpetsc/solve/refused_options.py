@@ -12,16 +12,13 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.solve.petsc.errors import petsc_errors
-from msmpetsc.solve.petsc.library import Integer, open_viewer, petsc_library
+from msmpetsc.solve.petsc.library import Integer, petsc_errors, petsc_library
 from msmpetsc.solve.presets import PRESETS, Preset, forget_defaults, set_defaults
 
 READ_AT_THE_END = re.compile(
     r"^(citations|get_total_flops|mpidump|options_left|options_view|memory_view|objects_dump|malloc_\w+)$"
 )
 READ_WHILE_SOLVING = re.compile(r"_view|_dump|_converged_reason|_monitor|_test_jacobian|_rate")
-SWITCHES_READ_AT_THE_END = ("options_left", "get_total_flops", "mpidump")
-VIEWERS_READ_AT_THE_END = ("log_view", "options_view", "memory_view")
 OF_STEPPERS = re.compile(r"^(reference_|fallback_)")
 
 OFTEN_GIVEN = {"ksp_view", "ksp_monitor", "ksp_max_it", "ksp_atol", "snes_view", "snes_monitor", "mat_type", "mat_view"}
@@ -69,7 +66,6 @@ def refuse_early(comm: MPI.Comm, ours: Collection[str]) -> None:
     message = comm.bcast(message)
     if message:
         raise InputError(message)
-    _check_what_is_read_at_the_end(database)
 
 
 def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
@@ -131,19 +127,6 @@ def _ours(name: str, ours: Collection[str]) -> str:
     valid = {own.lstrip("-").replace("-", "_"): own for own in ours}
     near = [name] if name.replace("-", "_") in valid else difflib.get_close_matches(name, valid, 1) * ("_" not in name)
     return f", did you mean {valid[near[0].replace('-', '_')]!r}?" if near else ""
-
-
-def _check_what_is_read_at_the_end(database: dict[str, str]) -> None:
-    """Raise InputError for values that would make PETSc fail when it ends, after all is computed (collective)."""
-    checks = {name: PETSc.Options().getBool for name in SWITCHES_READ_AT_THE_END}
-    checks |= {name: open_viewer for name in VIEWERS_READ_AT_THE_END}
-    for name in sorted(checks.keys() & {name for name, value in database.items() if value}):
-        try:
-            with petsc_errors(f"-{name} {database[name]}"):
-                checks[name](name)
-        except InputError:
-            PETSc.Options().delValue(name)  # for PETSc ends now, too
-            raise
 
 
 def _left() -> list[str]:

@@ -134,9 +134,10 @@ def read_table(folder: Path) -> "DataFrame":
     if not path.is_file():
         raise InputError(f"no table.csv in {folder}: it is no folder of a study")
     try:
-        return typed(pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna(""))
+        texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna("")
     except ValueError as error:  # of pandas' parser, of text that is not UTF-8
         raise InputError(f"{path} is not the table of a study: {str(error).splitlines()[0]}") from None
+    return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
 
 
 def as_table(rows: Sequence[Row]) -> "DataFrame":
@@ -147,18 +148,12 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
     return table.astype(dict.fromkeys(TEXT, object)).fillna(dict.fromkeys(TEXT, ""))
 
 
-def typed(texts: "DataFrame | Iterable[Mapping[str, str]]") -> "DataFrame":
-    """Return rows of text as a table with numbers for numbers; columns of no study stay, as text.
+def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
+    """Return rows of text as a table with numbers for numbers.
 
     What is missing, not a number, infinite or unreadable was not measured: NaN.
     """
-    from pandas import DataFrame
-
-    texts = DataFrame(texts if isinstance(texts, DataFrame) else list(texts))
-    stripped = texts.fillna("").map(str.strip)
-    unknown = [name for name in stripped if name not in COLUMNS]
-    table = stripped.reindex(columns=[*COLUMNS, *unknown], fill_value="").astype(object).fillna("")
-    return table.assign(**{name: table[name].map(_number).astype(float) for name in NUMBERS})
+    return as_table([{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts])
 
 
 def records(table: "DataFrame") -> list[Row]:

@@ -20,7 +20,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Scene
 from msmpetsc.solve.nonlinear.failure import REASON
 from msmpetsc.solve.simulate import Simulation
-from msmpetsc.study.distances import distance_of_shapes
+from msmpetsc.study.metrics import distance_of_shapes
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]

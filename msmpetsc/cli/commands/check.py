@@ -14,8 +14,8 @@ from msmpetsc.cli.ranks import RUNS_ITSELF, refuse_ranks
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.baselines import baseline
-from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, row
+from msmpetsc.study import baseline
+from msmpetsc.study.baseline import HEAD, Numbers, Recipe, judged, row
 
 SAME, DIFFERENT = 0, 1
 STEPS = 20  # of a scene's numbers, if nothing else is asked for
@@ -64,20 +64,20 @@ def run(args: argparse.Namespace) -> int:
 
 def update(scene: Path, file: Path, args: argparse.Namespace) -> None:
     """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
+    cells, steps, changes = args.cells, args.frames or STEPS, args.set
     if file.is_file() and not (args.frames or args.cells or args.set):
-        recipe = Recipe.of(baseline.read(file))
-    else:
-        recipe = Recipe(args.cells, args.frames or STEPS, tuple(args.set))
-    time = load_scene(scene, recipe.changes, by_user=False).time
+        before = baseline.read(file).run
+        cells, steps, changes = before.cells, before.steps, before.changes
+    time = load_scene(scene, changes, by_user=False).time
     if time.error is not None:
         raise InputError(
             f"{scene}: time.error chooses steps by an estimate: how far numbers may be apart then is not known; "
             "--set time={step=..., duration=...} takes steps of one length"
         )
-    recipe = Recipe(recipe.cells, min(recipe.steps, time.steps), recipe.changes)
+    recipe = Recipe(cells=cells, steps=min(steps, time.steps, baseline.MOST_STEPS), changes=changes)
     numbers = found(scene, recipe, args.ranks)
     baseline.write(file, numbers)
-    count = len(numbers["counts"]) + len(numbers["numbers"])
+    count = len(numbers.counts) + len(numbers.numbers)
     accuracy = baseline.allowed(recipe.steps, "m")
     print(f"{file}: {count} numbers after {recipe.steps} steps, positions to {accuracy:.1g}")
 
@@ -122,12 +122,11 @@ def check(files: Mapping[Path, Path], args: argparse.Namespace) -> int:
 def checked(scene: Path, stored: Numbers, args: argparse.Namespace) -> Checked:
     """Run a scene as its stored numbers were made, and print its line."""
     began = perf_counter()
-    numbers = found(scene, Recipe.of(stored), args.ranks)
+    numbers = found(scene, stored.run, args.ranks)
     outcome = Checked(scene, judged(numbers, stored), perf_counter() - began)
     if not args.json:
         verdict = "DIFFERS" if outcome.wrong else "same"
-        limit = nearest_to_limit(numbers, stored)
-        print(row(scene.stem, numbers["counts"], limit, outcome.seconds, verdict), flush=True)
+        print(row(scene.stem, numbers, stored, outcome.seconds, verdict), flush=True)
     return outcome
 
 

@@ -14,8 +14,7 @@ from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.keys import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.shipped import shipped_text, shipped_titles
-from msmpetsc.study.drafting.draft import draft, upwards
-from msmpetsc.study.drafting.measures import MeshMeasures, measured
+from msmpetsc.study.new_scene import MeshMeasures, draft, measured, upwards
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,9 +19,7 @@ from msmpetsc.scene.statics import STATIC
 
 if TYPE_CHECKING:
     from msmpetsc.study.runner import Bench
-    from msmpetsc.study.scene_lines import Tables
-    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial
-    from msmpetsc.study.sizing.choice import Candidate
+    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -60,36 +58,38 @@ def bench() -> Iterator["Bench"]:
             processes.stop()
 
 
-def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables") -> str:
+def print_command(args: argparse.Namespace, answer: "Tables") -> str:
     """Print lines to paste and a command that says the same, or change the file; return the command."""
     from msmpetsc.study.cases import launcher
-    from msmpetsc.study.scene_lines import lines, overrides, put_into
+    from msmpetsc.study.sizing.answer import lines, overrides, put_into
 
-    print(f"\n{lines(method, more)}\n")
-    changes = [word for change in overrides(args.scene, method, more) for word in ("--set", change)]
+    print(f"\n{lines(answer)}\n")
+    changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
     print(command, flush=True)
     if args.write:
-        put_into(args.scene, method, more)
+        put_into(args.scene, answer)
         print(f"\nwritten into {args.scene}")
     return command
 
 
 def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, Any]]:
     """Try lattices and steps; return whether the choice meets the error, and all as a record."""
+    from msmpetsc.study.sizing.answer import tables
+
     plan = size_all(args, target)
     if args.chart:
         draw(plan, args.chart, target)
     print_size(plan, target)
     choice, budget = plan.choice, plan.choice.budget
-    more: Tables = {
+    more = {
         "cages": {"count": choice.cells, "cell_size": None},
         "budget": {
             "target": target, **{name: float(f"{value:.2g}") for name, value in vars(budget).items()},
             "count": choice.cells, "time_step": choice.method.time_step,
         },
     }  # fmt: skip
-    command = print_command(args, choice.method, more) if plan.met else None
+    command = print_command(args, {**tables(choice.method), **more}) if plan.met else None
     tried = [each._asdict() for each in plan.tried]
     record = {
         "choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "tried": tried, "command": command,
@@ -100,13 +100,11 @@ def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
     """Make the trials, and print each when it is done."""
     from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.sizing.trials import Sizer
+    from msmpetsc.study.sizing.trials import Asked, Sizer
 
     with bench() as runs:
-        sizer = Sizer(
-            args.scene, runs, target=target, presets=preset_names(), frames=args.frames, cells=args.cells,
-            ranks=args.ranks, report=print_size_trial,
-        )  # fmt: skip
+        asked = Asked(target, args.frames, args.cells, args.ranks)
+        sizer = Sizer(args.scene, runs, asked, preset_names(), print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
 
@@ -140,7 +138,7 @@ def print_size(plan: "SizePlan", target: float) -> None:
 
 def draw(plan: "SizePlan", path: Path, target: float) -> None:
     """Draw the expected error of each trial over its cost, and ring the choice."""
-    from msmpetsc.study.charts.sizes import plan_picture
+    from msmpetsc.study.charts.pareto import plan_picture
 
     plan_picture(plan, target, path)
     print(f"drawn: {path}")

@@ -77,21 +77,18 @@ def of_frames(result: Path, time_step: float) -> Row:
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
     start = 2 if count > 2 else 1  # what is only done once shows in the first frame
     known = [name for name in ("wall_time", *COUNTED) if name in series]
-    mean = {name: series[name][start:].sum() / steps[start - 1 :].sum() for name in known}
-    row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
-    row |= {name: float(mean[name]) for name in COUNTED if name in mean}
+    mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
+    row = {"frames": count, "steps": int(steps.sum()), "time_frame": mean.pop("wall_time"), **mean}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
     return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
 
 
 def _soundness(series: dict[str, np.ndarray]) -> Row:
-    """Return what went wrong on the way, as far as the file has it; inverted cells count in the last frame alone."""
-    row: Row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
-    if "energy_gained" in series:
-        row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
-    if "inverted" in series and series["inverted"][-1] >= 0:
+    """Return what went wrong on the way; inverted cells count in the last frame alone, where they were counted."""
+    row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
+    if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
-    if "self_contacts" in series and series["self_contacts"].any():
+    if series["self_contacts"].any():
         row["self_contacts"] = float(series["self_contacts"].max())
         row["self_distance"] = float(np.nanmin(series["self_distance"]))
     return row
@@ -99,21 +96,18 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
 
 def _energy_left(series: dict[str, np.ndarray]) -> float | None:
     """Return the energy at the end over that at the start; None for a body on which a load acts."""
-    energy = series["kinetic"] + series["elastic"] + series["contact"] + series.get("self_contact", 0.0)
+    energy = sum(series[name] for name in ("kinetic", "elastic", "contact", "self_contact"))
     return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 
 def _errors(series: dict[str, np.ndarray]) -> Row:
     """Return root mean squares over the steps whose true error was measured, or over all."""
-    estimated = series["step_error"][1:]
-    nothing = np.full(len(estimated), np.nan)
-    true = series["true_error"][1:] if "true_error" in series else nothing
-    energy = series["energy_error"][1:] if "energy_error" in series else nothing
+    estimated, true = series["step_error"][1:], series["true_error"][1:]
     where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
     return {  # of a step with no minimum near the estimate is infinite: then there is none of the run
         "estimated_error": None if np.isinf(estimated[where]).any() else _rms(estimated[where]),
         "true_error": _rms(true[where]),
-        "energy_error": _rms(energy[where]),
+        "energy_error": _rms(series["energy_error"][1:][where]),
     }
 
 

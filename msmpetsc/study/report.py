@@ -3,14 +3,14 @@
 What stands where is in report.html.j2; this file says what it is.
 """
 
-import json
 import tomllib
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
+from pandas import DataFrame, option_context
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
@@ -28,12 +28,10 @@ from msmpetsc.study.table import (
     is_repeated,
     mapped,
     read_table,
+    read_traces,
     swept,
     timed,
 )
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 FIRST, LAST = ["scene", "label", "status"], ["command"]  # columns of the whole table
 ABOVE = ["study", "machine", "versions"]
@@ -58,33 +56,24 @@ def write_report(folder: Path) -> Path:
     return path
 
 
-def draw_charts(table: "DataFrame", traces: list[dict], study: dict) -> list[Chart]:
+def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[Chart]:
     """Return all charts that there are numbers for; a method looks the same in each.
 
     study : the tables of the study file
     """
-    styles = curve_styles([*table["label"], *(entry["label"] for entry in traces)])
+    styles = curve_styles(table["label"])
     charts = stability_charts(table, study)
     sweeps = swept(table)
     for draw in (size_charts, pareto_charts, growth_charts):
         charts += draw(sweeps, styles)
     charts += order_charts(sweeps, styles, study)
-    commands = dict(zip(sweeps["case"], sweeps["command"], strict=True))
-    commands.pop("", None)
-    return charts + convergence_charts(traces, styles, commands)
-
-
-def read_traces(folder: Path) -> list[dict]:
-    """Return the entries of traces.json that have a trace; none where there is no such file."""
-    path = folder / "traces.json"
-    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    return [entry for entry in entries if entry.get("trace")]
+    return charts + convergence_charts(sweeps, styles, traces)
 
 
 # The page
 
 
-def page(title: str, date: str, table: "DataFrame", charts: list[Chart]) -> str:
+def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"anchor": anchor, "svg": lambda chart: Markup(svg_text(chart)), "html": html}
@@ -93,7 +82,7 @@ def page(title: str, date: str, table: "DataFrame", charts: list[Chart]) -> str:
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
 
-def facts(table: "DataFrame") -> dict[str, Any]:
+def facts(table: DataFrame) -> dict[str, Any]:
     """Return machine, versions and how many cases there are."""
     plain = swept(table)
     maps = {name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()}
@@ -102,7 +91,7 @@ def facts(table: "DataFrame") -> dict[str, Any]:
     return counts | {"maps": maps, "platforms": platforms, "repeats": repeats_note(timed(plain))}
 
 
-def repeats_note(rows: "DataFrame") -> str:
+def repeats_note(rows: DataFrame) -> str:
     """Say how often cases were run, and what follows for their times; empty without cases."""
     counts = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
     if rows.empty or not is_repeated(rows):
@@ -110,17 +99,15 @@ def repeats_note(rows: "DataFrame") -> str:
     return f"{counts}: times are medians, ranges and whiskers from the least to the greatest"
 
 
-def whole_table(table: "DataFrame") -> "DataFrame":
+def whole_table(table: DataFrame) -> DataFrame:
     """Return all columns that some case fills, but for those that stand above all; numbers before texts."""
     between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, *LAST, *ABOVE)]
     filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
     return table[[*FIRST, *filled, *LAST]]
 
 
-def html(table: "DataFrame") -> Markup:
+def html(table: DataFrame) -> Markup:
     """Return a table whose headings sort it."""
-    from pandas import option_context
-
     with option_context("display.max_colwidth", None):
         return Markup(table.map(formatting.plain).to_html(index=False, border=0, classes="sortable"))
 

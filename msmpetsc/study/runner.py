@@ -29,7 +29,7 @@ from msmpetsc.study.metrics import (
 )
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.schema import Study, load_study
-from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
+from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
 
 SETTINGS = ("cells", "time_step", "substep", "error", "max_iterations")  # that tell cases of a label apart
 PARTS = "parts"  # folder of the parts' folders
@@ -163,13 +163,13 @@ class StudyResults:
         case = result.row["case"]
         self.rows[case] = result.row
         if result.trace:
-            self.traces[case] = {key: result.row[key] for key in ("case", "scene", "label")} | {"trace": result.trace}
+            self.traces[case] = result.trace
         self.write()
 
     def write(self) -> None:
         """Write table and traces, each replaced whole."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
-        traces = [self.traces[case] for case in self.order if case in self.traces]
+        traces = {case: self.traces[case] for case in self.order if case in self.traces}
         write_whole(self.folder / "traces.json", json.dumps(traces))
 
 
@@ -293,9 +293,7 @@ def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
         rows = {row["case"]: row for row in _earlier_rows(folder) if row["case"] in by_id}
         new = {case: row for case, row in rows.items() if not _is_done(by_id[case], results.rows)}
         results.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
-        results.traces |= _traces(folder, new)
-    for case, entry in results.traces.items():
-        entry["label"] = by_id[case].label
+        results.traces |= {case: trace for case, trace in read_traces(folder).items() if case in new}
     return results
 
 
@@ -311,16 +309,6 @@ def _earlier_rows(folder: Path) -> list[Row]:
     if table is None or (table["case"] == "").any() or table[["ranks", "repeats"]].isna().any(axis=None):
         raise InputError(f"{path} is not the table of a study of this version: --restart begins anew")
     return records(table)
-
-
-def _traces(folder: Path, cases: Collection[str]) -> dict[str, dict]:
-    """Return what traces.json of a folder has of these cases."""
-    traces = folder / "traces.json"
-    try:
-        entries = json.loads(traces.read_text()) if traces.is_file() else []
-        return {entry["case"]: entry for entry in entries if entry["case"] in cases}
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{traces} is not what a study left: --restart begins anew") from None
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:

@@ -21,7 +21,7 @@ from msmpetsc.study.table import read_table, succeeded, typed
 ERRORS = [
     row_of("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
     row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
-    row_of("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    row_of("anderson", case="anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
     row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
     row_of("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
     row_of("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
@@ -34,22 +34,17 @@ SWEEP = [
     )
     for n, time in zip((1000, 10000, 100000), times, strict=True)
 ]
-TRACES = [
-    {
-        "scene": "block",
-        "label": label,
-        "case": label,
-        "trace": {
-            "frame": 7,
-            "iteration": [0, 1, 2],
-            "ksp_its": [0, 5, 9],
-            "seconds": [0.0, 0.011, 0.023],
-            "position_error": [0.3, rate, rate**2],
-            "energy_error": [0.1, None, rate**4],
-        },
+TRACES = {
+    label: {
+        "frame": 7,
+        "iteration": [0, 1, 2],
+        "ksp_its": [0, 5, 9],
+        "seconds": [0.0, 0.011, 0.023],
+        "position_error": [0.3, rate, rate**2],
+        "energy_error": [0.1, None, rate**4],
     }
     for label, rate in (("newton", 0.012), ("anderson", 0.17))
-]
+}
 
 
 @pytest.fixture(scope="module")
@@ -214,16 +209,16 @@ def test_every_point_tells_its_numbers(text: str):
     newton = "newton\ntrue error 3e-5\ntime frame 80 ms\ntime step 10 ms\nerror 1e-4\n"
     assert any(tip.startswith(newton) for tip in tips)
     assert "cg (step error 5e-4)\ncells 10,000\ntime frame a cell 9 µs" in "\n".join(tips)
-    assert "anderson\niteration 1\nseconds 11 ms\nposition error 1.7e-1\nksp its 5" in tips
+    assert any(
+        tip.startswith("anderson\niteration 1\nseconds 11 ms\nposition error 1.7e-1\nksp its 5\n") for tip in tips
+    )
     assert any(tip.startswith("newton\niteration 1\n") and tip.endswith("\n" + ERRORS[0]["command"]) for tip in tips)
 
 
 def test_of_several_traces_of_a_method_the_furthest_is_shown():
-    def entry(*errors: float) -> dict:
-        return {"scene": "a", "label": "b", "trace": {"iteration": [0, 1], "seconds": [0, 1], "position_error": errors}}
-
-    traces = [entry(0.5, 0.1), entry(0.5, 1e-6), entry(0.5, 1e-3)]
-    (chart,) = convergence_charts(traces, curve_styles(["b"]), {})
+    errors = {"x": (0.5, 0.1), "y": (0.5, 1e-6), "z": (0.5, 1e-3)}
+    traces = {case: {"iteration": [0, 1], "seconds": [0, 1], "position_error": of} for case, of in errors.items()}
+    (chart,) = convergence_charts(typed([row_of("b", case=case) for case in traces]), curve_styles(["b"]), traces)
     assert {value["y"] for value in values(chart.panels[0], "curve")} == {0.5, 1e-6}
 
 

@@ -20,6 +20,7 @@ from msmpetsc.scene.statics import STATIC
 if TYPE_CHECKING:
     from msmpetsc.study.runner import Bench
     from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
+    from msmpetsc.study.sizing.choice import Candidate
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -58,11 +59,12 @@ def bench() -> Iterator["Bench"]:
             processes.stop()
 
 
-def print_command(args: argparse.Namespace, answer: "Tables") -> str:
+def print_command(args: argparse.Namespace, method: "Candidate", more: "Tables") -> str:
     """Print lines to paste and a command that says the same, or change the file; return the command."""
     from msmpetsc.study.cases import launcher
-    from msmpetsc.study.sizing.answer import lines, overrides, put_into
+    from msmpetsc.study.sizing.answer import lines, overrides, put_into, tables
 
+    answer = {**tables(method), **more}
     print(f"\n{lines(answer)}\n")
     changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
@@ -75,21 +77,19 @@ def print_command(args: argparse.Namespace, answer: "Tables") -> str:
 
 def run_sizes(args: argparse.Namespace, target: float) -> tuple[bool, dict[str, Any]]:
     """Try lattices and steps; return whether the choice meets the error, and all as a record."""
-    from msmpetsc.study.sizing.answer import tables
-
     plan = size_all(args, target)
     if args.chart:
         draw(plan, args.chart, target)
     print_size(plan, target)
     choice, budget = plan.choice, plan.choice.budget
-    more = {
+    more: Tables = {
         "cages": {"count": choice.cells, "cell_size": None},
         "budget": {
             "target": target, **{name: float(f"{value:.2g}") for name, value in vars(budget).items()},
             "count": choice.cells, "time_step": choice.method.time_step,
         },
     }  # fmt: skip
-    command = print_command(args, {**tables(choice.method), **more}) if plan.met else None
+    command = print_command(args, choice.method, more) if plan.met else None
     tried = [each._asdict() for each in plan.tried]
     record = {
         "choice": asdict(choice), "error": budget.total, "bounds": plan.bounds, "tried": tried, "command": command,

@@ -1,13 +1,10 @@
 """Growth with the number of cells: frames a second, as in the paper's Figure 6, time, memory and KSP iterations."""
 
-from typing import TYPE_CHECKING
+from pandas import DataFrame
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import BYTES, COUNT, SECONDS, SHAPES, Chart, CurveStyle, Styles, log_axis
 from msmpetsc.study.table import grouped, measured, reach, records, succeeded
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 KIND = "Growth with the number of cells"
 CAPTION = (
@@ -26,7 +23,7 @@ PANELS = (  # title, column, how its ticks are written, whether it varies with t
 )
 
 
-def growth_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
+def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return one chart for each scene and time step where some curve has two cell counts or more."""
     charts = []
     for (scene, time_step), rows in grouped(measured(succeeded(table), "cells"), "scene", "time_step").items():
@@ -37,7 +34,7 @@ def growth_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
     return [chart for chart in charts if chart.panels]
 
 
-def with_curves(rows: "DataFrame") -> "DataFrame":
+def with_curves(rows: DataFrame) -> DataFrame:
     """Return the rows with a column ``curve``: the method, what else was varied within it, and its true step error."""
     varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
     words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
@@ -46,7 +43,7 @@ def with_curves(rows: "DataFrame") -> "DataFrame":
     return rows.assign(curve=rows["curve"].map(reached))
 
 
-def errors(rows: "DataFrame") -> str:
+def errors(rows: DataFrame) -> str:
     """Return the true step errors that a curve reached, as a range; empty where none was measured."""
     reached = measured(rows, "true_error")["true_error"]
     if reached.empty:
@@ -55,7 +52,7 @@ def errors(rows: "DataFrame") -> str:
     return f" (step error {' to '.join(ends)})"
 
 
-def styles_of(curves: "DataFrame", styles: Styles) -> Styles:
+def styles_of(curves: DataFrame, styles: Styles) -> Styles:
     """Return the style of each curve: curves of one label share its colour and differ in their marker."""
     number = curves.groupby("label").cumcount()
     shapes = [
@@ -66,7 +63,7 @@ def styles_of(curves: "DataFrame", styles: Styles) -> Styles:
     return {curve: CurveStyle(styles[label].color, shape) for curve, label, shape in of_curves}
 
 
-def growth_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Chart:
+def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return the panels that have data."""
     rows = rows.assign(
         time_frame_a_cell=rows["time_frame"] / rows["cells"], memory_a_cell=rows["memory"] / rows["cells"]

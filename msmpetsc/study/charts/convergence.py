@@ -1,9 +1,9 @@
 """Convergence within one step, over iterations and seconds; and in time, over the time step: of motion and energy."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from pandas import DataFrame, concat, to_numeric
 
 from msmpetsc.study.charts.plot import (
     COUNT,
@@ -19,10 +19,7 @@ from msmpetsc.study.charts.plot import (
     channel,
     log_axis,
 )
-from msmpetsc.study.table import grouped, measured, succeeded
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from msmpetsc.study.table import Row, grouped, measured, records, succeeded
 
 # Within one step
 
@@ -38,41 +35,35 @@ PANELS = (
 ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
 
 
-def iterates(entry: dict, commands: dict[str, str]) -> "DataFrame":
-    """Return a trace as a row an iterate; those without a positive error are left out."""
-    from pandas import DataFrame, to_numeric
-
-    trace = entry["trace"]
+def iterates(trace: dict, row: Row) -> DataFrame:
+    """Return the trace of a case as a row an iterate; those without a positive error are left out."""
     length = len(trace.get("position_error") or [])
     columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
     rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
-    rows = rows.assign(label=entry["label"], command=commands.get(entry.get("case", ""), ""))
+    rows = rows.assign(label=row["label"], command=row["command"])
     return rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
 
 
-def convergence_charts(traces: list[dict], styles: Styles, commands: dict[str, str]) -> list[Chart]:
-    """Return one chart for each scene with traces; ``commands``: by case, for traces that name theirs."""
-    from pandas import concat
-
+def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict]) -> list[Chart]:
+    """Return one chart for each scene with traces, which come by case."""
     charts = []
-    for scene in dict.fromkeys(entry["scene"] for entry in traces):
-        entries = [entry for entry in traces if entry["scene"] == scene]
-        curves = furthest([iterates(entry, commands) for entry in entries])
-        frames = {entry["trace"].get("frame") for entry in entries}
+    for scene, rows in grouped(table[table["case"].isin(traces.keys())], "scene").items():
+        curves = furthest([iterates(traces[row["case"]], row) for row in records(rows)])
+        frames = {traces[case].get("frame") for case in rows["case"]}
         step = f", step {frames.pop()}" if len(frames) == 1 else ""
         if curves:
             charts.append(convergence_chart(f"convergence_{scene}", f"{KIND}: {scene}{step}", concat(curves), styles))
     return charts
 
 
-def furthest(curves: list["DataFrame"]) -> list["DataFrame"]:
+def furthest(curves: list[DataFrame]) -> list[DataFrame]:
     """Return the trace of each method that ends with the least error: cases of looser targets are parts of it."""
     known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
     best = {rows["label"].iloc[0]: rows for rows in known}
     return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
 
 
-def convergence_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Chart:
+def convergence_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return two panels with one vertical scale."""
     chart = Chart(name, KIND, title, CAPTION, {label: styles[label] for label in dict.fromkeys(rows["label"])})
     y = log_axis("true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|", rows["position_error"], ERROR)
@@ -96,13 +87,13 @@ CLOSED = "(1 + ω²t²)^(\N{MINUS SIGN}n), implicit Euler, slowest vibration"
 TOLD = ("step", "steps", "trajectory_error", "energy_left", "iterations")
 
 
-def with_step(rows: "DataFrame") -> "DataFrame":
+def with_step(rows: DataFrame) -> DataFrame:
     """Return the rows with a column ``step``, what the integrator steps by [s], by which they are sorted."""
     explicit = (rows["integrator"] == "verlet") & (rows["substep"] > 0)
     return rows.assign(step=rows["substep"].where(explicit, rows["time_step"])).sort_values("step", kind="stable")
 
 
-def order(rows: "DataFrame") -> float | None:
+def order(rows: DataFrame) -> float | None:
     """Return the slope of log error over log step, least squares over the shorter half of the steps, two at least."""
     rows = with_step(measured(rows, "trajectory_error"))
     kept = rows.head(max(2, -(-len(rows) // 2)))
@@ -111,7 +102,7 @@ def order(rows: "DataFrame") -> float | None:
     return float(np.polyfit(np.log(kept["step"]), np.log(kept["trajectory_error"]), 1)[0])
 
 
-def order_charts(table: "DataFrame", styles: Styles, study: dict) -> list[Chart]:
+def order_charts(table: DataFrame, styles: Styles, study: dict) -> list[Chart]:
     """Return one chart for each [[order]] of the study file whose scene has numbers."""
     charts, ok = [], succeeded(table)
     for entry in study.get("order", ()):
@@ -121,7 +112,7 @@ def order_charts(table: "DataFrame", styles: Styles, study: dict) -> list[Chart]
     return charts
 
 
-def order_chart(scene: str, rows: "DataFrame", styles: Styles, frequency: float | None) -> Chart:
+def order_chart(scene: str, rows: DataFrame, styles: Styles, frequency: float | None) -> Chart:
     """Return the error in the left panel, the energy in the right one, where it was measured."""
     slopes = {label: order(group) for label, group in grouped(rows, "label").items()}
     names = {label: f"{label}: slope {slope:.2f}" if slope else label for label, slope in slopes.items()}
@@ -137,7 +128,7 @@ def order_chart(scene: str, rows: "DataFrame", styles: Styles, frequency: float 
     return chart
 
 
-def draw_energy(chart: Chart, rows: "DataFrame", frequency: float | None) -> None:
+def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
     """Draw the energy that is left over the step, and where it is known what implicit Euler leaves of it."""
     top = 1.15 * min(2, max(1, rows["energy_left"].max()))
     y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
@@ -149,7 +140,7 @@ def draw_energy(chart: Chart, rows: "DataFrame", frequency: float | None) -> Non
     panel.curves(rows, ("step", "energy_left"), TOLD, "curve")
 
 
-def closed_form(rows: "DataFrame", frequency: float) -> tuple[np.ndarray, np.ndarray]:
+def closed_form(rows: DataFrame, frequency: float) -> tuple[np.ndarray, np.ndarray]:
     """Return steps t [s] and the energy (1 + w^2 t^2)^(-n) that implicit Euler leaves of an oscillation.
 
     n = T / t steps; frequency [Hz].

@@ -7,9 +7,11 @@ of the lattice: explicit and implicit runs of any time step can be compared by i
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
+from pandas import DataFrame, concat
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import (
@@ -28,6 +30,7 @@ from msmpetsc.study.charts.plot import (
     points,
     save_png,
 )
+from msmpetsc.study.sizing.answer import SizePlan
 from msmpetsc.study.table import (
     ONCE_NOTE,
     Row,
@@ -40,11 +43,6 @@ from msmpetsc.study.table import (
     succeeded,
     within_noise,
 )
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-    from msmpetsc.study.sizing.answer import SizePlan
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
@@ -107,7 +105,7 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
     return [int(index) for index in np.lexsort((y, x)) if not beaten[index]]
 
 
-def front_rows(rows: "DataFrame", measure: ErrorMeasure) -> "DataFrame":
+def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     """Return the front of measured rows, by rising error.
 
     Errors that read alike, to two digits, count as equal: no step can better the trajectory error of its time step but
@@ -116,7 +114,7 @@ def front_rows(rows: "DataFrame", measure: ErrorMeasure) -> "DataFrame":
     return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 
 
-def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]:
+def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
     """Return the cheapest row with an error of at most this level, then those that its repeats do not tell from it.
 
     Nothing is interpolated; each method comes once; nothing comes where nothing reaches the level.
@@ -136,7 +134,7 @@ def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]
 # The charts
 
 
-def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
+def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return one chart for each scene, and for each of its cell counts where a method was swept."""
     charts = []
     for scene, rows in grouped(table, "scene").items():
@@ -150,7 +148,7 @@ def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
     return charts
 
 
-def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Chart | None:
+def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart | None:
     """Return the panels that have data; None where neither has."""
     step, trajectory = common_time_step(measured(rows, *STEP.columns)), measured(rows, *TRAJECTORY.columns)
     panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if len(shown)]
@@ -166,16 +164,14 @@ def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Ch
     return chart
 
 
-def common_time_step(rows: "DataFrame") -> "DataFrame":
+def common_time_step(rows: DataFrame) -> DataFrame:
     """Return the rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
     groups = grouped(rows, "time_step")
     return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
-def draw_panel(chart: Chart, rows: "DataFrame", measure: ErrorMeasure) -> None:
+def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     """Draw the front, over it a line through each method's own best points, its other ones small and hollow."""
-    from pandas import concat
-
     step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
@@ -233,7 +229,7 @@ SIZES_CAPTION = (
 SIZE = ("time_second", "surface_error")
 
 
-def size_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
+def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return one chart for each scene with surface errors: a curve a way to step, over its numbers of cells."""
     charts = []
     for scene, rows in grouped(measured(succeeded(table), *SIZE), "scene").items():
@@ -246,15 +242,13 @@ def size_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
     return charts
 
 
-def size_panel(chart: Chart, title: str, costs: Sequence[float], errors: Sequence[float], label: str) -> Axes:
+def size_panel(chart: Chart, title: str, costs: ArrayLike, errors: ArrayLike, label: str) -> Axes:
     """Return a panel of errors over costs."""
     return chart.panel(title, log_axis(TRAJECTORY.y_label, costs, SECONDS), log_axis(label, errors, ERROR))
 
 
-def plan_picture(plan: "SizePlan", target: float, path: Path) -> None:
+def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
     """Write a PNG of the trials' expected errors over their costs, by integrator; the choice is ringed."""
-    from pandas import DataFrame
-
     tried = [(trial.method, trial.cost, trial.error, trial.cells) for trial in plan.tried]
     rows = DataFrame(tried, columns=["label", *SIZE, "cells"]).assign(command="")
     chosen = DataFrame([(plan.choice.cost, plan.choice.budget.total)], columns=list(SIZE))

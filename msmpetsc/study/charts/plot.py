@@ -9,18 +9,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import vl_convert
 from numpy.typing import ArrayLike
+from pandas import DataFrame
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.table import records, spread
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
 # Okabe and Ito's colours without their yellow, which white paper swallows, then Tol's wine, olive, indigo, and a brown.
@@ -81,7 +79,7 @@ def curve_styles(labels: Iterable[str]) -> Styles:
     return {label: CurveStyle(*pair) for label, pair in zip(labels, pairs, strict=True)}
 
 
-def tips(rows: "DataFrame", told: Iterable[str], curve: str = "label") -> list[str]:
+def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
     """Return what the point of each row tells: its curve, what stands in its columns, the command that repeats it.
 
     told : columns; curve : the one with the name of its curve
@@ -153,7 +151,7 @@ class Axes:
         values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
         self.draw(values, {"type": "line", "color": FAINT, "strokeWidth": 1.6} | mark, order={"field": "n"})
 
-    def whiskers(self, rows: "DataFrame", columns: Columns, curve: str = "label") -> None:
+    def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
         """Draw the spread of the repeats of each row that was repeated, the second column its cost."""
         ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
         values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
@@ -163,7 +161,7 @@ class Axes:
             tick = {"type": "tick", "orient": "horizontal", "size": 7, "opacity": 1}
             self.draw(values, tick, **color | {"y": {"field": end} | self.y})
 
-    def curves(self, rows: "DataFrame", columns: Columns, told: Iterable[str], curve: str = "label") -> None:
+    def curves(self, rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> None:
         """Draw the rows of each curve, in their order, as a line with a marker at each point."""
         values = points(rows, columns, told, curve)
         color = {"color": nominal(self.styles, "color")}
@@ -179,13 +177,13 @@ class Axes:
             own, look = {"stroke": color}, {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
         self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
 
-    def rings(self, rows: "DataFrame", columns: Columns) -> None:
+    def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""
         values = [{"x": x, "y": y} for x, y in rows[list(columns)].itertuples(index=False)]
         self.draw(values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0})
 
 
-def points(rows: "DataFrame", columns: Columns, told: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
+def points(rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
     """Return each row as a point with its place, its curve, what it tells and its size."""
     sizes = rows.groupby(curve)[curve].transform("size").gt(MANY).map(SIZES.__getitem__)
     of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, told, curve), sizes, strict=True)

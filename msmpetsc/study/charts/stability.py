@@ -2,17 +2,15 @@
 
 import json
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from pandas import DataFrame
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, Styles, channel, tips
 from msmpetsc.study.metrics import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 KIND = "Stability"
 CAPTION = (
@@ -70,7 +68,7 @@ def entry(value: str, unit: str) -> str:
     return formatting.seconds(number) if unit == "s" else formatting.prefixed(number, unit)
 
 
-def scale(rows: "DataFrame", column: str, axis: dict) -> Scale:
+def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
     """Return the values that the rows have on this axis, in the order of the study file, worded as it says."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
@@ -79,13 +77,13 @@ def scale(rows: "DataFrame", column: str, axis: dict) -> Scale:
     return Scale(axis.get("name", column), tuple(values), tuple(texts), axis.get("key", ""))
 
 
-def stability_charts(table: "DataFrame", study: dict) -> list[Chart]:
+def stability_charts(table: DataFrame, study: dict) -> list[Chart]:
     """Return one chart a map; ``study``: the tables of the study file, for the names of the axes."""
     maps = {entry.get("name"): entry for entry in study.get("map", ())}
     return [stability_chart(name, rows, maps.get(name, {})) for name, rows in mapped(table).items()]
 
 
-def stability_chart(name: str, rows: "DataFrame", settings: dict) -> Chart:
+def stability_chart(name: str, rows: DataFrame, settings: dict) -> Chart:
     """Return the chart of a map; ``settings``: its table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
@@ -102,7 +100,7 @@ def stability_chart(name: str, rows: "DataFrame", settings: dict) -> Chart:
     return chart
 
 
-def legend_of(rows: "DataFrame") -> Styles:
+def legend_of(rows: DataFrame) -> Styles:
     """Return the colour and the symbol of each outcome there is, best first."""
     return {
         f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
@@ -130,7 +128,7 @@ def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
     return across | {"title": ""}, down | {"title": ""}
 
 
-def draw_cells(panel: Axes, rows: "DataFrame", x: Scale, y: Scale) -> None:
+def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
     """Draw cells that tell their numbers, the explicit limit across them, and over it their symbols."""
     words = {
         of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True))) for column, of in (("x", x), ("y", y))
@@ -165,7 +163,7 @@ def symbol(row: Row) -> str:
     return f"{count:.0f}" if count < 1000 else f"{count / 1000:.{1 if count < 9950 else 0}f}k"
 
 
-def draw_limit(panel: Axes, rows: "DataFrame", x: Scale, y: Scale) -> None:
+def draw_limit(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
     """Draw the explicit limit across the axis of time steps, where there is one, for each value of the other axis."""
     if "time.step" not in (x.key, y.key):
         return

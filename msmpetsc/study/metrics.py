@@ -96,7 +96,7 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
 
 def _energy_left(series: dict[str, np.ndarray]) -> float | None:
     """Return the energy at the end over that at the start; None for a body on which a load acts."""
-    energy = sum(series[name] for name in ("kinetic", "elastic", "contact", "self_contact"))
+    energy = np.sum([series[name] for name in ("kinetic", "elastic", "contact", "self_contact")], axis=0)
     return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 

@@ -1,4 +1,4 @@
-"""The cases of a study: what defines a run, the command that runs it, and the products of sweeps and maps."""
+"""The cases of a study: what defines a run, its command, and the products of sweeps and maps."""
 
 import hashlib
 import json
@@ -168,7 +168,7 @@ def with_solver(case: Case, scene: Scene) -> Case:
 
 
 def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
-    """Return a case with the overrides of its time and output tables; with its surface stored if ``surface``."""
+    """Return a case with the overrides of its time and output tables; ``surface``: it is stored."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
     time |= scene_tables(vars(case))["time"]
     output = (SURFACE if surface else "output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
@@ -273,7 +273,7 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the run with tiny steps that a case is measured against, stored at the moments that are compared.
+    """Return the run with tiny steps that a case is measured against, stored where they are compared.
 
     It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in it.
     """
@@ -323,7 +323,7 @@ def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | N
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
-    """Yield the places of a map, and what is run there; y may be the name of a case, x is then the method's."""
+    """Yield the places of a map, and what is run there; y may be a case's name, x is then the method's."""
     for case in map.case:
         length = case if case.steps or case.duration else map
         own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
@@ -336,7 +336,7 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
-    """Yield the changes of an axis; a time step may be longer than the scene, whose duration so changes with it."""
+    """Yield the changes of an axis; with a time step the duration changes, which may be shorter."""
     yield from axis.changes(value)
     if axis.key == "time.step":
         duration = length.steps * value if length.steps else max(length.duration or value, value)

@@ -1,4 +1,4 @@
-"""The figures of a run, from its result and its measure file: a row of the table, distances, its outcome in a word."""
+"""The figures of a run: a row of the table, its distances, its outcome in a word."""
 
 import json
 import math
@@ -45,7 +45,7 @@ SLOW = 30  # iterations a step
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return what stands in a measure file; nothing where there is none, as of a run that was killed."""
+    """Return what stands in a measure file; nothing where a run was killed before it."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):
@@ -67,7 +67,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return figures of the result file: times and iterations are means a step, the first frame left out."""
+    """Return figures of a result: times and iterations are means a step, the first frame left out."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -84,7 +84,7 @@ def of_frames(result: Path, time_step: float) -> Row:
 
 
 def _soundness(series: dict[str, np.ndarray]) -> Row:
-    """Return what went wrong on the way; inverted cells count in the last frame alone, where they were counted."""
+    """Return what went wrong on the way; inverted cells count in the last frame alone."""
     row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
     if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])

@@ -1,4 +1,4 @@
-"""A study is carried out: a bench runs each case, and the table is written after each, so that it can be continued."""
+"""A study is carried out: a bench runs each case, and the table is written after each."""
 
 import json
 import os
@@ -31,7 +31,7 @@ from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.schema import Study, load_study
 from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
 
-SETTINGS = ("cells", "time_step", "substep", "error", "max_iterations")  # that tell cases of a label apart
+SETTINGS = ("cells", "time_step", "substep", "error", "max_iterations")  # that tell cases apart
 PARTS = "parts"  # folder of the parts' folders
 
 
@@ -65,7 +65,7 @@ class Bench:
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
-        """Run a case as often as it says; what goes wrong stands in its row. ``keep``: its result stays."""
+        """Run a case as often as it says; what goes wrong is in its row. ``keep``: its result stays."""
         runs: list[Row] = []
         path, trace = self.result_of(case), None
         known = case.columns | {"study": self.study, "command": shown_command(case)}
@@ -132,7 +132,7 @@ def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
 
 
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
-    """Return the error of a run's surface, or of its nodes, by the name of its column; or why there is none."""
+    """Return the error of a run's surface, or of its nodes, by its column; or why there is none."""
     name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     try:
         return {f"{name}_error": measure(path, reference)}, ""
@@ -229,7 +229,7 @@ def run_study(
 def list_study(
     path: Path, folder: Path, presets: Collection[str] | None, full: bool = False
 ) -> list[tuple[Case, bool]]:
-    """Return the cases of a study file in their order, and whether each is done; nothing is run or written."""
+    """Return the cases of a study file, and whether each is done; nothing is run or written."""
     require_extra()
     every, wanted = _cases(load_study(path, presets), path, full, presets)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
@@ -245,7 +245,7 @@ def _cases(
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
-    """Run cases, keep their results and show each, on a terminal with the time that is left; ``done`` were before."""
+    """Run cases, keep their results and show each; ``done`` were before."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     try:
         with bar, closing(measure_all(bench, todo, jobs)) as finished:
@@ -269,7 +269,7 @@ def described(row: Row) -> str:
 
 
 def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Generator[CaseResult, None, None]:
-    """Yield each case's result when it is done; whatever ends this early ends the runs under way."""
+    """Yield each case's result when it is done; what ends this early ends the runs under way."""
     pool = ThreadPoolExecutor(jobs)
     try:
         futures = [pool.submit(bench.measure, case) for case in todo]
@@ -312,7 +312,7 @@ def _earlier_rows(folder: Path) -> list[Row]:
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case need not be run: one given up is worth another try once it may take longer, or less."""
+    """Return whether a case need not be run: one given up may be worth another try."""
     row = rows.get(case.id)
     return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
 

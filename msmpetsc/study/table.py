@@ -128,7 +128,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv, see ``typed``. Raises InputError without a table, or for one that is none."""
+    """Return the rows of table.csv, see ``typed``. Raises InputError where there is no such table."""
     import pandas
 
     path = folder / "table.csv"
@@ -142,7 +142,7 @@ def read_table(folder: Path) -> "DataFrame":
 
 
 def read_traces(folder: Path) -> dict[str, dict]:
-    """Return the traces of traces.json by case; none where there is no such file. Raises InputError."""
+    """Return the traces of traces.json by case; none without the file. Raises InputError."""
     path = folder / "traces.json"
     try:
         traces = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
@@ -152,7 +152,7 @@ def read_traces(folder: Path) -> dict[str, dict]:
 
 
 def as_table(rows: Sequence[Row]) -> "DataFrame":
-    """Return rows as a table with all columns in their order; a number that is missing is NaN, a text empty."""
+    """Return rows as a table with all columns; a number that is missing is NaN, a text empty."""
     from pandas import DataFrame
 
     table = DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(NUMBERS, float))
@@ -216,7 +216,7 @@ def failed(table: "DataFrame") -> "DataFrame":
 
 
 def swept(table: "DataFrame") -> "DataFrame":
-    """Return the rows of sweeps; those of maps stand apart, for a run that fails there is an answer."""
+    """Return the rows of sweeps; those of maps stand apart: a run that fails there is an answer."""
     return table[table["map"] == ""]
 
 

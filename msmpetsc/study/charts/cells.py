@@ -1,4 +1,4 @@
-"""Growth with the number of cells: frames a second, as in the paper's Figure 6, time, memory and KSP iterations."""
+"""Growth with the number of cells: frames a second (the paper's Figure 6), time, memory, iterations."""
 
 from pandas import DataFrame
 
@@ -13,7 +13,7 @@ CAPTION = (
     "error compare. Per cell, a level curve means a cost in proportion to the cells. Memory is the peak of all ranks, "
     "the program itself and the surface mesh included. Whiskers reach from the least to the greatest of the repeats."
 )
-VARIED = ("error", "max_iterations", "ranks")  # columns that may differ between curves of one method
+VARIED = ("error", "max_iterations", "ranks")  # may differ between curves of one method
 TOLD = ("time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor", "ranks")
 PANELS = (  # title, column, how its ticks are written, whether it varies with the time
     ("frames a second", "fps", COUNT, True),
@@ -24,7 +24,7 @@ PANELS = (  # title, column, how its ticks are written, whether it varies with t
 
 
 def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return one chart for each scene and time step where some curve has two cell counts or more."""
+    """Return a chart for each scene and time step where some curve has two cell counts or more."""
     charts = []
     for (scene, time_step), rows in grouped(measured(succeeded(table), "cells"), "scene", "time_step").items():
         rows = with_curves(rows)
@@ -35,7 +35,7 @@ def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``curve``: the method, what else was varied within it, and its true step error."""
+    """Return the rows with a column ``curve``: the method, what varied in it, and its step error."""
     varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
     words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
     rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
@@ -44,7 +44,7 @@ def with_curves(rows: DataFrame) -> DataFrame:
 
 
 def errors(rows: DataFrame) -> str:
-    """Return the true step errors that a curve reached, as a range; empty where none was measured."""
+    """Return the range of true step errors that a curve reached; empty where none was measured."""
     reached = measured(rows, "true_error")["true_error"]
     if reached.empty:
         return ""
@@ -53,7 +53,7 @@ def errors(rows: DataFrame) -> str:
 
 
 def styles_of(curves: DataFrame, styles: Styles) -> Styles:
-    """Return the style of each curve: curves of one label share its colour and differ in their marker."""
+    """Return the style of each curve: those of one label share its colour, and have own markers."""
     number = curves.groupby("label").cumcount()
     shapes = [
         SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]

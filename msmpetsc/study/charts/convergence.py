@@ -1,4 +1,4 @@
-"""Convergence within one step, over iterations and seconds; and in time, over the time step: of motion and energy."""
+"""Convergence within one step, over iterations and seconds; and in time, over the time step."""
 
 import math
 
@@ -36,7 +36,7 @@ ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
 
 
 def iterates(trace: dict, row: Row) -> DataFrame:
-    """Return the trace of a case as a row an iterate; those without a positive error are left out."""
+    """Return the trace of a case as a row an iterate; those without a positive error are out."""
     length = len(trace.get("position_error") or [])
     columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
     rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
@@ -57,7 +57,7 @@ def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict]
 
 
 def furthest(curves: list[DataFrame]) -> list[DataFrame]:
-    """Return the trace of each method that ends with the least error: cases of looser targets are parts of it."""
+    """Return the trace of each method that ends with the least error: looser targets are parts of it."""
     known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
     best = {rows["label"].iloc[0]: rows for rows in known}
     return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
@@ -88,13 +88,13 @@ TOLD = ("step", "steps", "trajectory_error", "energy_left", "iterations")
 
 
 def with_step(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``step``, what the integrator steps by [s], by which they are sorted."""
+    """Return the rows with a column ``step``, what the integrator steps by [s], sorted by it."""
     explicit = (rows["integrator"] == "verlet") & (rows["substep"] > 0)
     return rows.assign(step=rows["substep"].where(explicit, rows["time_step"])).sort_values("step", kind="stable")
 
 
 def order(rows: DataFrame) -> float | None:
-    """Return the slope of log error over log step, least squares over the shorter half of the steps, two at least."""
+    """Return the slope of log error over log step, fitted to the shorter half of the steps."""
     rows = with_step(measured(rows, "trajectory_error"))
     kept = rows.head(max(2, -(-len(rows) // 2)))
     if kept["step"].nunique() < 2:
@@ -129,7 +129,7 @@ def order_chart(scene: str, rows: DataFrame, styles: Styles, frequency: float | 
 
 
 def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
-    """Draw the energy that is left over the step, and where it is known what implicit Euler leaves of it."""
+    """Draw the energy that is left over the step, and implicit Euler's closed form if it is known."""
     top = 1.15 * min(2, max(1, rows["energy_left"].max()))
     y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
     panel = chart.panel("energy left at the end", log_axis("time step", rows["step"], SECONDS), y)
@@ -141,7 +141,7 @@ def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
 
 
 def closed_form(rows: DataFrame, frequency: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps t [s] and the energy (1 + w^2 t^2)^(-n) that implicit Euler leaves of an oscillation.
+    """Return steps t [s] and the energy (1 + w^2 t^2)^(-n) that implicit Euler leaves.
 
     n = T / t steps; frequency [Hz].
     """

@@ -1,4 +1,4 @@
-"""Speed against accuracy: computing time over the step error, over the trajectory error, and over the surface's.
+"""Speed against accuracy: computing time over the errors of step, trajectory and surface.
 
 The two errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods
 can be compared by it where the time step is the same. The trajectory error says how far the run is from the true motion
@@ -96,7 +96,7 @@ TRAJECTORY = ErrorMeasure(
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
-    """Return indices of the points that no other beats: none is at most as great in both and smaller in one.
+    """Return the points that no other beats: none is at most as great in both and smaller in one.
 
     They come by rising x.
     """
@@ -165,13 +165,13 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
 
 
 def common_time_step(rows: DataFrame) -> DataFrame:
-    """Return the rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
+    """Return the rows of the time step with the most of them: only they compare by time a frame."""
     groups = grouped(rows, "time_step")
     return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
 def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
-    """Draw the front, over it a line through each method's own best points, its other ones small and hollow."""
+    """Draw the front, over it a line through each method's best points, the others hollow."""
     step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
@@ -218,7 +218,7 @@ def cost_of(row: Row, measure: ErrorMeasure) -> str:
     return f"{cost} [{formatting.seconds(row['least'])} to {formatting.seconds(row['greatest'])}]"
 
 
-# The error of the surface over what it costs: of a study's lattices and steps, and of the trials of a plan
+# The error of the surface over what it costs: of a study, and of the trials of a plan
 
 SIZES = "Surface error over cost"
 SIZES_CAPTION = (
@@ -230,7 +230,7 @@ SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return one chart for each scene with surface errors: a curve a way to step, over its numbers of cells."""
+    """Return a chart for each scene with surface errors: a curve a way to step, over its cells."""
     charts = []
     for scene, rows in grouped(measured(succeeded(table), *SIZE), "scene").items():
         own = {label: styles[label] for label in dict.fromkeys(rows["label"])}
@@ -248,7 +248,7 @@ def size_panel(chart: Chart, title: str, costs: ArrayLike, errors: ArrayLike, la
 
 
 def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
-    """Write a PNG of the trials' expected errors over their costs, by integrator; the choice is ringed."""
+    """Write a PNG of the trials' expected errors over their costs; the choice is ringed."""
     tried = [(trial.method, trial.cost, trial.error, trial.cells) for trial in plan.tried]
     rows = DataFrame(tried, columns=["label", *SIZE, "cells"]).assign(command="")
     chosen = DataFrame([(plan.choice.cost, plan.choice.budget.total)], columns=list(SIZE))

@@ -1,4 +1,4 @@
-"""What all charts share: a colour and a marker for each method, axes in readable units, and points with their numbers.
+"""What all charts share: colours and markers, axes in readable units, points with their numbers.
 
 A chart is a Vega-Lite specification; vl-convert draws it, without a browser, as SVG for the page and as PNG.
 """
@@ -21,7 +21,7 @@ from msmpetsc.study import formatting
 from msmpetsc.study.table import records, spread
 
 INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
-# Okabe and Ito's colours without their yellow, which white paper swallows, then Tol's wine, olive, indigo, and a brown.
+# Okabe and Ito's colours but yellow, which white swallows, then Tol's wine, olive, indigo, and a brown.
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",
@@ -80,7 +80,7 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
 
 def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
-    """Return what the point of each row tells: its curve, what stands in its columns, the command that repeats it.
+    """Return what the point of each row tells: its curve, its numbers, the command that repeats it.
 
     told : columns; curve : the one with the name of its curve
     """
@@ -99,7 +99,7 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values: a margin on both sides, and a decade at least.
+    """Return a logarithmic axis around positive values, with margins, of a decade at least.
 
     Numbers stand at the decades, and at 2 and 5 where there are few decades.
     """
@@ -112,7 +112,7 @@ def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
 
 
 def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str, Any]:
-    """Return an axis with 0 at the left, logarithmic from the decade of the least positive value on.
+    """Return an axis with 0 at the left, logarithmic from the least positive value on.
 
     Methods differ by powers of ten.
     """
@@ -152,7 +152,7 @@ class Axes:
         self.draw(values, {"type": "line", "color": FAINT, "strokeWidth": 1.6} | mark, order={"field": "n"})
 
     def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
-        """Draw the spread of the repeats of each row that was repeated, the second column its cost."""
+        """Draw the spread of the repeats of each row; the second column is its cost."""
         ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
         values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
         color = {"color": nominal(self.styles, "color")}
@@ -270,6 +270,6 @@ def save_png(chart: Chart, folder: Path) -> Path:
 
 
 def svg_text(chart: Chart) -> str:
-    """Return the chart as an <svg> element: every point has a <title>, which browsers show under the mouse."""
+    """Return the chart as an <svg> element, whose points have a <title>: browsers show it."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
     return re.sub(r'<path aria-label="([^"]*)"([^>]*)/>', r'<path class="point"\2><title>\1</title></path>', text)

@@ -1,4 +1,4 @@
-"""Stability: what becomes of each method over two axes, a panel a method, or with named cases, a column a method."""
+"""Stability: what becomes of each method over two axes, or with named cases."""
 
 import json
 import math
@@ -18,7 +18,7 @@ CAPTION = (
     "solved; of verlet, its substeps. Point at a cell for its numbers and the command that repeats it."
 )
 LIMIT = "longest stable explicit step, 2 / ω"
-# from the worst to the best: told apart by lightness as well as by hue, and each cell has its symbol
+# from the worst to the best: they differ in lightness and hue, and each cell has its symbol
 COLORS = {
     "crashed": "#000000", "timeout": "#7a4a1e", "refused": "#9a9a9a", "not finite": "#332288", "energy": "#882255",
     "diverged": "#d55e00", "not recovered": "#cc79a7", "inverted": "#e69f00", "slow": "#f0e442", "ok": "#c3e3f5",
@@ -38,7 +38,7 @@ TOLD = (
 
 
 class Scale(NamedTuple):
-    """One side of a map: its values in their order, as the table has them, and how a reader wants them."""
+    """One side of a map: its values in their order, and how a reader wants them."""
 
     name: str
     values: tuple[str, ...]
@@ -46,7 +46,7 @@ class Scale(NamedTuple):
     key: str = ""
 
     def position(self, value: float) -> float:
-        """Return the position of a number, in cells, between two values by its logarithm; NaN outside of all cells."""
+        """Return the position of a number, in cells, by its logarithm; NaN outside of all cells."""
         logs = np.log(np.array(self.values, float))
         if len(logs) < 2 or value <= 0:
             return math.nan
@@ -56,7 +56,7 @@ class Scale(NamedTuple):
 
 
 def entry(value: str, unit: str) -> str:
-    """Return an entry of an axis as a reader wants it: 10 ms, 20%, 100 kPa, or the name of a case."""
+    """Return an entry of an axis as a reader wants it: 10 ms, 20%, 100 kPa, or a case's name."""
     try:
         number = float(value)
     except ValueError:
@@ -69,7 +69,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
-    """Return the values that the rows have on this axis, in the order of the study file, worded as it says."""
+    """Return the values that the rows have on this axis, in the order and the unit of the study file."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
@@ -78,7 +78,7 @@ def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
 
 
 def stability_charts(table: DataFrame, study: dict) -> list[Chart]:
-    """Return one chart a map; ``study``: the tables of the study file, for the names of the axes."""
+    """Return a chart a map; ``study``: the study file, which names the axes."""
     maps = {entry.get("name"): entry for entry in study.get("map", ())}
     return [stability_chart(name, rows, maps.get(name, {})) for name, rows in mapped(table).items()]
 
@@ -129,7 +129,7 @@ def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw cells that tell their numbers, the explicit limit across them, and over it their symbols."""
+    """Draw cells that tell their numbers, the explicit limit, and over it their symbols."""
     words = {
         of.name: rows[column].map(dict(zip(of.values, of.texts, strict=True))) for column, of in (("x", x), ("y", y))
     }
@@ -164,7 +164,7 @@ def symbol(row: Row) -> str:
 
 
 def draw_limit(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
-    """Draw the explicit limit across the axis of time steps, where there is one, for each value of the other axis."""
+    """Draw the explicit limit across the axis of time steps, for each value of the other axis."""
     if "time.step" not in (x.key, y.key):
         return
     (along, steps), (other, across) = (("x", x), ("y", y)) if x.key == "time.step" else (("y", y), ("x", x))

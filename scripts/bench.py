@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """The cost of a step, `newton` beside what it took the place of. Needs the meshes.
 
-    scripts/bench.py [--only NAME ...] [--frames N] [--repeats N] [--ranks N] [--large] [-o PAGE]
+    scripts/bench.py [--only NAME ...] [--frames N] [--repeats N] [--ranks N] [--gpu] [--large] [-o PAGE]
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
-the other, and all of that again for each repeat. --only takes rows whose name contains NAME.
+the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --gpu takes `newton` alone,
+on one core, with --ranks on so many, and on the GPU of the machine.
 
 Figures are of all frames but the first, for what is done once shows in it: the mean time, its median over the repeats
 with the least and the greatest of them in brackets; `slowest tenth` is the mean of those frames. KSP iterations and
@@ -13,6 +14,7 @@ products with the Hessian, which do not depend on the machine, are means; where 
 in their order. `times as fast` and what stands behind it is of the last method.
 """
 
+import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -24,7 +26,11 @@ import lab
 
 import numpy as np
 import trimesh
+from petsc4py import PETSc
 from table1 import PAPER, SCENES, slowest_tenth
+
+from msmpetsc.backend import cuda
+from msmpetsc.solve.petsc import device
 
 NUMBERS = "wall_time", "iterations", "ksp_its", "products", "step_error"
 SMALL = 50_000  # nodes: of fewer the memory is mostly Python's
@@ -133,28 +139,35 @@ def rows(methods: dict[str, Method], args: Namespace) -> lab.Rows:
             yield row(name, runs)
 
 
-def parser(documentation: str | None, repeats: int) -> lab.ArgumentParser:
-    """Return the arguments of a bench, so many repeats the default."""
-    options = lab.parser(documentation)
+def methods_of(args: Namespace) -> dict[str, Method]:
+    """Return what is run, the last of them held against the others."""
+    today = METHODS[TODAY]
+    more = {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks)} if args.ranks > 1 else {}
+    if args.gpu:
+        return {TODAY: today, **more, "GPU": Method((*today.words, "--device", "cuda"))}
+    return {name: method for name, method in METHODS.items() if name != TODAY} | more | {TODAY: today}
+
+
+def main() -> int:
+    options = lab.parser(__doc__)
     options.add_argument(
         "--only", nargs="+", default=[""], metavar="NAME", help="rows whose name contains one of these"
     )
     options.add_argument("--frames", type=int, metavar="N", help="steps of each run; all of the scene's if absent")
-    options.add_argument("--repeats", type=int, default=repeats, metavar="N", help="runs of each method (%(default)s)")
+    options.add_argument("--repeats", type=int, default=5, metavar="N", help="runs of each method (%(default)s)")
     options.add_argument("--ranks", type=int, default=1, metavar="N", help="on so many ranks, too")
+    options.add_argument("--gpu", action="store_true", help="on a GPU beside the CPU")
     options.add_argument("--large", action="store_true", help=f"{LARGE}, too, which takes hours")
-    return options
-
-
-def main() -> None:
-    args = parser(__doc__, 5).parse_args()
-    methods = dict(METHODS)
-    if args.ranks > 1:
-        today = methods.pop(TODAY)
-        methods |= {f"{TODAY}, {args.ranks} ranks": Method(today.words, args.ranks), TODAY: today}
+    args = options.parse_args()
+    if args.gpu and (lacking := device.what_is_missing()):
+        print(f"bench: {lacking}", file=sys.stderr)
+        return 2
     with lab.page(args):
-        lab.table(rows(methods, args))
+        if args.gpu:
+            print(f"{cuda.name()}, PETSc {'.'.join(map(str, PETSc.Sys.getVersion()))}")
+        lab.table(rows(methods_of(args), args))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

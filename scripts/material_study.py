@@ -253,12 +253,11 @@ def struck_bar(courant: float) -> tuple[np.ndarray, np.ndarray]:
 
 def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
     """Errors of the speeds of a pulse's centre and of its peak, and what is left of its height."""
-    centre = times @ v / v.sum(axis=0)
-    peak = []
+    centre, peak = times @ v / v.sum(axis=0), []
     for column in v.T:  # the top of a parabola through the three highest values
-        at = column.argmax()
-        low, top, high = column[at - 1 : at + 2]
-        peak.append(times[at] + (times[1] - times[0]) * (low - high) / (low - 2 * top + high) / 2)
+        near = column.argmax() + np.arange(-1, 2)
+        a, b, _ = np.polyfit(times[near] - times[near[1]], column[near], 2)
+        peak.append(times[near[1]] - b / (2 * a))
     of_centre, of_peak = np.diff(STATIONS) * CELL / np.diff([centre, peak])[:, 0] / SPEED - 1
     return of_centre, of_peak, v[:, 1].max() / v[:, 0].max()
 
@@ -310,21 +309,20 @@ def mass_error(lattice: Lattice, mesh: trimesh.Trimesh) -> float:
     return lattice.mass.sum() / (DENSITY * mesh.volume) - 1
 
 
+def along_x(mesh: trimesh.Trimesh, degrees: float = 0.0) -> trimesh.Trimesh:
+    """A bar of LENGTH along z, laid along x and turned about it."""
+    mesh.vertices = mesh.vertices[:, [2, 0, 1]] + [LENGTH / 2, 0, 0]
+    return mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(degrees), (1, 0, 0)))
+
+
 def round_bar() -> trimesh.Trimesh:
-    """Along x; its circle has 256 sides, which take 0.02% of its stiffness."""
+    """Its circle has 256 sides, which take 0.02% of its stiffness."""
     return along_x(trimesh.creation.cylinder(RADIUS, LENGTH, sections=256))
 
 
 def turned_bar() -> trimesh.Trimesh:
-    """A square bar along x, turned by 30 degrees about it."""
-    bar = along_x(trimesh.creation.box((WIDTH, WIDTH, LENGTH)))
-    bar.apply_transform(trimesh.transformations.rotation_matrix(np.radians(30), (1, 0, 0)))
-    return bar
-
-
-def along_x(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    mesh.vertices = mesh.vertices[:, [2, 0, 1]] + [LENGTH / 2, 0, 0]
-    return mesh
+    """A square bar."""
+    return along_x(trimesh.creation.box((WIDTH, WIDTH, LENGTH)), degrees=30)
 
 
 def bar_errors(mesh: trimesh.Trimesh, exact: float, h: float, boundary: str) -> tuple[int, np.ndarray, np.ndarray]:

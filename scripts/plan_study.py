@@ -20,7 +20,7 @@ import lab
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.study.cases import inline
-from msmpetsc.study.distances import surface_error
+from msmpetsc.study.metrics import surface_error
 
 ERRORS, LIMIT = (0.1, 0.03, 0.01), 900.0  # [s] a finer run
 FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1

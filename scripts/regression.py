@@ -8,54 +8,45 @@ number of ranks nor the way in which a step is solved shows. Counts must be equa
 the tolerance. How a scene is run stands under "run" of its file: changes that let few steps show what it is about.
 Exit status 0: all are; 1: something differs, or nothing was compared. --update stores the numbers found.
 
-The numbers and their tolerance are those of `msmpetsc check` (msmpetsc/study/baselines).
+The numbers and their tolerance are those of `msmpetsc check` (msmpetsc/study/baseline.py).
 """
 
 import sys
-import tempfile
-from pathlib import Path
 from time import perf_counter
 
 import lab
 from clone import ROOT
 
+from msmpetsc.cli.commands.check import found as measured
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.baselines import baseline
+from msmpetsc.study import baseline
 
 STORED = ROOT / "tests" / "regression"
 
 
-def measured(scene: str, recipe: baseline.Recipe, ranks: int) -> dict:
-    """Run a scene; its numbers. InputError if a mesh is not here, RuntimeError with the last line if the run fails."""
-    file = lab.SCENES / f"{scene}.toml"
-    for mesh in load_scene(file).meshes.values():
-        locate(mesh.source, lab.SCENES)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{scene}.h5"
-        baseline.simulate(file, recipe, path, ranks)
-        return baseline.summary(path, recipe)
-
-
 def check(scene: str, ranks: int, update: bool) -> list[str] | None:
     """Run a scene and print its row; what is wrong with it, None if its mesh is not here."""
-    begun, file = perf_counter(), STORED / f"{scene}.json"
+    begun, path, file = perf_counter(), lab.SCENES / f"{scene}.toml", STORED / f"{scene}.json"
     try:
-        stored = baseline.read(file)
-        found = measured(scene, baseline.Recipe.of(stored), ranks)
+        for mesh in load_scene(path).meshes.values():
+            locate(mesh.source, lab.SCENES)
     except InputError as error:
         print(f"{scene:20} skipped: {error}")
         return None
-    except RuntimeError as error:
+    try:
+        stored = baseline.read(file)
+        found = measured(path, stored.run, ranks)
+    except InputError as error:
         print(f"{scene:20} FAILED")
-        return [f"{scene}: {error}"]
+        return [str(error)]
     wrong = [f"{scene}: {line}" for line in baseline.judged(found, stored).values() if line]
+    verdict = "DIFFERS" if wrong else "same"
     if update:
         baseline.write(file, found)
-    verdict = "stored" if update else "DIFFERS" if wrong else "same"
-    off = baseline.nearest_to_limit(found, stored)
-    print(baseline.row(scene, found["counts"], off, perf_counter() - begun, verdict), flush=True)
+        verdict = "stored"
+    print(baseline.row(scene, found, stored, perf_counter() - begun, verdict), flush=True)
     return [] if update else wrong
 
 

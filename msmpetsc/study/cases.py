@@ -1,4 +1,4 @@
-"""The cases of a study: what defines a run, the command that runs it, and the products of sweeps and maps."""
+"""The cases of a study: what defines a run, its command, and the products of sweeps and maps."""
 
 import hashlib
 import json
@@ -9,46 +9,26 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.schema import Axis, Length, Map, Method, ReferenceRun, Study, StudyScene, Sweep
+from msmpetsc.study.schema import Axis, Length, Map, MapCase, Method, Study, StudyScene, Sweep
 
-
-class Key(NamedTuple):
-    """The destinations of the value of a case's key.
-
-    override : table and key of the scene
-    argument : of ``msmpetsc run``
-    column   : whether the table of the study has it, by its own name
-    """
-
-    override: tuple[str, str] | None = None
-    argument: str = ""
-    column: bool = True
-
-
-KEYS = {
-    "scene": Key(),
-    "integrator": Key(override=("time", "integrator")),
-    "preset": Key(override=("solver", "preset")),
-    "options": Key(),  # PETSc's own arguments
-    "label": Key(),
-    "ranks": Key(),  # mpiexec's argument
-    "repeats": Key(),
-    "time_step": Key(override=("time", "step")),
-    "substep": Key(override=("time", "substep")),
-    "error": Key(override=("solver", "error")),
-    "max_iterations": Key(override=("solver", "max_iterations")),
-    "cells": Key(override=("cages", "count")),
-    "true_error": Key(argument="--true-error", column=False),
-    "trace": Key(argument="--trace", column=False),
+OVERRIDES = {  # values of a case that stand in tables of its scene
+    "integrator": ("time", "integrator"),
+    "preset": ("solver", "preset"),
+    "time_step": ("time", "step"),
+    "substep": ("time", "substep"),
+    "error": ("solver", "error"),
+    "max_iterations": ("solver", "max_iterations"),
 }
+ARGUMENTS = {"true_error": "--true-error", "trace": "--trace"}  # of ``msmpetsc run``
+IN_TABLE = ("scene", "options", "label", "ranks", "repeats", "cells", *OVERRIDES)  # values that are columns
 SURFACE = "output.surface=true"  # the override of a case whose surface is compared
-NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference", "point")
+NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference")
 
 
 @dataclass(frozen=True)
@@ -63,7 +43,7 @@ class MapPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One run, repeated. Where its values go is in KEYS.
+    """One run, repeated.
 
     content    : digest of the scene file and of the files that it names
     set        : all overrides, "key.path=value", as --set takes them; what follows repeats them for the table
@@ -101,7 +81,6 @@ class Case:
         """Digest of what defines the run, whatever it is called, however long it may take."""
         what = {name: value for name, value in asdict(self).items() if name not in NOT_ITS_IDENTITY}
         what |= {"version": __version__, "reference": self.reference and self.reference.id}
-        what |= {"place": asdict(self.point)} if self.point else {}  # as tables of before have it
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
@@ -110,14 +89,9 @@ class Case:
         return SURFACE in self.set
 
     @property
-    def work(self) -> float:
-        """A guess, in cells: a process counts as 10^4 of them, and so does a scene that names none."""
-        return self.repeats * (1e4 + (self.cells or 1e4))
-
-    @property
     def columns(self) -> dict[str, Any]:
         """Columns of the table that are known before the case runs."""
-        row = {name: getattr(self, name) for name, key in KEYS.items() if key.column}
+        row = {name: getattr(self, name) for name in IN_TABLE}
         if self.point:
             row |= {"map": self.point.map, "x": str(self.point.x), "y": str(self.point.y)}
         return row | {"case": self.id}
@@ -137,7 +111,7 @@ class Case:
 def run_arguments(case: Case) -> list[str]:
     """Return what follows ``msmpetsc``, outputs aside."""
     changes = [word for change in case.set for word in ("--set", change)]
-    given = [(key.argument, getattr(case, name)) for name, key in KEYS.items() if key.argument]
+    given = [(argument, getattr(case, name)) for name, argument in ARGUMENTS.items()]
     extra = [word for name, value in given if value is not None for word in (name, str(value))]
     return ["run", os.path.relpath(case.file), *changes, *extra, *shlex.split(case.options)]
 
@@ -178,32 +152,26 @@ def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     values = {**values, "integrator": None if values["integrator"] == "implicit-euler" else values["integrator"]}
     names = ("time",) if values["integrator"] == "verlet" else ("time", "solver")
     tables: dict[str, dict[str, Any]] = {name: {} for name in names}
-    for name, value in values.items():
-        table, key = KEYS[name].override or ("", "")
-        if table in tables:
-            tables[table][key] = value
+    for name, (table, key) in OVERRIDES.items():
+        if table in tables and name in values:
+            tables[table][key] = values[name]
     return tables
 
 
 def with_solver(case: Case, scene: Scene) -> Case:
     """Return a case with the overrides of its solver table; none for verlet."""
-    solver = scene_tables(override_values(case)).get("solver")
+    solver = scene_tables(vars(case)).get("solver")
     if solver is None:
         return case
     return case.changed(f"solver={inline(scene.solver.model_dump(exclude_unset=True) | solver)}")
 
 
 def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bool = False) -> Case:
-    """Return a case with the overrides of its time and output tables; with its surface stored if ``surface``."""
+    """Return a case with the overrides of its time and output tables; ``surface``: it is stored."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
-    time |= scene_tables(override_values(case))["time"]
+    time |= scene_tables(vars(case))["time"]
     output = (SURFACE if surface else "output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
     return case.changed(f"time={inline(time)}", *output)
-
-
-def override_values(case: Case) -> dict[str, Any]:
-    """Return the values of a case that override its scene."""
-    return {name: getattr(case, name) for name, key in KEYS.items() if key.override}
 
 
 def inline(table: Mapping[str, Any]) -> str:
@@ -304,54 +272,33 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 
 
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
-    """Return the run that a case is measured against, stored at the moments that are compared.
+    """Return the run with tiny steps that a case is measured against, stored where they are compared.
 
     It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in it.
     """
-    if scene.reference is None:
+    reference = scene.reference
+    if reference is None:
         return None
-    cells = scene.reference.cells
-    if cells:
-        base = replace(base, cells=cells, set=(*scene.set, f"cages.count={cells}"))
+    if reference.cells:
+        base = replace(base, cells=reference.cells, set=(*scene.set, f"cages.count={reference.cells}"))
     frame = scene.frame or as_given.time.step
     duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
-    return reference_case(base, scene.reference, as_given, frame=frame, duration=duration)
-
-
-def reference_case(base: Case, reference: ReferenceRun, scene: Scene, *, frame: float, duration: float) -> Case:
-    """Return a run of the same lattice with tiny steps; frame, duration [s]."""
-    surface = reference.cells is not None
     case = replace(
         base, integrator=reference.integrator, time_step=frame, repeats=1, timeout=reference.timeout, label="reference"
     )
+    surface = reference.cells is not None
     if reference.integrator == "verlet":
-        return with_time(replace(case, substep=reference.substep), duration, 1, scene, surface)
+        return with_time(replace(case, substep=reference.substep), duration, 1, as_given, surface)
     step = reference.step or frame  # the schema asks for it
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s")
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
     solver = inline({"preset": reference.preset, "error": reference.error})
-    return with_time(case.changed(f"solver={solver}"), duration, every, scene, surface)
+    return with_time(case.changed(f"solver={solver}"), duration, every, as_given, surface)
 
 
 # Maps
-
-
-@dataclass(frozen=True)
-class MapScene:
-    """A scene with its changes, which all methods are tried on. y may be the name of a case, x is then the method's.
-
-    length : of a run; the scene's own duration where it says nothing
-    """
-
-    file: str
-    set: tuple[str, ...]
-    x: float | None
-    y: float | str
-    length: Length
-    recovers: bool = False
-    options: str = ""
 
 
 def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | None = None) -> Iterator[Case]:
@@ -362,51 +309,49 @@ def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | N
     Raises InputError for a scene that is wrong.
     """
     methods = [method for method in study.method if not map.methods or method.label in map.methods]
-    for point in named_scenes(map) if map.case else grid_scenes(map):
-        file = folder / point.file
-        scene = load_scene(file, point.set, presets, by_user=False)
+    for x, y, run in map_points(map):
+        file = folder / run.file
+        scene = load_scene(file, run.set, presets, by_user=False)
         base = Case(
-            scene=map.name, file=file, content=digest(file, scene), set=point.set, integrator="verlet",
+            scene=map.name, file=file, content=digest(file, scene), set=run.set, integrator="verlet",
             time_step=scene.time.step, timeout=study.timeout,
         )  # fmt: skip
         for method in methods:
-            yield map_case(base, point, method, scene)
+            point = MapPoint(map.name, method.label if x is None else x, y, run.recovers)
+            yield map_case(replace(base, point=point), run, method, scene)
 
 
-def grid_scenes(map: Map) -> Iterator[MapScene]:
-    """Yield the scenes at the points of two axes."""
-    if map.x is None or map.y is None or map.file is None:
-        return  # the schema asks for them
-    for y, x in product(map.y.values, map.x.values):
-        changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-        yield MapScene(map.file, changes, x, y, map)
+def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
+    """Yield the places of a map, and what is run there; y may be a case's name, x is then the method's."""
+    for case in map.case:
+        length = case if case.steps or case.duration else map
+        own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
+        yield None, case.name, case.model_copy(update=own)
+    if map.x and map.y and map.file:
+        whole = MapCase(name=map.name, file=map.file, steps=map.steps, duration=map.duration)
+        for y, x in product(map.y.values, map.x.values):
+            changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
+            yield x, y, whole.model_copy(update={"set": changes})
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
-    """Yield the changes of an axis; a time step may be longer than the scene, whose duration so changes with it."""
+    """Yield the changes of an axis; with a time step the duration changes, which may be shorter."""
     yield from axis.changes(value)
     if axis.key == "time.step":
         duration = length.steps * value if length.steps else max(length.duration or value, value)
         yield f"time.duration={duration!r}"
 
 
-def named_scenes(map: Map) -> Iterator[MapScene]:
-    """Yield the scenes of named cases."""
-    for case in map.case:
-        length = case if case.steps or case.duration else map
-        changes = (*map.set, *case.set)
-        yield MapScene(case.file, changes, None, case.name, length, recovers=case.recovers, options=case.options)
-
-
-def map_case(base: Case, point: MapScene, method: Method, scene: Scene) -> Case:
+def map_case(base: Case, run: MapCase, method: Method, scene: Scene) -> Case:
     """Return the run of a method at a point of a map."""
-    solves = method.integrator != "verlet"
+    options, preset = [method.options], ""
+    if method.integrator != "verlet":
+        options.append(run.options)
+        preset = method.preset
     case = replace(
-        base, integrator=method.integrator, preset=method.preset if solves else "", error=method.error,
-        max_iterations=method.max_iterations, label=method.label,
-        options=" ".join(filter(None, (method.options, point.options if solves else ""))),
-        point=MapPoint(base.scene, method.label if point.x is None else point.x, point.y, point.recovers),
+        base, integrator=method.integrator, preset=preset, error=method.error, max_iterations=method.max_iterations,
+        label=method.label, options=" ".join(filter(None, options)),
     )  # fmt: skip
-    step, length = scene.time.step, point.length
-    duration = length.steps * step if length.steps else length.duration or scene.time.duration
+    step = scene.time.step
+    duration = run.steps * step if run.steps else run.duration or scene.time.duration
     return with_time(with_solver(case, scene), max(duration, step), 1, scene)

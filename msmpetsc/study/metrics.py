@@ -1,6 +1,8 @@
-"""The figures of a run, from its result file and its measure file, as a row of the table; and its outcome in a word."""
+"""The figures of a run: a row of the table, its distances, its outcome in a word."""
 
 import json
+import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -8,19 +10,19 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from msmpetsc.errors import InputError
+from msmpetsc.results.compare import common_times, refuse_different_lattices
 from msmpetsc.results.reader import Result
-from msmpetsc.study.distances import shape_error
+from msmpetsc.results.surfaces import surface_distance
 from msmpetsc.study.table import Row
 
 COUNTS = ("cells", "nodes", "unknowns", "springs")
 PARTS = ("setup", "factor", "local", "ksp", "output")
 COUNTED = ("iterations", "ksp_its", "products")  # of the steps; an older file lacks the last
 
-OUTCOMES = (  # of a run of a map: from the worst to the best
-    "crashed", "timeout", "refused", "not finite", "energy", "diverged", "not recovered", "inverted", "slow", "ok",
-)  # fmt: skip
-MEANING = {
+MEANING = {  # of the outcomes of a run of a map, from the worst to the best
     "crashed": "the program itself broke",
     "timeout": "took too long",
     "refused": "the program would not begin",
@@ -32,6 +34,7 @@ MEANING = {
     "slow": "more than 30 iterations a step",
     "ok": "none of these",
 }
+OUTCOMES = tuple(MEANING)
 STEP_FAILED, REFUSED = 3, 2  # exit statuses
 OWN_NAME = ("not finite", "energy", "refused")  # kinds of failure that are outcomes
 RECOVERED = 0.02  # shape error
@@ -41,43 +44,30 @@ SLOW = 30  # iterations a step
 # The measure file, which ``msmpetsc run --measure`` leaves
 
 
-def read_costs(path: Path) -> Row:
+def read_record(path: Path) -> dict[str, Any]:
+    """Return what stands in a measure file; nothing where a run was killed before it."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def costs(record: dict[str, Any]) -> Row:
     """Return counts, times, memory, machine and versions of a measure file."""
-    record = json.loads(path.read_text())
     row = {name: record.get(name) for name in (*COUNTS, "memory", "explicit_limit")}
     row |= {f"time_{part}": record.get("time", {}).get(part) for part in PARTS}
-    return row | {"machine": _machine(record.get("machine", {})), "versions": _versions(record.get("versions", {}))}
-
-
-def read_failure(path: Path) -> str:
-    """Return the kind of failure that a measure file records; "" for none, or where there is no such file."""
-    try:
-        failure = json.loads(path.read_text()).get("failure")
-    except (OSError, ValueError):
-        return ""
-    return failure["kind"] if failure else ""
-
-
-def read_trace(path: Path) -> dict | None:
-    """Return the trace of a measure file; None where there is none."""
-    return json.loads(path.read_text()).get("trace") if path.is_file() else None
-
-
-def _machine(record: dict) -> str:
-    parts = [record.get("cpu"), record.get("cores") and f"{record['cores']} cores"]
-    parts += [record.get("memory") and f"{record['memory'] / 2**30:.0f} GiB", record.get("system")]
-    return ", ".join(str(part) for part in parts if part)
-
-
-def _versions(record: dict) -> str:
-    return ", ".join(f"{name} {version}" for name, version in record.items())
+    machine = record.get("machine", {})
+    parts = [machine.get("cpu"), machine.get("cores") and f"{machine['cores']} cores"]
+    parts += [machine.get("memory") and f"{machine['memory'] / 2**30:.0f} GiB", machine.get("system")]
+    versions = ", ".join(f"{name} {version}" for name, version in record.get("versions", {}).items())
+    return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
 
 
 # The result file
 
 
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return figures of the result file: times and iterations are means a step, the first frame left out."""
+    """Return figures of a result: times and iterations are means a step, the first frame left out."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -87,21 +77,18 @@ def of_frames(result: Path, time_step: float) -> Row:
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)  # between frames
     start = 2 if count > 2 else 1  # what is only done once shows in the first frame
     known = [name for name in ("wall_time", *COUNTED) if name in series]
-    mean = {name: series[name][start:].sum() / steps[start - 1 :].sum() for name in known}
-    row = {"frames": count, "steps": int(steps.sum()), "time_frame": float(mean["wall_time"])}
-    row |= {name: float(mean[name]) for name in COUNTED if name in mean}
+    mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
+    row = {"frames": count, "steps": int(steps.sum()), "time_frame": mean.pop("wall_time"), **mean}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
     return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
 
 
 def _soundness(series: dict[str, np.ndarray]) -> Row:
-    """Return what went wrong on the way, as far as the file has it; inverted cells count in the last frame alone."""
-    row: Row = {name: float(series[name][1:].sum()) for name in ("substeps", "fallbacks") if name in series}
-    if "energy_gained" in series:
-        row["energy_gained"] = float(np.nansum(series["energy_gained"][1:]))
-    if "inverted" in series and series["inverted"][-1] >= 0:
+    """Return what went wrong on the way; inverted cells count in the last frame alone."""
+    row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
+    if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
-    if "self_contacts" in series and series["self_contacts"].any():
+    if series["self_contacts"].any():
         row["self_contacts"] = float(series["self_contacts"].max())
         row["self_distance"] = float(np.nanmin(series["self_distance"]))
     return row
@@ -109,21 +96,18 @@ def _soundness(series: dict[str, np.ndarray]) -> Row:
 
 def _energy_left(series: dict[str, np.ndarray]) -> float | None:
     """Return the energy at the end over that at the start; None for a body on which a load acts."""
-    energy = series["kinetic"] + series["elastic"] + series["contact"] + series.get("self_contact", 0.0)
+    energy = np.sum([series[name] for name in ("kinetic", "elastic", "contact", "self_contact")], axis=0)
     return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
 
 
 def _errors(series: dict[str, np.ndarray]) -> Row:
     """Return root mean squares over the steps whose true error was measured, or over all."""
-    estimated = series["step_error"][1:]
-    nothing = np.full(len(estimated), np.nan)
-    true = series["true_error"][1:] if "true_error" in series else nothing
-    energy = series["energy_error"][1:] if "energy_error" in series else nothing
+    estimated, true = series["step_error"][1:], series["true_error"][1:]
     where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
     return {  # of a step with no minimum near the estimate is infinite: then there is none of the run
         "estimated_error": None if np.isinf(estimated[where]).any() else _rms(estimated[where]),
         "true_error": _rms(true[where]),
-        "energy_error": _rms(energy[where]),
+        "energy_error": _rms(series["energy_error"][1:][where]),
     }
 
 
@@ -192,3 +176,84 @@ def counted(outcomes: Iterable[Any]) -> str:
     """Return how many went how, best first: 20 ok, 3 slow."""
     counts = Counter(outcomes)
     return ", ".join(f"{counts[name]} {name}" for name in reversed(OUTCOMES) if counts[name])
+
+
+# Distances of motions: from the rest shape, and from the true motion
+
+
+def shape_error(run: Result, frame: int) -> float | None:
+    """Return ``distance_of_shapes`` for a frame of a result; None where a position is not finite.
+
+    Of several bodies it is that of the one that is farthest from its shape.
+    """
+    position = run.frames.position[frame]
+    if not np.isfinite(position).all():
+        return None
+    rest, mass, body = run["lattice/nodes"][:], run["lattice/mass"][:], run.body_of("lattice")
+    of_bodies = (body == number for number in np.unique(body))
+    return max(distance_of_shapes(position[own], rest[own], mass[own]) for own in of_bodies)
+
+
+def distance_of_shapes(x: np.ndarray, rest: np.ndarray, mass: np.ndarray) -> float:
+    """Return the distance of nodes x (n, 3) from ``rest`` (n, 3) after the best rigid motion, over the longest side.
+
+        min over R, c of sqrt( sum_i m_i |x_i - R rest_i - c|^2 / sum_i m_i ) / side    [-]
+
+    R is a rotation: a mirrored body is not in its rest shape. (Kabsch 1976, as scipy has it.)
+    """
+    side = np.ptp(rest, axis=0).max()
+    if side == 0:  # one node
+        return 0.0
+    x, rest = (points - mass @ points / mass.sum() for points in (x, rest))
+    size = max(np.abs(x).max(), side)  # what has flown apart must not overflow
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of a flat body several rotations are the best: any will do
+        rotation, _ = Rotation.align_vectors(x / size, rest / size, weights=mass / mass.sum())
+    squared = ((x - rotation.apply(rest)) ** 2).sum(axis=1) / size**2  # scipy's own figure ends at 1e-8
+    return float(np.sqrt(mass @ squared / mass.sum()) * size / side)
+
+
+def trajectory_error(result: Path, reference: Path) -> float:
+    """Return the distance of a run from a reference run, relative to how far the reference has moved [-].
+
+        sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
+
+    Sums over the times that both files have, masses M and rest positions of the lattice. x_ref stands for the limit
+    of the time step to zero, so this is the error of the time step and of unfinished steps together, unlike the
+    step error, which knows the step alone. Nothing else is subtracted: a body that flies as a whole counts its
+    flight as motion, so the same error of its shape is a smaller figure there than of one that only swings.
+
+    Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
+    """
+    with Result(result) as run, Result(reference) as true:
+        refuse_different_lattices(run, true)
+        rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
+        pairs = common_times(run.frames.time[:], true.frames.time[:])
+        if len(pairs) < 2:
+            raise InputError(f"{result} and {reference} have {len(pairs)} times in common, 2 are needed")
+        off = moved = 0.0
+        for of_run, of_reference in pairs:
+            x, x_ref = run.frames.position[of_run], true.frames.position[of_reference]
+            off += mass @ ((x - x_ref) ** 2).sum(axis=1)
+            moved += mass @ ((x_ref - rest) ** 2).sum(axis=1)
+    if moved == 0:
+        raise InputError(f"{reference}: nothing moves in it")
+    return float(np.sqrt(off / moved))
+
+
+def surface_error(result: Path, reference: Path, until: float = math.inf) -> float:
+    """Return the distance of a run's surface from that of a reference run, of any lattice of the same mesh [-].
+
+        sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
+
+    until : times after it do not count [s]
+
+    The reference stands for the body itself: this is the error of cells, time step and unfinished steps together.
+
+    Raises InputError if the meshes differ, a surface was not stored, there is no common time, or nothing moves.
+    """
+    with Result(result) as run, Result(reference) as true:
+        distance = surface_distance(run, true, until)
+    if distance.moved == 0:
+        raise InputError(f"{reference}: nothing moves in it")
+    return distance.overall / distance.moved

@@ -39,13 +39,20 @@ class Ended:
     reason: str
     seconds: float
 
+    @property
+    def word(self) -> str:
+        """Whether it ended well: ok, failed or timeout."""
+        if not self.reason:
+            return "ok"
+        return "timeout" if self.status is None else "failed"
+
 
 class Processes:
-    """The processes under way; once stopped, none is started any more."""
+    """The processes under way; once ``stopped``, none is started any more."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen | Forked] = set()
-        self._stopped = False
+        self.stopped = False
         self._lock = Lock()
 
     def run(self, command: Sequence[str], log: Path, timeout: float, warm: bool = False) -> Ended:
@@ -72,19 +79,14 @@ class Processes:
     def stop(self) -> None:
         """End all processes, for good."""
         with self._lock:
-            self._stopped, running = True, list(self._running)
+            self.stopped, running = True, list(self._running)
         for process in running:
             end(process)
-
-    @property
-    def stopped(self) -> bool:
-        """True once no process is started any more."""
-        return self._stopped
 
     def _start(self, command: Sequence[str], log: Path, warm: bool) -> subprocess.Popen | Forked | None:
         variables = environment(alone=command[0] != "mpiexec")
         with self._lock, open(log, "w") as out:
-            if self._stopped:
+            if self.stopped:
                 return None
             process: subprocess.Popen | Forked
             if warm:

@@ -3,28 +3,24 @@
 What stands where is in report.html.j2; this file says what it is.
 """
 
-import json
 import tomllib
 from datetime import datetime
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
+from pandas import DataFrame, option_context
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.cells import growth_charts
-from msmpetsc.study.charts.convergence import convergence_charts
-from msmpetsc.study.charts.order import order_charts
-from msmpetsc.study.charts.pareto import pareto_charts
+from msmpetsc.study.charts.convergence import convergence_charts, order_charts
+from msmpetsc.study.charts.pareto import pareto_charts, size_charts
 from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
-from msmpetsc.study.charts.sizes import size_charts
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.metrics import counted
 from msmpetsc.study.table import (
-    COLUMNS,
     NUMBERS,
     ONCE_NOTE,
     TEXT,
@@ -32,14 +28,13 @@ from msmpetsc.study.table import (
     is_repeated,
     mapped,
     read_table,
+    read_traces,
     swept,
     timed,
 )
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-FIRST, LAST = ["label", "status"], ["command"]  # columns of the whole table even where all cases agree in them
+FIRST, LAST = ["scene", "label", "status"], ["command"]  # columns of the whole table
+ABOVE = ["study", "machine", "versions"]
 OF_FAILURES = ["scene", "label", "time_step", "error", "status", "reason", "command"]
 
 
@@ -48,65 +43,46 @@ def write_report(folder: Path) -> Path:
 
     Returns the path of report.html. Raises InputError where there is no table.
     """
-    table, traces, study = read_table(folder), read_traces(folder), study_file(folder)
-    charts = draw_charts(table, traces, study)
+    table, file, study = read_table(folder), folder / "study.toml", {}
+    if file.is_file():
+        study = tomllib.loads(file.read_text(encoding="utf-8"))
+    charts = draw_charts(table, read_traces(folder), study)
     for chart in charts:
         save_png(chart, folder)
     names = [name for name in table["study"] if name]
     title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
-    path = folder / "report.html"
-    write_whole(path, page(title, measured_on(folder), table, charts))
+    path, written = folder / "report.html", datetime.fromtimestamp((folder / "table.csv").stat().st_mtime)
+    write_whole(path, page(title, f"{written.astimezone():%d %B %Y, %H:%M %z}", table, charts))
     return path
 
 
-def draw_charts(table: "DataFrame", traces: list[dict], study: dict) -> list[Chart]:
+def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[Chart]:
     """Return all charts that there are numbers for; a method looks the same in each.
 
     study : the tables of the study file
     """
-    styles = curve_styles([*table["label"], *(entry["label"] for entry in traces)])
+    styles = curve_styles(table["label"])
     charts = stability_charts(table, study)
     sweeps = swept(table)
     for draw in (size_charts, pareto_charts, growth_charts):
         charts += draw(sweeps, styles)
     charts += order_charts(sweeps, styles, study)
-    commands = dict(zip(sweeps["case"], sweeps["command"], strict=True))
-    commands.pop("", None)
-    return charts + convergence_charts(traces, styles, commands)
-
-
-def read_traces(folder: Path) -> list[dict]:
-    """Return the entries of traces.json that have a trace; none where there is no such file."""
-    path = folder / "traces.json"
-    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    return [entry for entry in entries if entry.get("trace")]
-
-
-def study_file(folder: Path) -> dict:
-    """Return the tables of study.toml; none where there is no such file."""
-    file = folder / "study.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-
-
-def measured_on(folder: Path) -> str:
-    """Return when the table was last written, UTC offset included."""
-    return datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone().strftime("%d %B %Y, %H:%M %z")
+    return charts + convergence_charts(sweeps, styles, traces)
 
 
 # The page
 
 
-def page(title: str, date: str, table: "DataFrame", charts: list[Chart]) -> str:
+def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"anchor": anchor, "svg": lambda chart: Markup(svg_text(chart)), "html": html}
-    folder = files("msmpetsc.study")
-    css, script = (Markup((folder / f"report.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
-    content = facts(table) | whole_table(table) | {"failures": failed(swept(table))[OF_FAILURES], "charts": charts}
-    return environment.get_template("report.html.j2").render(title=title, date=date, css=css, script=script, **content)
+    tables = {"table": whole_table(table), "failures": failed(swept(table))[OF_FAILURES]}
+    template = environment.get_template("report.html.j2")
+    return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
 
-def facts(table: "DataFrame") -> dict[str, Any]:
+def facts(table: DataFrame) -> dict[str, Any]:
     """Return machine, versions and how many cases there are."""
     plain = swept(table)
     maps = {name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()}
@@ -115,7 +91,7 @@ def facts(table: "DataFrame") -> dict[str, Any]:
     return counts | {"maps": maps, "platforms": platforms, "repeats": repeats_note(timed(plain))}
 
 
-def repeats_note(rows: "DataFrame") -> str:
+def repeats_note(rows: DataFrame) -> str:
     """Say how often cases were run, and what follows for their times; empty without cases."""
     counts = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
     if rows.empty or not is_repeated(rows):
@@ -123,22 +99,15 @@ def repeats_note(rows: "DataFrame") -> str:
     return f"{counts}: times are medians, ranges and whiskers from the least to the greatest"
 
 
-def whole_table(table: "DataFrame") -> dict[str, Any]:
-    """Return the whole table, and what all its cases share, which stands above it."""
-    unknown = [str(name) for name in table if name not in COLUMNS]
-    order = [name for name in (*TEXT, *NUMBERS, *unknown) if name not in (*FIRST, *LAST)]
-    filled = [name for name in order if (table[name].notna() & (table[name] != "")).any()]
-    agreed = [name for name in filled if len(table) > 1 and table[name].nunique(dropna=False) == 1]
-    differing = [name for name in filled if name not in agreed]
-    differing.sort(key=lambda name: name in TEXT and name != "scene")
-    shared = {name: formatting.plain(table[name].iloc[0]) for name in agreed}
-    return {"table": table[[*FIRST, *differing, *LAST]], "shared": shared}
+def whole_table(table: DataFrame) -> DataFrame:
+    """Return all columns that some case fills, but for those that stand above all; numbers before texts."""
+    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, *LAST, *ABOVE)]
+    filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
+    return table[[*FIRST, *filled, *LAST]]
 
 
-def html(table: "DataFrame") -> Markup:
+def html(table: DataFrame) -> Markup:
     """Return a table whose headings sort it."""
-    from pandas import option_context
-
     with option_context("display.max_colwidth", None):
         return Markup(table.map(formatting.plain).to_html(index=False, border=0, classes="sortable"))
 

@@ -1,25 +1,37 @@
-"""A study is carried out: a bench runs each case, and the table is written after each, so that it can be continued."""
+"""A study is carried out: a bench runs each case, and the table is written after each."""
 
 import json
 import os
 import shutil
+import sys
 from collections.abc import Collection, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
+from typing import Any
+
+from tqdm import tqdm
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
-from msmpetsc.study.distances import surface_error, trajectory_error
-from msmpetsc.study.metrics import of_frames, outcome, rates, read_costs, read_failure, read_trace, together
+from msmpetsc.study.metrics import (
+    costs,
+    of_frames,
+    outcome,
+    rates,
+    read_record,
+    surface_error,
+    together,
+    trajectory_error,
+)
 from msmpetsc.study.process import Ended, Processes, too_long
-from msmpetsc.study.progress import StudyProgress
 from msmpetsc.study.schema import Study, load_study
-from msmpetsc.study.table import Row, read_table, records, require_extra, write_table
+from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
 
+SETTINGS = ("cells", "time_step", "substep", "error", "max_iterations")  # that tell cases apart
 PARTS = "parts"  # folder of the parts' folders
 
 
@@ -28,11 +40,10 @@ PARTS = "parts"  # folder of the parts' folders
 
 @dataclass(frozen=True)
 class CaseResult:
-    """The row of a case, its trace if one was asked for, and the time all of it took [s]."""
+    """The row of a case, and its trace if one was asked for."""
 
     row: Row
     trace: dict | None
-    seconds: float
 
 
 @dataclass
@@ -54,55 +65,37 @@ class Bench:
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
-        """Run a case as often as it says; what goes wrong stands in its row. ``keep``: its result stays."""
+        """Run a case as often as it says; what goes wrong is in its row. ``keep``: its result stays."""
         runs: list[Row] = []
-        path, seconds = self.result_of(case), 0.0
+        path, trace = self.result_of(case), None
+        known = case.columns | {"study": self.study, "command": shown_command(case)}
         reference, why = self._reference(case)
-        trace, kind = None, ""
         for repeat in range(case.repeats):
             ended = self._run(case if repeat == 0 else case.unmeasured(), path)
-            seconds += ended.seconds
-            row, problem = self._figures(case, path, ended)
+            record = read_record(path.with_suffix(".json"))
+            row, problem = _figures(case, path, record)
             if repeat == 0:
-                trace = read_trace(path.with_suffix(".json"))
+                trace = record.get("trace")
                 if reference is not None and not ended.reason:
                     errors, why = _distance(case, path, reference)
                     row |= errors
-            kind = read_failure(path.with_suffix(".json"))
             if not keep or ended.reason:
                 _remove_files(path, log=not ended.reason)
             runs.append(row)
             if ended.reason:
                 break
             why = why or problem
-        status = "ok" if not ended.reason else "timeout" if ended.status is None else "failed"
-        row = self._named(case) | together(runs) | {"status": status, "reason": ended.reason or why}
+        row = known | together(runs) | {"status": ended.word, "reason": ended.reason or why}
         if case.point:
+            kind = (record.get("failure") or {}).get("kind", "")
             row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
-        return CaseResult(row | rates(row, case.time_step), trace, seconds)
-
-    def _named(self, case: Case) -> Row:
-        """Return what is known of a case before it runs."""
-        return case.columns | {"study": self.study, "command": shown_command(case)}
+        return CaseResult(row | rates(row, case.time_step), trace)
 
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
         figures, log = path.with_suffix(".json"), path.with_suffix(".log")
         warm = self.warm or case.point is not None
         return self.processes.run(command(case, path, figures), log, case.timeout, warm)
-
-    def _figures(self, case: Case, path: Path, ended: Ended) -> tuple[Row, str]:
-        """Return the figures of a run, as far as it came; and what is missing, in words."""
-        row: Row = {}
-        problem = ""
-        try:
-            row |= read_costs(path.with_suffix(".json"))
-            row |= of_frames(path, case.time_step)
-            if case.integrator == "verlet":
-                row["estimated_error"] = None  # nothing is solved
-        except (OSError, ValueError, InputError) as error:
-            problem = "" if ended.reason else f"no figures: {error}"
-        return row, problem
 
     def _reference(self, case: Case) -> tuple[Path | None, str]:
         """Return the result of the case's reference, made if need be; or why there is none."""
@@ -126,8 +119,20 @@ class Bench:
         return (path, "") if path.is_file() else (None, f"no reference: {failed.read_text()}")
 
 
+def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
+    """Return the figures of a run, as far as it came; and what is missing, in words."""
+    row = costs(record)
+    try:
+        row |= of_frames(path, case.time_step)
+    except (OSError, ValueError, InputError) as error:
+        return row, f"no figures: {error}"
+    if case.integrator == "verlet":
+        row["estimated_error"] = None  # nothing is solved
+    return row, ""
+
+
 def _distance(case: Case, path: Path, reference: Path) -> tuple[Row, str]:
-    """Return the error of a run's surface, or of its nodes, by the name of its column; or why there is none."""
+    """Return the error of a run's surface, or of its nodes, by its column; or why there is none."""
     name, measure = ("surface", surface_error) if case.stores_surface else ("trajectory", trajectory_error)
     try:
         return {f"{name}_error": measure(path, reference)}, ""
@@ -158,13 +163,13 @@ class StudyResults:
         case = result.row["case"]
         self.rows[case] = result.row
         if result.trace:
-            self.traces[case] = {key: result.row[key] for key in ("case", "scene", "label")} | {"trace": result.trace}
+            self.traces[case] = result.trace
         self.write()
 
     def write(self) -> None:
         """Write table and traces, each replaced whole."""
         write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
-        traces = [self.traces[case] for case in self.order if case in self.traces]
+        traces = {case: self.traces[case] for case in self.order if case in self.traces}
         write_whole(self.folder / "traces.json", json.dumps(traces))
 
 
@@ -224,7 +229,7 @@ def run_study(
 def list_study(
     path: Path, folder: Path, presets: Collection[str] | None, full: bool = False
 ) -> list[tuple[Case, bool]]:
-    """Return the cases of a study file in their order, and whether each is done; nothing is run or written."""
+    """Return the cases of a study file, and whether each is done; nothing is run or written."""
     require_extra()
     every, wanted = _cases(load_study(path, presets), path, full, presets)
     rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
@@ -240,21 +245,31 @@ def _cases(
 
 
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
-    """Run cases and keep their results; ``done`` were before."""
-    work = {case.id: case.work for case in todo}
-    progress = StudyProgress(list(work.values()), done)
+    """Run cases, keep their results and show each; ``done`` were before."""
+    bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     try:
-        with closing(measure_all(bench, todo, jobs)) as finished:
-            for result in finished:
+        with bar, closing(measure_all(bench, todo, jobs)) as finished:
+            for count, result in enumerate(finished, done + 1):
                 results.add(result)
-                progress.update(result.row, work[result.row["case"]])
+                bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
+                bar.update()
     finally:
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()
 
 
+def described(row: Row) -> str:
+    """Return what a case was, and what became of it."""
+    if row.get("map"):
+        return f"{row['map']} {row['label']} at {row['x']}, {row['y']}: {row['outcome']}"
+    numbers = (*SETTINGS, "time_frame", "true_error", "trajectory_error", "surface_error")
+    known = (f"{name} {row[name]:.3g}" for name in numbers if row.get(name))
+    status = row["reason"] if row["status"] == "ok" else f"{row['status']}: {row['reason']}"
+    return ", ".join(filter(None, [f"{row['scene']} {row['label']}", *known, status]))
+
+
 def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Generator[CaseResult, None, None]:
-    """Yield each case's result when it is done; whatever ends this early ends the runs under way."""
+    """Yield each case's result when it is done; what ends this early ends the runs under way."""
     pool = ThreadPoolExecutor(jobs)
     try:
         futures = [pool.submit(bench.measure, case) for case in todo]
@@ -278,9 +293,7 @@ def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
         rows = {row["case"]: row for row in _earlier_rows(folder) if row["case"] in by_id}
         new = {case: row for case, row in rows.items() if not _is_done(by_id[case], results.rows)}
         results.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
-        results.traces |= _traces(folder, new)
-    for case, entry in results.traces.items():
-        entry["label"] = by_id[case].label
+        results.traces |= {case: trace for case, trace in read_traces(folder).items() if case in new}
     return results
 
 
@@ -298,18 +311,8 @@ def _earlier_rows(folder: Path) -> list[Row]:
     return records(table)
 
 
-def _traces(folder: Path, cases: Collection[str]) -> dict[str, dict]:
-    """Return what traces.json of a folder has of these cases."""
-    traces = folder / "traces.json"
-    try:
-        entries = json.loads(traces.read_text()) if traces.is_file() else []
-        return {entry["case"]: entry for entry in entries if entry["case"] in cases}
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{traces} is not what a study left: --restart begins anew") from None
-
-
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case need not be run: one given up is worth another try once it may take longer, or less."""
+    """Return whether a case need not be run: one given up may be worth another try."""
     row = rows.get(case.id)
     return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
 

@@ -1,7 +1,7 @@
 """The schema of a study file: which scenes are run, and with what; and how it is read (TOML)."""
 
 import shlex
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -15,12 +15,6 @@ from msmpetsc.solve.petsc.words import unsafe_word
 
 Error = Annotated[float, Field(gt=0, lt=1)]
 Override = Annotated[str, Field(min_length=3)]
-
-
-def _not_empty(values: tuple) -> tuple:
-    if not values:
-        raise rule("must not be empty")
-    return values
 
 
 def _words(options: str) -> str:
@@ -39,10 +33,9 @@ def _differ(names: list[str], what: str) -> None:
         raise rule(f"must not have two {what} of the name {twice!r}")
 
 
-def _known(wanted: list[str], what: str, info: ValidationInfo) -> None:
+def _known(wanted: Iterable[str], what: str, names: list[str]) -> None:
     """Refuse ``wanted`` names that no scene, or no method, of this study has; ``what``: "scene" or "method"."""
-    names = [getattr(entry, "name", None) or entry.label for entry in info.data.get(what, ())]
-    unknown = next((name for name in wanted if what in info.data and name not in names), None)
+    unknown = next((name for name in wanted if name not in names), None)
     if unknown is not None:
         raise rule(f"names a {what} {unknown!r} that is not there{did_you_mean(unknown, names)}")
 
@@ -138,10 +131,11 @@ class Sweep(Table):
     trace: bool = Field(default=False, description="follow the iterates of the scene's trace step")
     full: bool = Field(default=False, description="only with --full")
 
-    @field_validator("integrators", "options", "ranks")
-    @classmethod
-    def _has_some(cls, values: tuple) -> tuple:
-        return _not_empty(values)
+    @model_validator(mode="after")
+    def _has_cases(self) -> "Sweep":
+        if not (self.integrators and self.options and self.ranks):
+            raise rule("has no cases: integrators, options and ranks must not be empty")
+        return self
 
 
 class Method(Table):
@@ -230,43 +224,23 @@ class Study(Table):
     scene: ListOf[StudyScene] = Field(default=(), description="what is run")
     sweep: ListOf[Sweep] = Field(default=(), description="how it is run")
     method: ListOf[Method] = Field(default=(), description="the methods of maps")
-    map: ListOf[Map] = Field(default=(), validate_default=True, description="what happens where")
+    map: ListOf[Map] = Field(default=(), description="what happens where")
     order: ListOf[Order] = Field(default=(), description="scenes that show the order of the integrators")
 
-    @field_validator("scene")
-    @classmethod
-    def _scenes_differ(cls, scenes: tuple[StudyScene, ...]) -> tuple[StudyScene, ...]:
-        _differ([scene.name for scene in scenes], "scenes")
-        return scenes
-
-    @field_validator("sweep")
-    @classmethod
-    def _scenes_known(cls, sweeps: tuple[Sweep, ...], info: ValidationInfo) -> tuple[Sweep, ...]:
-        _known([name for sweep in sweeps for name in sweep.scenes], "scene", info)
-        return sweeps
-
-    @field_validator("method")
-    @classmethod
-    def _methods_differ(cls, methods: tuple[Method, ...]) -> tuple[Method, ...]:
-        _differ([method.label for method in methods], "methods")
-        return methods
-
-    @field_validator("map")
-    @classmethod
-    def _has_what_it_needs(cls, maps: tuple[Map, ...], info: ValidationInfo) -> tuple[Map, ...]:
-        if not maps and not all(info.data.get(name, True) for name in ("scene", "sweep")):
-            raise rule("required, or else scene and sweep")
-        _differ([map.name for map in maps], "maps")
-        _known([name for map in maps for name in map.methods], "method", info)
-        if maps and not info.data.get("method", True):
-            raise rule("needs methods: [[method]]", "method")
-        return maps
-
-    @field_validator("order")
-    @classmethod
-    def _orders_known(cls, orders: tuple[Order, ...], info: ValidationInfo) -> tuple[Order, ...]:
-        _known([order.scene for order in orders], "scene", info)
-        return orders
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Study":
+        if not self.map and not (self.scene and self.sweep):
+            raise rule("needs scene and sweep, or map: one of them is required")
+        if self.map and not self.method:
+            raise rule("needs methods for its maps: [[method]]")
+        scenes, methods = [scene.name for scene in self.scene], [method.label for method in self.method]
+        maps = [map.name for map in self.map]
+        for names, what in ((scenes, "scenes"), (methods, "methods"), (maps, "maps")):
+            _differ(names, what)
+        _known((name for sweep in self.sweep for name in sweep.scenes), "scene", scenes)
+        _known((order.scene for order in self.order), "scene", scenes)
+        _known((name for map in self.map for name in map.methods), "method", methods)
+        return self
 
 
 def load_study(path: Path, presets: Collection[str] | None = None) -> Study:

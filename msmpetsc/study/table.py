@@ -3,6 +3,7 @@
 pandas is imported where it is used: the commands that need no table do not wait for it.
 """
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
@@ -127,38 +128,43 @@ def write_table(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv, see ``typed``. Raises InputError without a table, or for one that is none."""
+    """Return the rows of table.csv, see ``typed``. Raises InputError where there is no such table."""
     import pandas
 
     path = folder / "table.csv"
     if not path.is_file():
         raise InputError(f"no table.csv in {folder}: it is no folder of a study")
     try:
-        return typed(pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna(""))
+        texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna("")
     except ValueError as error:  # of pandas' parser, of text that is not UTF-8
         raise InputError(f"{path} is not the table of a study: {str(error).splitlines()[0]}") from None
+    return typed(texts.to_dict("records"))  # type: ignore[arg-type]  # columns are called by text
+
+
+def read_traces(folder: Path) -> dict[str, dict]:
+    """Return the traces of traces.json by case; none without the file. Raises InputError."""
+    path = folder / "traces.json"
+    try:
+        traces = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return dict(traces.items())
+    except (ValueError, AttributeError):
+        raise InputError(f"{path} is not what a study left: --restart begins anew") from None
 
 
 def as_table(rows: Sequence[Row]) -> "DataFrame":
-    """Return rows as a table with all columns in their order; a number that is missing is NaN, a text empty."""
+    """Return rows as a table with all columns; a number that is missing is NaN, a text empty."""
     from pandas import DataFrame
 
     table = DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(NUMBERS, float))
     return table.astype(dict.fromkeys(TEXT, object)).fillna(dict.fromkeys(TEXT, ""))
 
 
-def typed(texts: "DataFrame | Iterable[Mapping[str, str]]") -> "DataFrame":
-    """Return rows of text as a table with numbers for numbers; columns of no study stay, as text.
+def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
+    """Return rows of text as a table with numbers for numbers.
 
     What is missing, not a number, infinite or unreadable was not measured: NaN.
     """
-    from pandas import DataFrame
-
-    texts = DataFrame(texts if isinstance(texts, DataFrame) else list(texts))
-    stripped = texts.fillna("").map(str.strip)
-    unknown = [name for name in stripped if name not in COLUMNS]
-    table = stripped.reindex(columns=[*COLUMNS, *unknown], fill_value="").astype(object).fillna("")
-    return table.assign(**{name: table[name].map(_number).astype(float) for name in NUMBERS})
+    return as_table([{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts])
 
 
 def records(table: "DataFrame") -> list[Row]:
@@ -210,7 +216,7 @@ def failed(table: "DataFrame") -> "DataFrame":
 
 
 def swept(table: "DataFrame") -> "DataFrame":
-    """Return the rows of sweeps; those of maps stand apart, for a run that fails there is an answer."""
+    """Return the rows of sweeps; those of maps stand apart: a run that fails there is an answer."""
     return table[table["map"] == ""]
 
 

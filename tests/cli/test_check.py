@@ -9,7 +9,7 @@ import pytest
 from block_scene import block_scene
 
 from msmpetsc.cli.main import main
-from msmpetsc.study.baselines.baseline import Recipe, allowed, judged
+from msmpetsc.study.baseline import Numbers, Recipe, allowed, judged, read
 
 pytestmark = pytest.mark.timeout(200)
 STEPS = 3
@@ -36,10 +36,10 @@ def numbers(scene: Path) -> Path:
 
 def test_the_numbers_say_how_they_were_made(numbers: Path):
     stored = json.loads(numbers.read_text())
-    assert Recipe.of(stored) == Recipe(None, STEPS, ("material.density=900.0",))
+    assert read(numbers).run == Recipe(cells=None, steps=STEPS, changes=["material.density=900.0"])
     springs = (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32  # edges, diagonals of faces, of the 4 x 4 x 2 cells
     assert stored["counts"] == {"cells": 32, "nodes": 75, "springs": springs, "pinned": 25, "frames": STEPS + 1}
-    assert all(not line for line in judged(stored, stored).values())
+    assert all(not line for line in judged(read(numbers), read(numbers)).values())
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
@@ -123,11 +123,10 @@ def test_damaged_numbers_are_refused_before_anything_is_run(scene: Path, numbers
 
 
 def test_too_great_a_scale_hides_no_difference(numbers: Path):
-    found = json.loads(numbers.read_text())
     stored = json.loads(numbers.read_text())
     stored["scales"] = dict.fromkeys(stored["scales"], 1e300)
     stored["numbers"]["elastic"]["value"] += 1000.0
-    assert judged(found, stored)["elastic"]
+    assert judged(read(numbers), Numbers.model_validate(stored))["elastic"]
 
 
 def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, numbers: Path, ball: Path, capsys):

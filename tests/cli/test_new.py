@@ -19,7 +19,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.drafting.measures import measured, unit_of
+from msmpetsc.study.new_scene import measured, unit_of
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:

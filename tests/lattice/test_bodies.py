@@ -21,7 +21,7 @@ from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.results.compare import compare
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.multigrid.grids import grid_indices
-from msmpetsc.study.distances import distance_of_shapes, shape_error
+from msmpetsc.study.metrics import distance_of_shapes, shape_error
 from msmpetsc.view.overlays import Rest, fixed_nodes
 
 H = 0.125

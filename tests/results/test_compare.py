@@ -18,7 +18,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.compare import DEFAULT, compare, difference
 from msmpetsc.results.reader import Result
 from msmpetsc.results.surfaces import point_areas, surface_distance
-from msmpetsc.study.distances import surface_error
+from msmpetsc.study.metrics import surface_error
 
 DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the last frame
 

@@ -24,11 +24,11 @@ from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
 from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
-from msmpetsc.study.baselines import baseline
+from msmpetsc.study import baseline
 from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import StudyResults
-from msmpetsc.study.scene_lines import put_into
+from msmpetsc.study.sizing.answer import put_into, tables
 from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
 from msmpetsc.view.drawable import drawable_of_result
@@ -88,14 +88,14 @@ def writers(sources: Path) -> dict[str, Writer]:
             lambda path: small_result.write(path.with_suffix(".h5")),
         ),
         "x.toml": Writer("cli/commands/new.py", lambda path: new.write(path, "title = 'a scene'\n")),
-        "x.baseline.json": Writer("study/baselines/baseline.py", lambda path: baseline.write(path, {"counts": {}})),
+        "x.baseline.json": Writer("study/baseline.py", lambda path: baseline.write(path, NUMBERS)),
         "junit.xml": Writer(
             "cli/commands/check.py",
             lambda path: write_junit(path, [Checked(Path("a.toml"), {"cells": "", "nodes": "off"}, 1.0)]),
         ),
         "planned.toml": Writer(
-            "study/scene_lines.py",
-            lambda path: put_into(path, Candidate("verlet", 0.02)),
+            "study/sizing/answer.py",
+            lambda path: put_into(path, tables(Candidate("verlet", 0.02))),
             lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
         ),
         "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),
@@ -115,6 +115,7 @@ def writers(sources: Path) -> dict[str, Writer]:
     return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
 
 
+NUMBERS = baseline.Numbers(run=baseline.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
 # what never ends a run, and what needs one to be called: these too write by the one way, and nothing else
 NOT_TRIED = {"app/profile.py"}

@@ -10,6 +10,8 @@ import bench
 import numpy as np
 import pytest
 
+from msmpetsc.solve.petsc import device
+
 COST = {"cells": 1000, "nodes": 100_000, "memory": 2e8, "time": {"setup": 1.5}}
 
 
@@ -57,3 +59,11 @@ def test_a_run_is_a_real_one(tmp_path: Path, monkeypatch):
     done = bench.measured("beam 1e4", bench.METHODS["newton, gamg"], None)
     assert len(done.frames["ksp_its"]) == 2 and done.frames["products"].min() > 0 and done.cost["cells"] == 8 * 3 * 3
     assert bench.measured("beam 1e4", bench.Method(("-gone",)), None) is None
+
+
+def test_without_a_gpu_it_says_so(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    if device.what_is_missing() is None:
+        pytest.skip("there is one")
+    monkeypatch.setattr(sys, "argv", ["bench.py", "--gpu"])
+    assert bench.main() == 2
+    assert capsys.readouterr().err.count("\n") == 1

@@ -8,7 +8,6 @@ from pathlib import Path
 import lab
 
 import bench_peers
-import numpy as np
 import peers
 import pytest
 from conftest import ENVIRONMENT, ROOT
@@ -27,15 +26,6 @@ def test_the_beam_that_peers_get_is_that_of_the_run(small: bench_peers.Setup):
     assert len(given.nodes) == 5 * 3 * 3 and given.pinned.sum() == 9
     assert given.corner.max(axis=0).tolist() == [4, 2, 2]
     assert given.mass.sum() == pytest.approx(1000 * 16 * bench_peers.CELL**3)
-
-
-def test_no_spring_joins_nodes_of_a_color(small: bench_peers.Setup):
-    given = peers.read_beam(small.reference)
-    color = np.empty(len(given.nodes), int)
-    for i, group in enumerate(peers.color_groups(given)):
-        color[group] = i
-    assert np.bincount(color).sum() == len(given.nodes)
-    assert (color[given.springs[:, 0]] != color[given.springs[:, 1]]).all()
 
 
 def test_the_error_of_verlet_s_trajectory_is_small(small: bench_peers.Setup):

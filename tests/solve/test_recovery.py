@@ -18,7 +18,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.nonlinear.error_control import REASON
 from msmpetsc.solve.simulate import Simulation
-from msmpetsc.study.distances import distance_of_shapes
+from msmpetsc.study.metrics import distance_of_shapes
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]

@@ -1,16 +1,17 @@
 """The figures of a run: its error against a reference, means of its steps, medians of its repeats."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from scipy.spatial.transform import Rotation
 from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.writer import ResultFile
-from msmpetsc.study.distances import common_times, trajectory_error
-from msmpetsc.study.metrics import of_frames, together
+from msmpetsc.study.metrics import common_times, distance_of_shapes, of_frames, together, trajectory_error
 
 
 def result(path: Path, times: list[float], positions: list[np.ndarray], mass: list[float], **series) -> Path:
@@ -91,3 +92,37 @@ def test_the_range_of_the_repeats_is_kept_and_a_single_run_has_none():
     assert together(runs) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
     assert together(runs[:1]) == {"time_frame": 0.3}
     assert together([*runs[:2], {}]) == {"time_frame": 0.2, "time_frame_min": 0.1, "time_frame_max": 0.3}
+
+
+def block(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform([0, 0, 0], [4, 2, 1], (50, 3)), rng.uniform(1, 3, 50)
+
+
+def test_a_rigid_motion_is_no_error_of_shape():
+    rest, mass = block()
+    moved = Rotation.from_rotvec([1, 2, -2]).apply(rest) + np.array([5, -7, 100])
+    assert distance_of_shapes(moved, rest, mass) < 1e-12
+
+
+def test_the_error_of_a_swollen_body_by_hand():
+    """All grows by 10% about the centre of mass: a tenth of the root mean square distance from it."""
+    rest, mass = block()
+    centre = mass @ rest / mass.sum()
+    spread = math.sqrt(mass @ ((rest - centre) ** 2).sum(axis=1) / mass.sum())
+    expected = 0.1 * spread / np.ptp(rest, axis=0).max()
+    assert distance_of_shapes(1.1 * rest, rest, mass) == pytest.approx(expected)
+
+
+def test_a_mirrored_body_is_not_in_its_rest_shape():
+    """Mirrored through the thinnest side, at best: two masses at +-a along it are 2 a off."""
+    rest = np.array([[2.0, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.5], [0, 0, -0.5], [1, 0.5, 0.3]])
+    assert distance_of_shapes(rest * [1, 1, -1], rest, np.ones(7)) > 0.02
+
+
+def test_energy_is_not_compared_where_a_load_acts_and_a_number_that_is_none_has_no_shape(tmp_path: Path):
+    rest, mass = block()
+    positions = [rest, *[rest + math.nan] * 3]
+    path = result(tmp_path / "x.h5", [0, 0.1, 0.2, 0.3], positions, mass, kinetic=[1] * 4, potential=[0, 0, 0, -1])
+    row = of_frames(path, 0.1)
+    assert row["energy_left"] is None and row["shape_error"] is None

@@ -11,19 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_files import Balance, row_of, spaced, svgs, tooltips, write_rows
 
-from msmpetsc.errors import InputError
 from msmpetsc.study.charts.cells import growth_charts
 from msmpetsc.study.charts.convergence import convergence_charts
-from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, winners
-from msmpetsc.study.charts.plot import RING, Chart, Panel, curve_styles
-from msmpetsc.study.charts.sizes import size_charts
+from msmpetsc.study.charts.pareto import STEP, TRAJECTORY, front, front_rows, pareto_charts, size_charts, winners
+from msmpetsc.study.charts.plot import RING, Axes, Chart, curve_styles
 from msmpetsc.study.report import write_report
-from msmpetsc.study.table import read_table, records, succeeded, typed
+from msmpetsc.study.table import read_table, succeeded, typed
 
 ERRORS = [
     row_of("newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2),
     row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
-    row_of("anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
+    row_of("anderson", case="anderson", error=1e-2, time_frame=0.03, true_error=6e-3, trajectory_error=0.21),
     row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
     row_of("verlet", integrator="verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
     row_of("paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3, true_error=1e-7),
@@ -36,22 +34,17 @@ SWEEP = [
     )
     for n, time in zip((1000, 10000, 100000), times, strict=True)
 ]
-TRACES = [
-    {
-        "scene": "block",
-        "label": label,
-        "case": label,
-        "trace": {
-            "frame": 7,
-            "iteration": [0, 1, 2],
-            "ksp_its": [0, 5, 9],
-            "seconds": [0.0, 0.011, 0.023],
-            "position_error": [0.3, rate, rate**2],
-            "energy_error": [0.1, None, rate**4],
-        },
+TRACES = {
+    label: {
+        "frame": 7,
+        "iteration": [0, 1, 2],
+        "ksp_its": [0, 5, 9],
+        "seconds": [0.0, 0.011, 0.023],
+        "position_error": [0.3, rate, rate**2],
+        "energy_error": [0.1, None, rate**4],
     }
     for label, rate in (("newton", 0.012), ("anderson", 0.17))
-]
+}
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +116,6 @@ def test_the_cheapest_names_all_within_its_noise():
     rows = succeeded(typed(NOISY))
     assert [row["label"] for row in winners(rows, STEP, 1e-2)] == ["newton", "pipecg", "anderson"]
     assert [row["label"] for row in winners(rows, STEP, 1e-3)] == ["anderson", "lbfgs"]
-    assert winners(rows, STEP, 1e-6) == []
     assert [row["label"] for row in winners(rows[:1], STEP, 1e-2)] == ["newton"], "nothing is within its noise"
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
@@ -137,7 +129,6 @@ def test_the_cheapest_names_all_within_its_noise():
 
 def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_path: Path, text: str):
     rows = succeeded(typed(ERRORS))
-    assert [row["label"] for row in winners(rows, STEP, 1e-1)] == ["anderson"]
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     unknown = "Each was run once: how much its time varies is not known"
     assert all(lines[-1].startswith(unknown) for lines in chart.findings.values())
@@ -146,7 +137,7 @@ def test_without_repeats_noise_is_unknown_and_nobody_shares_the_first_place(tmp_
     assert unknown not in page and "<dt>Repeats</dt><dd>3: times are medians" in page
 
 
-def values(panel: Panel, column: str) -> list:
+def values(panel: Axes, column: str) -> list:
     """The values of all layers of a panel that have this column."""
     return [value for layer in panel.layers for value in layer["data"]["values"] if column in value]
 
@@ -160,7 +151,7 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     rows = typed([*NOISY, *(repeated("cg", t / 2, t, 3 * t, cells=n, scene="s") for n, t in ((10, 0.1), (99, 1.0)))])
     (pareto,), (growth,) = (draw(rows, curve_styles(rows["label"])) for draw in (pareto_charts, growth_charts))
 
-    def ends(panel: Panel) -> list:
+    def ends(panel: Axes) -> list:
         return sorted({(value["y"], value["high"]) for value in values(panel, "high")})
 
     step, trajectory = map(ends, pareto.panels)
@@ -215,20 +206,20 @@ def test_every_point_tells_its_numbers(text: str):
     assert len(tips) == (4 + 5) + 4 * 6 + 2 * 6  # pareto's panels, growth's panels, two traces in two panels
     for row in (row for row in ERRORS + SWEEP if row["status"] == "ok"):
         assert any(row["label"] in tip and row["command"] in tip for tip in tips), row
-    newton = "newton\nstep error: 3e-5\ncomputing time a frame: 80 ms\ntime step: 10 ms\nerror asked for: 1e-4\n"
+    newton = "newton\ntrue error 3e-5\ntime frame 80 ms\ntime step 10 ms\nerror 1e-4\n"
     assert any(tip.startswith(newton) for tip in tips)
-    assert "cg (step error 5e-4)\nvalid cells: 10,000\ntime a frame and cell: 9 µs" in "\n".join(tips)
-    assert "anderson\niteration: 1\ncomputing time: 11 ms\nstep error: 1.7e-1\nKSP iterations: 5" in tips
-    assert any(tip.startswith("newton\niteration: 1\n") and tip.endswith("\n" + ERRORS[0]["command"]) for tip in tips)
+    assert "cg (step error 5e-4)\ncells 10,000\ntime frame a cell 9 µs" in "\n".join(tips)
+    assert any(
+        tip.startswith("anderson\niteration 1\nseconds 11 ms\nposition error 1.7e-1\nksp its 5\n") for tip in tips
+    )
+    assert any(tip.startswith("newton\niteration 1\n") and tip.endswith("\n" + ERRORS[0]["command"]) for tip in tips)
 
 
 def test_of_several_traces_of_a_method_the_furthest_is_shown():
-    def entry(*errors: float) -> dict:
-        return {"scene": "a", "label": "b", "trace": {"iteration": [0, 1], "seconds": [0, 1], "position_error": errors}}
-
-    traces = [entry(0.5, 0.1), entry(0.5, 1e-6), entry(0.5, 1e-3)]
-    (chart,) = convergence_charts(traces, curve_styles(["b"]), {})
-    assert [value["y"] for value in values(chart.panels[0], "curve")] == [0.5, 1e-6]
+    errors = {"x": (0.5, 0.1), "y": (0.5, 1e-6), "z": (0.5, 1e-3)}
+    traces = {case: {"iteration": [0, 1], "seconds": [0, 1], "position_error": of} for case, of in errors.items()}
+    (chart,) = convergence_charts(typed([row_of("b", case=case) for case in traces]), curve_styles(["b"]), traces)
+    assert {value["y"] for value in values(chart.panels[0], "curve")} == {0.5, 1e-6}
 
 
 def test_the_report_needs_nothing_beside_itself(text: str):
@@ -271,24 +262,6 @@ def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
     assert Balance(text).open == [] and len(svgs(text)) == charts
 
 
-def test_a_table_without_some_columns_is_read(tmp_path: Path):
-    write_rows(tmp_path, ERRORS, ("label", "status", "command"))
-    assert records(read_table(tmp_path))[0]["true_error"] is None
-    assert "newton" in write_report(tmp_path).read_text()
-
-
-def test_a_folder_without_a_table_is_named(tmp_path: Path):
-    with pytest.raises(InputError, match=r"no table\.csv"):
-        write_report(tmp_path)
-
-
-def test_a_trace_without_errors_is_left_out(tmp_path: Path):
-    write_rows(tmp_path, [])
-    traces = [{"scene": "a", "label": "b", "trace": trace} for trace in (None, {}, {"position_error": [None]})]
-    (tmp_path / "traces.json").write_text(json.dumps(traces))
-    assert svgs(write_report(tmp_path).read_text()) == []
-
-
 def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path):
     """Fill is both cheaper and more exact than whole cells but for their coarsest."""
     rows = [
@@ -299,8 +272,8 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     rows.append(row_of("fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3))
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
-    assert len([title for title in tooltips(text) if "surface error: " in spaced(title)]) == 6
-    assert "with 2,000 cells." in spaced(text) and "a pin holds no node" in text
+    assert len([title for title in tooltips(text) if "surface error " in title]) == 6
+    assert "a pin holds no node" in text
     table = read_table(tmp_path)
     (chart,) = size_charts(table, curve_styles(table["label"]))
     (rings,) = [layer for layer in chart.panels[0].layers if layer["mark"].get("shape") == RING]

@@ -19,7 +19,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.study import table
 from msmpetsc.study.runner import StudyPart, list_study, run_study
-from msmpetsc.study.table import COLUMNS, read_table, records
+from msmpetsc.study.table import COLUMNS, read_table, records, write_table
 
 
 def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
@@ -38,8 +38,7 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     assert row["memory"] == 1000 - 4  # of the leanest run
     assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
     assert sum("--trace 2" in call for call in calls(tmp_path)) == 1  # in the first repeat alone
-    (told,) = json.loads((tmp_path / "out" / "traces.json").read_text())
-    assert (told["scene"], told["label"], told["trace"]["frame"]) == ("a", "newton", 2)
+    assert json.loads((tmp_path / "out" / "traces.json").read_text())[row["case"]]["frame"] == 2
     with h5py.File(tmp_path / "out" / "table.h5") as file:
         assert file["label"].asstr()[:].tolist() == ["newton"]
         assert file["time_frame"][0] == row["time_frame"] and np.isnan(file["true_error"][0])
@@ -70,19 +69,6 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     rows = carry_out(tmp_path, text)
     assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
     assert rows == [row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))]
-
-
-def test_what_a_part_lacks_the_whole_runs(tmp_path: Path, stand_in):
-    text = ONE_SCENE + 'trace = 2\n[[sweep]]\ntrace = true\npresets = ["newton"]\nerrors = [0.2, 0.1]'
-    path, out = study_file(tmp_path, text), tmp_path / "out"
-    run_study(path, out, None, part=StudyPart(2, 2))
-    assert [done for _, done in list_study(path, out, None)] == [False, True]
-    assert run_study(path, out, None, part=StudyPart(9, 9))[0]["error"] == 0.1  # done by another part
-    assert not (out / "parts" / "9-of-9" / "calls.txt").exists()
-    assert run_study(path, out, None, part=StudyPart(1, 9)) == []  # more parts than cases
-    carry_out(tmp_path, text)
-    assert len(calls(tmp_path)) == 1
-    assert len(json.loads((out / "traces.json").read_text())) == 2
 
 
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3", "1/", "-1/3"])
@@ -165,3 +151,31 @@ def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path
     with pytest.raises(InputError, match=r"^pandas is not installed: pip install .msmpetsc\[study\]. brings it$"):
         carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
     assert not (tmp_path / "out").exists()
+
+
+# The table
+
+
+def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):
+    row = {"case": "1", "cells": 1009, "steps": 8, "time_step": 1e-3, "fps": 121.25, "memory": 4e8, "error": None}
+    row |= {name: 1 for name, column in COLUMNS.items() if column.kind is int}
+    write_table(tmp_path, [row])
+    once = (tmp_path / "table.csv").read_text()
+    write_table(tmp_path, records(read_table(tmp_path)))
+    assert (tmp_path / "table.csv").read_text() == once and ",1009," in once
+
+
+def test_a_table_that_is_none_is_one_line(tmp_path: Path, stand_in):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "table.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="--restart begins anew"):
+        carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
+
+
+def test_only_a_table_and_its_charts_load_what_they_need():
+    """A plan and the start of a study do without pandas, vl-convert and jinja2."""
+    modules = "msmpetsc.study.runner, msmpetsc.study.sizing.trials, msmpetsc.cli.main"
+    loaded = "sorted({'pandas', 'vl_convert', 'jinja2'} & set(sys.modules))"
+    words = [sys.executable, "-c", f"import sys, {modules}; print({loaded})"]
+    done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[]\n", done.stderr

@@ -14,8 +14,8 @@ from msmpetsc.app.checks import MEASURE_NAMES, XML_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.study.baselines import baseline
-from msmpetsc.study.baselines.baseline import HEAD, Numbers, Recipe, judged, nearest_to_limit, row
+from msmpetsc.study import baseline
+from msmpetsc.study.baseline import HEAD, Numbers, Recipe, judged, row
 
 SAME, DIFFERENT = 0, 1
 STEPS = 20  # of a scene's numbers, if nothing else is asked for
@@ -47,7 +47,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--baseline names the numbers of one scene: of several, each has its own beside it")
     asked = None
     if args.frames or args.cells or args.set:
-        asked = Recipe(args.cells, args.frames or STEPS, tuple(args.set))
+        steps = min(args.frames or STEPS, baseline.MOST_STEPS)
+        asked = Recipe(cells=args.cells, steps=steps, changes=args.set)
     files = {scene: args.baseline or scene.with_suffix(".baseline.json") for scene in args.scenes}
     if not args.update:
         if asked:
@@ -68,19 +69,19 @@ def run(args: argparse.Namespace) -> int:
 
 def update(scene: Path, file: Path, asked: Recipe | None, ranks: int) -> None:
     """Run a scene and store its numbers, as those stored before were made if nothing else is asked for."""
-    recipe = asked or Recipe(None, STEPS, ())
+    recipe = asked or Recipe(cells=None, steps=STEPS)
     if file.is_file() and not asked:
-        recipe = Recipe.of(baseline.read(file))
+        recipe = baseline.read(file).run
     time = load_scene(scene, recipe.changes, by_user=False).time
     if time.error is not None:
         raise InputError(
             f"{scene}: time.error chooses steps by an estimate: how far numbers may be apart then is not known; "
             "--set time={step=..., duration=...} takes steps of one length"
         )
-    recipe = Recipe(recipe.cells, min(recipe.steps, time.steps), recipe.changes)
+    recipe = recipe.model_copy(update={"steps": min(recipe.steps, time.steps)})
     numbers = found(scene, recipe, ranks)
     baseline.write(file, numbers)
-    count = len(numbers["counts"]) + len(numbers["numbers"])
+    count = len(numbers.counts) + len(numbers.numbers)
     accuracy = baseline.allowed(recipe.steps, "m")
     print(f"{file}: {count} numbers after {recipe.steps} steps, positions to {accuracy:.1g}")
 
@@ -119,10 +120,10 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> list[Checked
 def checked(scene: Path, stored: Numbers, ranks: int) -> Checked:
     """Run a scene as its stored numbers were made, and print its line."""
     began = perf_counter()
-    numbers = found(scene, Recipe.of(stored), ranks)
+    numbers = found(scene, stored.run, ranks)
     outcome = Checked(scene, judged(numbers, stored), perf_counter() - began)
     verdict = "DIFFERS" if outcome.wrong else "same"
-    print(row(scene.stem, numbers["counts"], nearest_to_limit(numbers, stored), outcome.seconds, verdict), flush=True)
+    print(row(scene.stem, numbers, stored, outcome.seconds, verdict), flush=True)
     return outcome
 
 

@@ -14,8 +14,7 @@ from msmpetsc.results.disk import whole_file, write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 from msmpetsc.scene.toml import toml_of
-from msmpetsc.study.drafting.draft import draft, upwards
-from msmpetsc.study.drafting.measures import MeshMeasures, measured
+from msmpetsc.study.new_scene import MeshMeasures, draft, measured, upwards
 
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"  # the scenes that a wheel holds, too; in a clone a link to scenes/
 

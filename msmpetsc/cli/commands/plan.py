@@ -17,8 +17,7 @@ from msmpetsc.scene.statics import STATIC
 
 if TYPE_CHECKING:
     from msmpetsc.study.runner import Bench
-    from msmpetsc.study.scene_lines import Tables
-    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial
+    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
     from msmpetsc.study.sizing.choice import Choice
 
 NOTHING_MEETS = 3
@@ -63,17 +62,17 @@ def bench() -> Iterator["Bench"]:
 def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> str:
     """Print lines to paste and a command that says the same, or change the file; return the command."""
     from msmpetsc.study.cases import launcher
-    from msmpetsc.study.scene_lines import lines, overrides, put_into
+    from msmpetsc.study.sizing.answer import lines, overrides, put_into, tables
 
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
-    more: Tables = {"cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
-    print(f"\n{lines(choice.method, more)}\n")
-    changes = [word for change in overrides(args.scene, choice.method, more) for word in ("--set", change)]
+    answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
+    print(f"\n{lines(answer)}\n")
+    changes = [word for change in overrides(args.scene, answer) for word in ("--set", change)]
     command = shlex.join([*launcher(args.ranks), "msmpetsc", "run", str(args.scene), *changes])
     print(command, flush=True)
     if args.write:
-        put_into(args.scene, choice.method, more)
+        put_into(args.scene, answer)
         print(f"\nwritten into {args.scene}")
     return command
 
@@ -81,13 +80,11 @@ def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
     """Make the trials, and print each when it is done."""
     from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.sizing.trials import Sizer
+    from msmpetsc.study.sizing.trials import Asked, Sizer
 
     with bench() as runs:
-        sizer = Sizer(
-            args.scene, runs, target=target, presets=preset_names(), frames=args.frames, cells=args.cells,
-            ranks=args.ranks, report=print_size_trial,
-        )  # fmt: skip
+        asked = Asked(target, args.frames, args.cells, args.ranks)
+        sizer = Sizer(args.scene, runs, asked, preset_names(), print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
 
@@ -121,7 +118,7 @@ def print_size(plan: "SizePlan", target: float) -> None:
 
 def draw(plan: "SizePlan", path: Path, target: float) -> None:
     """Draw the expected error of each trial over its cost, and ring the choice."""
-    from msmpetsc.study.charts.sizes import plan_picture
+    from msmpetsc.study.charts.pareto import plan_picture
 
     plan_picture(plan, target, path)
     print(f"drawn: {path}")

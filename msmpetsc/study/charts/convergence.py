@@ -1,13 +1,27 @@
-"""Convergence within one step: the error over the iterations, and over the seconds."""
+"""Convergence within one step, over iterations and seconds; and in time, over the time step."""
 
-from typing import TYPE_CHECKING
+import math
 
-from msmpetsc.study import formatting
-from msmpetsc.study.charts.plot import COUNT, ERROR, SECONDS, Chart, Numbers, Styles, axis_from_zero, log_axis
-from msmpetsc.study.table import grouped
+import numpy as np
+from pandas import DataFrame, concat, to_numeric
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from msmpetsc.study.charts.plot import (
+    COUNT,
+    DASH,
+    ERROR,
+    FAINT,
+    PLAIN,
+    SECONDS,
+    Chart,
+    CurveStyle,
+    Styles,
+    axis_from_zero,
+    channel,
+    log_axis,
+)
+from msmpetsc.study.table import Row, grouped, measured, records, succeeded
+
+# Within one step
 
 KIND = "Convergence within one step"
 CAPTION = (
@@ -18,60 +32,119 @@ PANELS = (
     ("iteration", "iteration", "over the iterations", COUNT),
     ("seconds", "computing time within the step", "over the computing time", SECONDS),
 )
-ITERATE = ("iteration", "ksp_its", "seconds", "position_error", "energy_error")
-NUMBERS: Numbers = {
-    "iteration": (formatting.count, "iteration"),
-    "computing time": (formatting.seconds, "seconds"),
-    "step error": (formatting.error, "position_error"),
-    "energy error": (formatting.error, "energy_error"),
-    "KSP iterations": (formatting.count, "ksp_its"),
-}
+ITERATE = ("iteration", "seconds", "position_error", "energy_error", "ksp_its")
 
 
-def iterates(entry: dict, commands: dict[str, str]) -> "DataFrame":
-    """Return a trace as a row an iterate; those without a positive error are left out."""
-    from pandas import DataFrame, to_numeric
-
-    trace = entry["trace"]
+def iterates(trace: dict, row: Row) -> DataFrame:
+    """Return the trace of a case as a row an iterate; those without a positive error are out."""
     length = len(trace.get("position_error") or [])
     columns = {name: (trace.get(name) or [None] * length)[:length] for name in ITERATE}
     rows = DataFrame(columns, dtype=object).apply(to_numeric, errors="coerce").astype(float)
-    rows = rows.assign(label=entry["label"], command=commands.get(entry.get("case", ""), ""))
+    rows = rows.assign(label=row["label"], command=row["command"])
     return rows[(rows["position_error"] > 0) & (rows["position_error"] < 1e300)]
 
 
-def convergence_charts(traces: list[dict], styles: Styles, commands: dict[str, str]) -> list[Chart]:
-    """Return one chart for each scene with traces; ``commands``: by case, for traces that name theirs."""
+def convergence_charts(table: DataFrame, styles: Styles, traces: dict[str, dict]) -> list[Chart]:
+    """Return one chart for each scene with traces, which come by case."""
     charts = []
-    for scene in dict.fromkeys(entry["scene"] for entry in traces):
-        entries = [entry for entry in traces if entry["scene"] == scene]
-        curves = furthest([iterates(entry, commands) for entry in entries])
-        frames = {entry["trace"].get("frame") for entry in entries}
+    for scene, rows in grouped(table[table["case"].isin(traces.keys())], "scene").items():
+        curves = furthest([iterates(traces[row["case"]], row) for row in records(rows)])
+        frames = {traces[case].get("frame") for case in rows["case"]}
+        step = f", step {frames.pop()}" if len(frames) == 1 else ""
         if curves:
-            charts.append(convergence_chart(scene, frames, curves, styles))
+            charts.append(convergence_chart(f"convergence_{scene}", f"{KIND}: {scene}{step}", concat(curves), styles))
     return charts
 
 
-def furthest(curves: list["DataFrame"]) -> dict[str, "DataFrame"]:
-    """Return the trace of each method that ends with the least error: cases of looser targets are parts of it."""
-    best: dict[str, DataFrame] = {}
-    for curve in curves:
-        for label, rows in grouped(curve, "label").items():
-            if label not in best or rows["position_error"].iloc[-1] < best[label]["position_error"].iloc[-1]:
-                best[label] = rows
-    return best
+def furthest(curves: list[DataFrame]) -> list[DataFrame]:
+    """Return the trace of each method that ends with the least error: looser targets are parts of it."""
+    known = sorted((curve for curve in curves if len(curve)), key=lambda rows: -rows["position_error"].iloc[-1])
+    best = {rows["label"].iloc[0]: rows for rows in known}
+    return [best[label] for label in dict.fromkeys(rows["label"].iloc[0] for rows in curves if len(rows))]
 
 
-def convergence_chart(scene: str, frames: set, curves: dict[str, "DataFrame"], styles: Styles) -> Chart:
+def convergence_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return two panels with one vertical scale."""
-    step = f", step {frames.pop()}" if len(frames) == 1 else ""
-    own = {label: styles[label] for label in curves}
-    chart = Chart(f"convergence_{scene}", KIND, f"{KIND}: {scene}{step}", CAPTION, own)
-    errors = [error for rows in curves.values() for error in rows["position_error"]]
-    y = log_axis("true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|", errors, ERROR)
-    for column, name, title, words in PANELS:
-        times = [value for rows in curves.values() for value in rows[column].dropna()]
-        panel = chart.panel(title, axis_from_zero(name, times, words), y)
-        for rows in curves.values():
-            panel.curve(rows.dropna(subset=[column]), (column, "position_error"), NUMBERS)
+    chart = Chart(name, KIND, title, CAPTION, {label: styles[label] for label in dict.fromkeys(rows["label"])})
+    y = log_axis("true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|", rows["position_error"], ERROR)
+    for column, axis, title, words in PANELS:
+        shown = rows.dropna(subset=[column])
+        panel = chart.panel(title, axis_from_zero(axis, list(shown[column]), words), y)
+        panel.curves(shown, (column, "position_error"), ITERATE)
     return chart
+
+
+# In time
+
+ORDER = "Convergence in time"
+ORDER_CAPTION = (
+    "The steps are solved to many digits, so that what is seen is the error of the time step alone. Of verlet the step "
+    "is the substep. In the legend: the slope of the error, fitted to the shorter half of the steps; a start that is "
+    "not smooth lowers it, for there are always vibrations that the steps are too long for. Energy left: where no load "
+    "acts; overtones lose theirs sooner than the slowest vibration, whose closed form is dashed."
+)
+CLOSED = "(1 + ω²t²)^(\N{MINUS SIGN}n), implicit Euler, slowest vibration"
+TOLD = ("step", "steps", "trajectory_error", "energy_left", "iterations")
+
+
+def with_step(rows: DataFrame) -> DataFrame:
+    """Return the rows with a column ``step``, what the integrator steps by [s], sorted by it."""
+    explicit = (rows["integrator"] == "verlet") & (rows["substep"] > 0)
+    return rows.assign(step=rows["substep"].where(explicit, rows["time_step"])).sort_values("step", kind="stable")
+
+
+def order(rows: DataFrame) -> float | None:
+    """Return the slope of log error over log step, fitted to the shorter half of the steps."""
+    rows = with_step(measured(rows, "trajectory_error"))
+    kept = rows.head(max(2, -(-len(rows) // 2)))
+    if kept["step"].nunique() < 2:
+        return None
+    return float(np.polyfit(np.log(kept["step"]), np.log(kept["trajectory_error"]), 1)[0])
+
+
+def order_charts(table: DataFrame, styles: Styles, study: dict) -> list[Chart]:
+    """Return one chart for each [[order]] of the study file whose scene has numbers."""
+    charts, ok = [], succeeded(table)
+    for entry in study.get("order", ()):
+        rows = ok[ok["scene"] == entry.get("scene")]
+        if len(measured(rows, "trajectory_error")):
+            charts.append(order_chart(entry["scene"], rows, styles, entry.get("frequency")))
+    return charts
+
+
+def order_chart(scene: str, rows: DataFrame, styles: Styles, frequency: float | None) -> Chart:
+    """Return the error in the left panel, the energy in the right one, where it was measured."""
+    slopes = {label: order(group) for label, group in grouped(rows, "label").items()}
+    names = {label: f"{label}: slope {slope:.2f}" if slope else label for label, slope in slopes.items()}
+    rows = with_step(rows.assign(curve=rows["label"].map(names)))
+    own = {name: styles[label] for label, name in names.items()}
+    chart = Chart(f"order_{scene}", ORDER, f"{ORDER}: {scene}", ORDER_CAPTION, own)
+    shown, left = measured(rows, "trajectory_error"), measured(rows, "energy_left")
+    y = log_axis("trajectory error", shown["trajectory_error"], ERROR)
+    panel = chart.panel("error of the motion", log_axis("time step", shown["step"], SECONDS), y)
+    panel.curves(shown, ("step", "trajectory_error"), TOLD, "curve")
+    if len(left):
+        draw_energy(chart, left, frequency)
+    return chart
+
+
+def draw_energy(chart: Chart, rows: DataFrame, frequency: float | None) -> None:
+    """Draw the energy that is left over the step, and implicit Euler's closed form if it is known."""
+    top = 1.15 * min(2, max(1, rows["energy_left"].max()))
+    y = channel("energy left / energy at the start", PLAIN, np.arange(0, top, 0.2), domain=[0, top])
+    panel = chart.panel("energy left at the end", log_axis("time step", rows["step"], SECONDS), y)
+    euler = rows[rows["integrator"] == "implicit-euler"]
+    if frequency and len(euler):
+        chart.styles[CLOSED] = CurveStyle(FAINT, DASH)
+        panel.line(*closed_form(euler, frequency), strokeDash=[6, 4])
+    panel.curves(rows, ("step", "energy_left"), TOLD, "curve")
+
+
+def closed_form(rows: DataFrame, frequency: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps t [s] and the energy (1 + w^2 t^2)^(-n) that implicit Euler leaves.
+
+    n = T / t steps; frequency [Hz].
+    """
+    t = np.geomspace(rows["time_step"].min(), rows["time_step"].max(), 100)
+    end = (rows["steps"] * rows["time_step"]).max()
+    return t, (1 + (2 * math.pi * frequency * t) ** 2) ** (-end / t)

@@ -1,4 +1,4 @@
-"""Speed against accuracy: computing time over the step error, and over the trajectory error, in two panels.
+"""Speed against accuracy: computing time over the errors of step, trajectory and surface.
 
 The two errors are never mixed. The step error says how far a step is from the exact minimiser of its energy: methods
 can be compared by it where the time step is the same. The trajectory error says how far the run is from the true motion
@@ -6,11 +6,31 @@ of the lattice: explicit and implicit runs of any time step can be compared by i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pandas import DataFrame, concat
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.plot import ERROR, INK, RING, SECONDS, Chart, CurveStyle, Numbers, Panel, Styles, log_axis
+from msmpetsc.study.charts.plot import (
+    DASH,
+    ERROR,
+    FAINT,
+    INK,
+    RING,
+    SECONDS,
+    Axes,
+    Chart,
+    CurveStyle,
+    Styles,
+    curve_styles,
+    log_axis,
+    points,
+    save_png,
+)
+from msmpetsc.study.sizing.answer import SizePlan
 from msmpetsc.study.table import (
     ONCE_NOTE,
     Row,
@@ -24,9 +44,6 @@ from msmpetsc.study.table import (
     within_noise,
 )
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front"
@@ -39,8 +56,12 @@ CAPTION = (
 )
 
 
-@dataclass(frozen=True)
-class ErrorMeasure:
+TOLD = (
+    "least", "greatest", "time_step", "substep", "error", "max_iterations", "iterations", "ranks",
+)  # fmt: skip
+
+
+class ErrorMeasure(NamedTuple):
     """A panel: the columns of an error and of what it costs, and their words."""
 
     error: str
@@ -48,28 +69,11 @@ class ErrorMeasure:
     name: str
     x_label: str
     y_label: str
-    unit: str
 
     @property
     def columns(self) -> tuple[str, str]:
         """The columns of both axes."""
         return self.error, self.cost
-
-    @property
-    def numbers(self) -> Numbers:
-        """Numbers that a point tells of itself; its rows have the spread of their cost."""
-        return {
-            self.name: (formatting.error, self.error),
-            self.y_label: (formatting.seconds, self.cost),
-            "least of the repeats": (formatting.seconds, "least"),
-            "greatest of the repeats": (formatting.seconds, "greatest"),
-            "time step": (formatting.seconds, "time_step"),
-            "substep": (formatting.seconds, "substep"),
-            "error asked for": (formatting.error, "error"),
-            "most iterations": (formatting.count, "max_iterations"),
-            "iterations a step": (formatting.count, "iterations"),
-            "ranks": (formatting.count, "ranks"),
-        }
 
 
 STEP = ErrorMeasure(
@@ -78,7 +82,6 @@ STEP = ErrorMeasure(
     name="step error",
     x_label="true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|, rms over steps",
     y_label="computing time a frame",
-    unit="a frame",
 )
 TRAJECTORY = ErrorMeasure(
     error="trajectory_error",
@@ -86,7 +89,6 @@ TRAJECTORY = ErrorMeasure(
     name="trajectory error",
     x_label="trajectory error against a reference with a tiny step",
     y_label="computing time a simulated second",
-    unit="a simulated second",
 )
 
 
@@ -94,21 +96,16 @@ TRAJECTORY = ErrorMeasure(
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
-    """Return indices of the points that no other beats: none is at most as great in both and smaller in one.
+    """Return the points that no other beats: none is at most as great in both and smaller in one.
 
     They come by rising x.
     """
-    best: list[int] = []
-    lowest = float("inf")
-    for index in sorted(range(len(x)), key=lambda i: (x[i], y[i])):
-        twin = bool(best) and (x[best[-1]], y[best[-1]]) == (x[index], y[index])
-        if y[index] < lowest or twin:
-            best.append(index)
-            lowest = y[index]
-    return best
+    across, down = np.subtract.outer(x, x), np.subtract.outer(y, y)  # of a row's point from a column's
+    beaten = ((across >= 0) & (down >= 0) & ((across > 0) | (down > 0))).any(axis=1)
+    return [int(index) for index in np.lexsort((y, x)) if not beaten[index]]
 
 
-def front_rows(rows: "DataFrame", measure: ErrorMeasure) -> "DataFrame":
+def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     """Return the front of measured rows, by rising error.
 
     Errors that read alike, to two digits, count as equal: no step can better the trajectory error of its time step but
@@ -117,7 +114,7 @@ def front_rows(rows: "DataFrame", measure: ErrorMeasure) -> "DataFrame":
     return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 
 
-def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]:
+def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
     """Return the cheapest row with an error of at most this level, then those that its repeats do not tell from it.
 
     Nothing is interpolated; each method comes once; nothing comes where nothing reaches the level.
@@ -137,7 +134,7 @@ def winners(rows: "DataFrame", measure: ErrorMeasure, level: float) -> list[Row]
 # The charts
 
 
-def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
+def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return one chart for each scene, and for each of its cell counts where a method was swept."""
     charts = []
     for scene, rows in grouped(table, "scene").items():
@@ -151,7 +148,7 @@ def pareto_charts(table: "DataFrame", styles: Styles) -> list[Chart]:
     return charts
 
 
-def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Chart | None:
+def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart | None:
     """Return the panels that have data; None where neither has."""
     step, trajectory = common_time_step(measured(rows, *STEP.columns)), measured(rows, *TRAJECTORY.columns)
     panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if len(shown)]
@@ -167,15 +164,15 @@ def pareto_chart(name: str, title: str, rows: "DataFrame", styles: Styles) -> Ch
     return chart
 
 
-def common_time_step(rows: "DataFrame") -> "DataFrame":
-    """Return the rows of the time step with the most of them, the longer of two: only they compare by time a frame."""
+def common_time_step(rows: DataFrame) -> DataFrame:
+    """Return the rows of the time step with the most of them: only they compare by time a frame."""
     groups = grouped(rows, "time_step")
     return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
-def draw_panel(chart: Chart, rows: "DataFrame", measure: ErrorMeasure) -> None:
-    """Draw a panel: the front first, the methods over it."""
-    step = formatting.seconds(rows["time_step"].iloc[0])
+def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
+    """Draw the front, over it a line through each method's best points, the others hollow."""
+    step = formatting.worded("time_step", rows["time_step"].iloc[0])
     at_step = f", time step {step}" if measure is STEP and step else ""
     x = log_axis(measure.x_label, rows[measure.error], ERROR)
     y = log_axis(measure.y_label, reach(rows, measure.cost).to_numpy().ravel(), SECONDS)
@@ -184,18 +181,13 @@ def draw_panel(chart: Chart, rows: "DataFrame", measure: ErrorMeasure) -> None:
     (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
     errors, costs = list(front[measure.error]), list(front[measure.cost])
     panel.line([errors[0], *errors, right], [top, *costs, costs[-1]], interpolate="step-after", strokeWidth=1.2)
-    for group in grouped(rows.join(spread(rows, measure.cost)), "label").values():
-        draw_method(panel, group, measure)
+    rows = rows.join(spread(rows, measure.cost))
+    best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
+    told = (*measure.columns, *TOLD)
+    panel.whiskers(rows, measure.columns)
+    panel.mark(points(rows.drop(best.index), measure.columns, told), hollow=True)
+    panel.curves(best, measure.columns, told)
     panel.rings(front, measure.columns)
-
-
-def draw_method(panel: Panel, rows: "DataFrame", measure: ErrorMeasure) -> None:
-    """Draw a line through a method's own best points, and its other ones small and hollow."""
-    best = front_rows(rows, measure)
-    color = panel.styles[rows["label"].iloc[0]].color
-    panel.whiskers(rows, measure.columns, color)
-    panel.curve(best, measure.columns, measure.numbers)
-    panel.mark(rows.drop(best.index), measure.columns, measure.numbers, fill="white", stroke=color, size=35)
 
 
 # In words
@@ -207,14 +199,15 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
     if not best:
         return f"{start} nothing measured reaches it."
     row, *near = best
-    reached = formatting.error(row[measure.error])
-    step = f", {formatting.stepping(row)}" if measure is TRAJECTORY else ""
-    asked = f"asked for {formatting.error(row['error'])}, " if row["error"] else ""
-    sentence = f"{start} {row['label']}, {cost_of(row, measure)} {measure.unit} ({asked}reached {reached}{step})"
-    if not near:
-        return f"{sentence}."
+    facts = [f"reached {formatting.error(row[measure.error])}"]
+    if row["error"]:
+        facts.insert(0, f"asked for {formatting.error(row['error'])}")
+    if measure is TRAJECTORY:
+        facts.append(formatting.stepping(row))
+    unit = measure.y_label.removeprefix("computing time ")
+    sentence = f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({', '.join(facts)})"
     rivals = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in near)
-    return f"{sentence}; within its noise: {rivals}."
+    return f"{sentence}; within its noise: {rivals}." if near else f"{sentence}."
 
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:
@@ -223,3 +216,52 @@ def cost_of(row: Row, measure: ErrorMeasure) -> str:
     if row["least"] is None:
         return cost
     return f"{cost} [{formatting.seconds(row['least'])} to {formatting.seconds(row['greatest'])}]"
+
+
+# The error of the surface over what it costs: of a study, and of the trials of a plan
+
+SIZES = "Surface error over cost"
+SIZES_CAPTION = (
+    "Lower is more exact, further left is cheaper. The surface error is how far the surface is from that of a run of "
+    "many more cells and shorter steps, rms over the surface and time, of its largest displacement: cells, time step "
+    "and unfinished steps together. A line joins the cells of one way to step, few at its left end."
+)
+SIZE = ("time_second", "surface_error")
+
+
+def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
+    """Return a chart for each scene with surface errors: a curve a way to step, over its cells."""
+    charts = []
+    for scene, rows in grouped(measured(succeeded(table), *SIZE), "scene").items():
+        own = {label: styles[label] for label in dict.fromkeys(rows["label"])}
+        chart = Chart(f"size_{scene}", SIZES, f"{SIZES}: {scene}", SIZES_CAPTION, own)
+        panel = size_panel(chart, scene, rows["time_second"], rows["surface_error"], SIZE[1].replace("_", " "))
+        panel.curves(rows.sort_values("cells", kind="stable"), SIZE, (*SIZE[::-1], "cells", "time_step", "error"))
+        panel.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
+        charts.append(chart)
+    return charts
+
+
+def size_panel(chart: Chart, title: str, costs: ArrayLike, errors: ArrayLike, label: str) -> Axes:
+    """Return a panel of errors over costs."""
+    return chart.panel(title, log_axis(TRAJECTORY.y_label, costs, SECONDS), log_axis(label, errors, ERROR))
+
+
+def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
+    """Write a PNG of the trials' expected errors over their costs; the choice is ringed."""
+    tried = [(trial.method, trial.cost, trial.error, trial.cells) for trial in plan.tried]
+    rows = DataFrame(tried, columns=["label", *SIZE, "cells"]).assign(command="")
+    chosen = DataFrame([(plan.choice.cost, plan.choice.budget.total)], columns=list(SIZE))
+    styles = curve_styles(sorted(set(rows["label"]))) | {"asked for": CurveStyle(FAINT, DASH)}
+    chart = Chart(path.stem, SIZES, f"{SIZES}: the trials of a plan", "", styles)
+    costs = [*rows["time_second"], *chosen["time_second"]]
+    errors = [*rows["surface_error"], *chosen["surface_error"], target]
+    panel = size_panel(chart, "tried, and ringed what is chosen", costs, errors, "surface error, estimated")
+    panel.line(panel.x["scale"]["domain"], [target, target], strokeDash=[6, 4])
+    values = points(rows, SIZE, (*SIZE, "cells"))
+    panel.mark(values)
+    cells = [value | {"text": formatting.count(count)} for value, count in zip(values, rows["cells"], strict=True)]
+    look = {"type": "text", "dx": 6, "dy": -6, "align": "left", "fontSize": 9, "color": FAINT}
+    panel.draw(cells, look, text={"field": "text"})
+    panel.rings(chosen, SIZE)
+    save_png(chart, path.parent)

@@ -1,28 +1,27 @@
-"""What all charts share: a colour and a marker for each method, axes in readable units, and points with their numbers.
+"""What all charts share: colours and markers, axes in readable units, points with their numbers.
 
 A chart is a Vega-Lite specification; vl-convert draws it, without a browser, as SVG for the page and as PNG.
 """
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import vl_convert
 from numpy.typing import ArrayLike
+from pandas import DataFrame
 
 from msmpetsc.results.disk import write_whole
-from msmpetsc.study.table import Row, records, spread
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from msmpetsc.study import formatting
+from msmpetsc.study.table import records, spread
 
 INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
-# Okabe and Ito's colours without their yellow, which white paper swallows, then Tol's wine, olive, indigo, and a brown.
+# Okabe and Ito's colours but yellow, which white swallows, then Tol's wine, olive, indigo, and a brown.
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
     "#882255", "#999933", "#332288", "#8c6239",
@@ -55,14 +54,10 @@ CONFIG: dict[str, Any] = {
 }  # fmt: skip
 UNIT = "replace(format(datum.value, '~s'), regexp('([^0-9.]?)$'), '\N{NO-BREAK SPACE}$1{}')"
 # how the number of a tick is written, as an expression of Vega's
-ERROR, COUNT, PLAIN = (
-    "replace(format(datum.value, '~e'), '+', '')",
-    "format(datum.value, '~s')",
-    "format(datum.value, '~g')",
-)
+ERROR = "replace(format(datum.value, '~e'), '+', '')"
+COUNT = "format(datum.value, '~s')"
+PLAIN = "format(datum.value, '~g')"
 SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
-
-Numbers = dict[str, tuple[Callable[[Any], str], str]]  # by heading: how to word a number, and its column
 
 
 @dataclass(frozen=True)
@@ -74,6 +69,7 @@ class CurveStyle:
 
 
 Styles = dict[str, CurveStyle]  # by label
+Columns = tuple[str, str]  # of both axes
 
 
 def curve_styles(labels: Iterable[str]) -> Styles:
@@ -83,17 +79,14 @@ def curve_styles(labels: Iterable[str]) -> Styles:
     return {label: CurveStyle(*pair) for label, pair in zip(labels, pairs, strict=True)}
 
 
-def tips(rows: "DataFrame", numbers: Numbers, label: str = "label") -> list[str]:
-    """Return what the point of each row tells: its curve, its numbers, and the command that repeats it.
+def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
+    """Return what the point of each row tells: its curve, its numbers, the command that repeats it.
 
-    label : column with the name of its curve
+    told : columns; curve : the one with the name of its curve
     """
-    return ["\n".join(filter(None, [row[label], *_told(row, numbers), row["command"]])) for row in records(rows)]
-
-
-def _told(row: Row, numbers: Numbers) -> list[str]:
-    texts = {name: word(row[column]) for name, (word, column) in numbers.items()}
-    return [f"{name}: {text}" for name, text in texts.items() if text]
+    told = list(dict.fromkeys(told))
+    lines = ([row[curve], *(formatting.entry(row, name) for name in told), row["command"]] for row in records(rows))
+    return ["\n".join(filter(None, tip)) for tip in lines]
 
 
 # Axes: channels of Vega-Lite
@@ -105,21 +98,21 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
     return {"type": "quantitative", "title": title, "scale": {"nice": False, "zero": False} | scale, "axis": axis}
 
 
-def log_axis(title: str, values: ArrayLike, words: str, dense: float = 2.5) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values: a margin on both sides, and a decade at least.
+def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
+    """Return a logarithmic axis around positive values, with margins, of a decade at least.
 
-    Numbers stand at the decades, and at 2 and 5 where there are fewer decades than ``dense``.
+    Numbers stand at the decades, and at 2 and 5 where there are few decades.
     """
     low, high = math.log10(np.min(values)), math.log10(np.max(values))
     middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
-    steps = (1, 2, 5) if high - low < dense else (1,)
+    steps = (1, 2, 5) if high - low < 2.5 else (1,)
     ticks = [step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps]
     return channel(title, words, ticks, type="log", domain=[10**low, 10**high])
 
 
-def axis_from_zero(title: str, values: Sequence[float], words: str) -> dict[str, Any]:
-    """Return an axis with 0 at the left, logarithmic from the decade of the least positive value on.
+def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str, Any]:
+    """Return an axis with 0 at the left, logarithmic from the least positive value on.
 
     Methods differ by powers of ten.
     """
@@ -137,8 +130,8 @@ def axis_from_zero(title: str, values: Sequence[float], words: str) -> dict[str,
 
 
 @dataclass
-class Panel:
-    """Axes and what is drawn in them; styles: of all curves of the legend."""
+class Axes:
+    """A panel: two axes and what is drawn in them; styles: of all curves of the legend."""
 
     title: str
     x: dict[str, Any]
@@ -153,53 +146,51 @@ class Panel:
             silent = {"aria": "description" in channels}
             self.layers.append({"data": {"values": values}, "mark": mark | silent, "encoding": axes | channels})
 
-    def line(self, x: Iterable[float], y: Iterable[float], color: str = FAINT, **mark: Any) -> None:
-        """Draw a line through points in their order."""
+    def line(self, x: Iterable[float], y: Iterable[float], **mark: Any) -> None:
+        """Draw a grey line through points in their order."""
         values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
-        self.draw(values, {"type": "line", "color": color, "strokeWidth": 1.6, **mark}, order={"field": "n"})
+        self.draw(values, {"type": "line", "color": FAINT, "strokeWidth": 1.6} | mark, order={"field": "n"})
 
-    def whiskers(self, rows: "DataFrame", columns: tuple[str, str], color: str) -> None:
-        """Draw the spread of the repeats of each row that was repeated."""
-        x, cost = columns
-        ends = spread(rows, cost).assign(x=rows[x]).dropna()
-        values = [{"x": a, "y": low, "high": high} for low, high, a in ends.itertuples(index=False)]
-        upper = {"y": {"field": "high"} | self.y}
-        self.draw(values, {"type": "rule", "color": color}, y2={"field": "high"})
-        for end in ({}, upper):
-            self.draw(values, {"type": "tick", "orient": "horizontal", "size": 7, "opacity": 1, "color": color}, **end)
+    def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
+        """Draw the spread of the repeats of each row; the second column is its cost."""
+        ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
+        values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
+        color = {"color": nominal(self.styles, "color")}
+        self.draw(values, {"type": "rule"}, y2={"field": "high"}, **color)
+        for end in ("y", "high"):
+            tick = {"type": "tick", "orient": "horizontal", "size": 7, "opacity": 1}
+            self.draw(values, tick, **color | {"y": {"field": end} | self.y})
 
-    def mark(
-        self, rows: "DataFrame", columns: tuple[str, str], numbers: Numbers, label: str = "label", **mark: Any
-    ) -> None:
-        """Draw a marker at each row, which tells its numbers; label: column with the name of its curve."""
-        of_rows = zip(*(rows[name] for name in (*columns, label)), tips(rows, numbers, label), strict=True)
-        values = [{"x": x, "y": y, "curve": curve, "tip": tip} for x, y, curve, tip in of_rows]
-        look = {"type": "point", "size": SIZES[0], "stroke": "white", "strokeWidth": 0.6} | mark
-        color = {} if "fill" in look else {"fill": nominal(self.styles, "color")}
-        self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **color)
+    def curves(self, rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> None:
+        """Draw the rows of each curve, in their order, as a line with a marker at each point."""
+        values = points(rows, columns, told, curve)
+        color = {"color": nominal(self.styles, "color")}
+        self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **color)
+        self.mark(values)
 
-    def curve(self, rows: "DataFrame", columns: tuple[str, str], numbers: Numbers, label: str = "label") -> None:
-        """Draw the rows of one curve as a line with a marker at each point."""
-        if len(rows):
-            color = self.styles[rows[label].iloc[0]].color
-            self.line(rows[columns[0]], rows[columns[1]], color)
-            self.mark(rows, columns, numbers, label, size=SIZES[len(rows) > MANY])
+    def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
+        """Draw a marker at each of ``points``, which tells its numbers."""
+        color = nominal(self.styles, "color")
+        own = {"fill": color, "size": {"field": "size", "type": "quantitative", "scale": None}}
+        look: dict[str, Any] = {"type": "point", "stroke": "white", "strokeWidth": 0.6}
+        if hollow:
+            own, look = {"stroke": color}, {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
+        self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
 
-    def rings(self, rows: "DataFrame", columns: tuple[str, str]) -> None:
+    def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""
         values = [{"x": x, "y": y} for x, y in rows[list(columns)].itertuples(index=False)]
         self.draw(values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0})
 
-    def text(self, rows: "DataFrame", columns: tuple[str, str], texts: Sequence[str], **mark: Any) -> None:
-        """Write a text to the upper right of each row."""
-        at = rows[list(columns)].itertuples(index=False)
-        values = [{"x": x, "y": y, "text": text} for (x, y), text in zip(at, texts, strict=True)]
-        look = {"type": "text", "dx": 6, "dy": -6, "align": "left", "fontSize": 9, "color": FAINT} | mark
-        self.draw(values, look, text={"field": "text"})
 
-    def spec(self, width: float, height: float) -> dict[str, Any]:
-        """Return the panel in Vega-Lite, of so many pixels."""
-        return {"title": self.title, "width": width, "height": height, "layer": self.layers}
+def points(rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> list[dict[str, Any]]:
+    """Return each row as a point with its place, its curve, what it tells and its size."""
+    sizes = rows.groupby(curve)[curve].transform("size").gt(MANY).map(SIZES.__getitem__)
+    of_rows = zip(*(rows[name] for name in (*columns, curve)), tips(rows, told, curve), sizes, strict=True)
+    return [
+        {"x": x, "y": y, "curve": name, "tip": tip, "size": size, "n": n}
+        for n, (x, y, name, tip, size) in enumerate(of_rows)
+    ]
 
 
 @dataclass
@@ -223,19 +214,22 @@ class Chart:
     columns: int = 3
     gap: float = 85
     height: float = HEIGHT
-    panels: list[Panel] = field(default_factory=list)
+    panels: list[Axes] = field(default_factory=list)
     findings: dict[str, list[str]] = field(default_factory=dict)
 
-    def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Panel:
+    def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Axes:
         """Return a new panel behind the others."""
-        self.panels.append(Panel(title, x, y, self.styles))
+        self.panels.append(Axes(title, x, y, self.styles))
         return self.panels[-1]
 
     def spec(self) -> dict[str, Any]:
         """Return the panels line by line in Vega-Lite, with one legend of all curves below."""
         columns = min(len(self.panels), self.columns)
         width = (WIDTH - self.gap * (columns - 1)) / columns
-        panels = [panel.spec(width, self.height) for panel in self.panels]
+        panels = [
+            {"title": panel.title, "width": width, "height": self.height, "layer": panel.layers}
+            for panel in self.panels
+        ]
         lines = [{"hconcat": panels[at : at + columns], "spacing": 15} for at in range(0, len(panels), columns)]
         own_legend = {"scale": {"fill": "independent", "shape": "independent"}}
         return {"vconcat": [*lines, legend(self.styles)], "resolve": own_legend, "spacing": 14}
@@ -276,6 +270,6 @@ def save_png(chart: Chart, folder: Path) -> Path:
 
 
 def svg_text(chart: Chart) -> str:
-    """Return the chart as an <svg> element: every point has a <title>, which browsers show under the mouse."""
+    """Return the chart as an <svg> element, whose points have a <title>: browsers show it."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
     return re.sub(r'<path aria-label="([^"]*)"([^>]*)/>', r'<path class="point"\2><title>\1</title></path>', text)

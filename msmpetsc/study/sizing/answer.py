@@ -1,13 +1,19 @@
 """What a plan of a surface error tells: its trials, its answer, and what keeps the error from being smaller."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import tomlkit
 
 from msmpetsc.errors import InputError
-from msmpetsc.study.sizing.choice import Candidate, Choice, Model
+from msmpetsc.results.disk import write_whole
+from msmpetsc.scene.reading import read_toml
+from msmpetsc.scene.statics import STATIC
+from msmpetsc.study.cases import inline, scene_tables
+from msmpetsc.study.sizing.choice import Candidate, Choice, CostModel
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class SizePlan:
     tried: list[Tried] = field(default_factory=list)
 
 
-def size_bounds(model: Model, target: float, step_known: bool) -> list[str]:
+def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
     """Return what an error out of reach is made of: more than half of it by the step, or by the cells.
 
     step_known : whether what is wrong with the step is said already
@@ -100,7 +106,7 @@ def inverted_bound(inverted: float, cells: float, law: str) -> list[str]:
     ]
 
 
-def time_bound(model: Model, target: float, times: Sequence[float], apart: Callable[[float], float]) -> list[str]:
+def time_bound(model: CostModel, target: float, times: Sequence[float], apart: Callable[[float], float]) -> list[str]:
     """Return until when an error out of reach would be within it; nothing if it is so at none of the times [s].
 
     apart : distance of the finest two lattices up to a time; the error of the cells is taken to go with it
@@ -114,3 +120,55 @@ def time_bound(model: Model, target: float, times: Sequence[float], apart: Calla
         if error <= target:
             return [f"the motion: {error:.1e} would be left if it ended at {time:.3g} s: fewer --frames"]
     return []
+
+
+# The answer as lines of a scene file
+
+Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
+
+
+def tables(method: Candidate) -> Tables:
+    """Return what the method says of a scene; None: the key must not stand there."""
+    values = {
+        "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
+        "error": method.step_error, "max_iterations": None,
+    }  # fmt: skip
+    if method.integrator == STATIC:
+        del values["time_step"]  # which spaces states, and need not stand there
+    return scene_tables(values)
+
+
+def lines(tables: Tables) -> str:
+    """Return TOML lines to paste."""
+    shown = {name: {key: value for key, value in table.items() if value is not None} for name, table in tables.items()}
+    return tomlkit.dumps(shown).strip()
+
+
+def overrides(scene: Path, tables: Tables) -> list[str]:
+    """Return the same as changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
+    (_, document), changes = read_toml(scene), []
+    for name, table in tables.items():
+        given = document.get(name, {})
+        if any(value is None and key in given for key, value in table.items()):
+            changes.append(f"{name}={inline({**given, **table})}")  # --set changes keys, and takes none away
+        else:
+            changes += [f"{name}.{key}={value}" for key, value in table.items() if value is not None]
+    return changes
+
+
+def put_into(scene: Path, tables: Tables) -> None:
+    """Change the scene file; comments, order and all else stay as they are. Raises InputError."""
+    text = scene.read_bytes().decode()
+    line_end = "\r\n" if "\r\n" in text else "\n"
+    document = tomlkit.parse(text)
+    for name, table in tables.items():
+        if name not in document:
+            document[name] = tomlkit.table()
+        old: Any = document[name]
+        for key, value in table.items():
+            if value is None:
+                old.pop(key, None)
+            elif old.get(key) != value:
+                old[key] = value
+    # new lines end like the others
+    write_whole(scene, tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))

@@ -78,7 +78,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Model:
+class CostModel:
     """What the trials told: errors of the cells, the steps and their solution, and what each costs.
 
     law         : of the error over the edge of a cell, cells^(-1/3)

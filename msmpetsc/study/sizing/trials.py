@@ -5,13 +5,14 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
-from msmpetsc.study.distances import surface_error
+from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.schema import Study, StudyScene, Sweep
 from msmpetsc.study.sizing.answer import (
@@ -23,7 +24,7 @@ from msmpetsc.study.sizing.answer import (
     size_bounds,
     time_bound,
 )
-from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, Model, Solving, Stepping
+from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
 PRESET = "newton"  # which itself chooses how its linear systems are preconditioned
@@ -46,32 +47,44 @@ VAGUE = 1 / 3  # of the error asked for: the most that the finest lattice may ha
 AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where fewer cells are not tried any more
 
 
+class Asked(NamedTuple):
+    """What a plan is asked for.
+
+    target : error of the surface
+    frames : first frames of the scene that are tried
+    cells  : of the finest lattice that is tried; the scene's if None
+    """
+
+    target: float
+    frames: int
+    cells: int | None = None
+    ranks: int = 1
+
+
 class Sizer:
-    """Makes the trials of one scene for one surface error."""
+    """Makes the trials of one scene for one surface error; ``report`` gets each, and notes."""
 
     def __init__(
         self,
         scene: Path,
         bench: Bench,
-        *,
-        target: float,
+        asked: Asked,
         presets: Collection[str],
-        frames: int,
-        cells: int | None,
-        ranks: int,
         report: Callable[[SizeTrial | str], None],
     ):
-        self.scene, self.bench, self.target, self.presets, self.ranks = scene, bench, target, presets, ranks
+        self.scene, self.bench, self.target, self.presets, self.ranks = scene, bench, asked.target, presets, asked.ranks
         self.as_given = load_scene(scene, (), presets)
-        count = cells or self.as_given.cages.count
+        count = asked.cells or self.as_given.cages.count
         if count is None:
             raise InputError(f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has")
-        self.cells, self.report = count, report
+        self.cells = count
+        self.report = report
         self.step = self.as_given.time.step
-        steps = min(frames, self.as_given.time.steps)
+        steps = min(asked.frames, self.as_given.time.steps)
         self.is_static = self.as_given.time.integrator == STATIC
         self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)  # twice the step fits, too
-        self.solved = min(1e-3, target / 10)  # step error of the trials
+        self.halved = [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
+        self.solved = min(1e-3, self.target / 10)  # step error of the trials
         self.bounds: list[str] = []
         self.cell_bound = ""  # what is not sure of the cells' error
         self.trials: list[SizeTrial] = []
@@ -99,7 +112,7 @@ class Sizer:
         costs = [(each.cells, each.cost) for each in lattices]
         on = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
-        model = Model(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
+        model = CostModel(law, steppings, solvings, on, costs, method.integrator == "verlet", 1, FINEST**3 * self.cells)
         wanted = model.cheapest(AIM * self.target)
         like = wanted is not None and lattices[-1].cells / 2 < wanted.cells < FINE * lattices[-1].cells
         # such an order makes the error of the finest lattice, which is part of all that are measured
@@ -120,7 +133,7 @@ class Sizer:
             self.step_errors = {state.method: 0.0} if state else {}
             return [Stepping(method, 0.0, state.cost) for method in self.step_errors if state]
         ladder, sizes = self._explicit(cells)
-        if len(ladder) < 2:
+        if not ladder:
             ladder, sizes = self._implicit(cells)
         if len(ladder) < 2:
             raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
@@ -164,7 +177,7 @@ class Sizer:
     def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
         """Return runs of BDF2 with steps halved until the error left is small, and their steps."""
         runs: list[SizeTrial] = []
-        for step in self._halved():
+        for step in self.halved:
             run = self._run(self._method("bdf2", step), cells)
             if run is None:
                 break
@@ -172,9 +185,6 @@ class Sizer:
             if len(runs) > 2 and self._left(runs, [each.method.time_step for each in runs]) <= self.target / PART:
                 break
         return runs, [each.method.time_step for each in runs]
-
-    def _halved(self) -> list[float]:
-        return [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
 
     def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
         """Return the error of the last of runs whose steps, or substeps, have these sizes."""
@@ -187,7 +197,7 @@ class Sizer:
         """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
         others: list[Stepping] = []
         enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
-        for step in self._halved():
+        for step in self.halved:
             run = self._run(self._method(integrator, step), cells)
             if run is None:
                 break
@@ -203,9 +213,7 @@ class Sizer:
     def _provisional(self, steppings: list[Stepping]) -> Candidate:
         """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
         fair = [each for each in steppings if each.error <= self.target / 2]
-        if fair:
-            return min(fair, key=self._at_scale).method
-        return min(steppings, key=lambda each: each.error).method
+        return (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
         """Return how loosely the steps may be solved, and what that leaves."""
@@ -258,7 +266,7 @@ class Sizer:
         """Return the cells of the lattice coarsened so many times."""
         return max(1, round(self.cells / COARSER ** (3 * power)))
 
-    def _checked(self, model: Model, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, Model]:
+    def _checked(self, model: CostModel, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, CostModel]:
         """Choose, run the choice and measure it, until its error is little less than was asked for.
 
         Each choice lies between the cells that met the error and those that did not, for errors go up and down from
@@ -292,7 +300,7 @@ class Sizer:
             bounds = fewest_bound(met, [(round(edge**-3), error) for edge, error in coarse])
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None, bounds), model
 
-    def _without(self, choice: Choice, model: Model, fewest: int) -> Model:
+    def _without(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
         """Return a model without the cells of what fails, where they are fewer than were tried, or its way to step."""
         if choice.cells < fewest:
             return replace(model, least=fewest)
@@ -321,7 +329,7 @@ class Sizer:
 
     # What is said
 
-    def _bounds(self, plan: SizePlan, model: Model, lattices: list[SizeTrial]) -> list[str]:
+    def _bounds(self, plan: SizePlan, model: CostModel, lattices: list[SizeTrial]) -> list[str]:
         """Return what bounds the error, in words; of the lattices that tell the cells' error."""
         finest = max(self.trials, key=lambda each: each.cells)
         inverted = inverted_bound(finest.inverted, finest.cells, self.as_given.material.law)
@@ -332,7 +340,7 @@ class Sizer:
             bounds += time_bound(model, self.target, times, lambda until: _apart(lattices[-2], lattices[-1], until))
         return bounds
 
-    def _tried(self, model: Model) -> list[Tried]:
+    def _tried(self, model: CostModel) -> list[Tried]:
         """Return cost and expected error of each trial, where the error of its step is known."""
         solved = {each.step_error: each.error for each in model.solvings} | {None: 0.0}
         tried = []

@@ -1,7 +1,8 @@
 """A first scene for a mesh: each value with its reason, to run at once and to be changed.
 
-The body either falls on the ground or, long and lying, is clamped at one end and bends under its weight. Young's
-modulus follows from the size, so that any body deforms visibly; the step from the period of its slowest motion.
+The mesh is measured; its unit and its upward axis are guessed, its faults and parts counted. The body either falls on
+the ground or, long and lying, is clamped at one end and bends under its weight. Young's modulus follows from the size,
+so that any body deforms visibly; the step from the period of its slowest motion.
 """
 
 import json
@@ -9,11 +10,20 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, QhullError
 
+from msmpetsc.build import USUAL
+from msmpetsc.geometry.prepare import part_labels
+from msmpetsc.geometry.surface import Surface, SurfaceReport, examine
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.scene.key_table import SCHEMA_FILE
-from msmpetsc.study.drafting.measures import MeshMeasures
 
+MILLIMETRE = 1e-3  # [m]
+SOLE = 0.02  # of the height: what lies so near to the lowest point may stand on the ground
+FEET = 0.5  # share of the sole that counts less where it is flat, as a table's top is: feet are likelier below
+SURER = 0.1  # by so much y must stand better than z to be upwards
+Y_BY_DEFINITION = (".glb", ".gltf")
 G, DENSITY = 9.81, 1000.0  # [m/s^2], [kg/m^3]
 USUAL_SIZE = 0.3  # [m], where the file's unit cannot be guessed
 SLENDER = 2.5  # times its other sides: so long a body is a beam
@@ -29,8 +39,89 @@ TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z 
 GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
+# The mesh
+
+
 @dataclass(frozen=True)
-class Shape:
+class MeshMeasures:
+    """What a first scene rests on.
+
+    sides  : (3,) of the bounding box, in the file's unit
+    report : volume, area and faults, in the file's unit
+    parts  : (p,) share of the area that each connected part has, the largest first
+    unit   : what the file's unit is taken for [m]; None where neither metres nor millimetres give a usual body
+    y_up   : whether y points upwards, not z
+    """
+
+    sides: np.ndarray
+    triangles: int
+    report: SurfaceReport
+    parts: np.ndarray
+    unit: float | None
+    y_up: bool
+
+    @property
+    def thickness(self) -> float:
+        """Mean thickness, twice the volume over the area; in the file's unit."""
+        return 2 * abs(self.report.volume) / self.report.area
+
+
+def measured(surface: Surface, suffix: str = "") -> MeshMeasures:
+    """Measure a surface as its file has it; ``suffix`` of the file: the axes of glTF are defined."""
+    sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
+    areas = np.bincount(part_labels(surface), trimesh.triangles.area(surface.points[surface.triangles]))
+    return MeshMeasures(
+        sides=sides,
+        triangles=len(surface.triangles),
+        report=examine(surface),
+        parts=np.sort(areas / areas.sum())[::-1],
+        unit=unit_of(float(sides.max())),
+        y_up=suffix.lower() in Y_BY_DEFINITION or uprightness(surface, 1) > uprightness(surface, 2) + SURER,
+    )
+
+
+def unit_of(side: float) -> float | None:
+    """Return the unit [m] in which a body of this longest side has a usual size, metres before millimetres."""
+    return next((unit for unit in (1.0, MILLIMETRE) if USUAL[0] <= side * unit <= USUAL[1]), None)
+
+
+def uprightness(surface: Surface, axis: int) -> float:
+    """Return how much likelier a body stands with this axis upwards than downwards, in [-1, 1].
+
+    A chair stands well on its feet and badly on its head; lying on its back it does both, a little.
+    """
+    return stands(surface, axis, 1) - stands(surface, axis, -1)
+
+
+def stands(surface: Surface, axis: int, way: int) -> float:
+    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of its ground plan
+    that it stands on, less where it stands on a face rather than on feet.
+
+    That is the convex hull of its lowest points; nothing where its centre is not above it.
+    """
+    used, plan = np.unique(surface.triangles), np.delete(surface.points, axis, axis=1)
+    height = way * surface.points[:, axis]
+    height -= height[used].min()
+    low = height <= SOLE * height[used].max()
+    try:
+        hull, ground = ConvexHull(plan[used[low[used]]]), ConvexHull(plan[used])
+    except QhullError:  # an edge or a corner
+        return 0.0
+    areas = trimesh.triangles.area(surface.points[surface.triangles])
+    centre = areas @ plan[surface.triangles].mean(axis=1) / areas.sum()
+    if not (hull.equations[:, :2] @ centre + hull.equations[:, 2] <= 0).all():
+        return 0.0
+    lowest = surface.triangles[low[surface.triangles].all(axis=1)]
+    flat = np.insert(plan, 2, 0.0, axis=1)
+    face = trimesh.triangles.area(flat[lowest]).sum() / hull.volume  # in two dimensions the volume is an area
+    return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
+
+
+# The scene
+
+
+@dataclass(frozen=True)
+class Dimensions:
     """The body as it will lie, z upwards: sides (3,) [m], mean thickness [m], volume [m^3]."""
 
     sides: np.ndarray
@@ -48,7 +139,7 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     """Return the text of a scene for a mesh, ``source`` as the scene will name it."""
     unit = mesh.unit or USUAL_SIZE / mesh.sides.max()
     sides = unit * (mesh.sides[[0, 2, 1]] if mesh.y_up else mesh.sides)
-    body = Shape(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
+    body = Dimensions(sides, unit * mesh.thickness, unit**3 * abs(mesh.report.volume))
     head = [
         f"#:schema {SCHEMA_FILE}",
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
@@ -59,7 +150,7 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     return "\n".join([*head, "", *mesh_lines, "", *cages, "", *moved]) + "\n"
 
 
-def _mesh(source: str, mesh: MeshMeasures, body: Shape) -> list[str]:
+def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     """Return the table of the mesh, and what is wrong with it."""
     report, longest = mesh.report, float(body.sides.max())
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
@@ -93,14 +184,14 @@ def _mesh(source: str, mesh: MeshMeasures, body: Shape) -> list[str]:
     return lines
 
 
-def _cages(body: Shape) -> list[str]:
+def _cages(body: Dimensions) -> list[str]:
     aim = body.volume * (ACROSS / body.thickness) ** 3
     count = int(plain(min(max(aim, CELLS[0]), CELLS[1]), 1))
     across = body.thickness * (count / body.volume) ** (1 / 3)
     return ["[cages]", line(f"count = {count}", f"cells; a mean thickness of {body.thickness:.2g} m has {across:.1f}")]
 
 
-def _falling(body: Shape) -> list[str]:
+def _falling(body: Dimensions) -> list[str]:
     """Return the tables of a body that falls on the ground."""
     height = float(body.sides[2])
     young = SINKING * DENSITY * G * height
@@ -119,16 +210,15 @@ def _falling(body: Shape) -> list[str]:
     return [*material, law, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
 
 
-def _clamped(body: Shape, axis: int) -> list[str]:
+def _clamped(body: Dimensions, axis: int) -> list[str]:
     """Return the tables of a beam (Euler, Bernoulli) with one end clamped; its section counts as a full rectangle."""
     length, thick = float(body.sides[axis]), float(body.sides[2])
     young = 1.5 * DENSITY * G * length**3 / (thick**2 * SAG)  # q l^4 / 8 E I = SAG l under its weight
     period = bending_period(length, thick, young, DENSITY)
-    normal = ["0", "0", "0"]
-    normal[axis] = "-1"
-    point = ["0", "0", "0"]
-    point[axis] = f"{CLAMPED:g}"
-    region = f"half_space = {{ point = [{', '.join(point)}], normal = [{', '.join(normal)}] }}, relative = true"
+    along = np.eye(3, dtype=int)[axis]
+    point = ", ".join(f"{CLAMPED * each:g}" for each in along)
+    normal = ", ".join(str(-each) for each in along)
+    region = f"half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true"
     pin = [line("[[pin]]", "the body is long and lies: one end does not move"), f"region = {{ {region} }}"]
     material = _material(young, f"its end would sink by about {100 * SAG:g}% of its length")
     return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]

@@ -14,7 +14,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -31,61 +30,44 @@ GROWTH = 10  # of an error, by contact and buckling
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 NODES = 5  # whose places are stored, evenly spread by their numbers
 HEAD = f"{'scene':20} {'cells':>6} {'nodes':>6} {'springs':>8} {'off by':>9} {'allowed':>9} {'time':>7}"
-Numbers = dict[str, Any]  # as stored: "run", "counts", "scales" by unit, "numbers" by name
+Unit = Literal["m", "J", "kg m/s"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=0)]
 Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 MOST_STEPS = int((2 / (GROWTH * ERROR)) ** 0.5)  # with more, any difference would be allowed
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True)
+    model_config = ConfigDict(strict=True, frozen=True, populate_by_name=True)
 
 
-class _StoredRun(_Strict):
-    cells: Annotated[int, Field(ge=1)] | None = Field(alias="cells asked for")
-    steps: int = Field(ge=1, le=MOST_STEPS)
-    changes: list[str]
+class Recipe(_Strict):
+    """How a scene is run for its numbers."""
+
+    cells: Annotated[int, Field(ge=1)] | None = Field(
+        validation_alias="cells asked for", serialization_alias="cells asked for", description="the scene's own if None"
+    )
+    error: float = ERROR
+    steps: int = Field(ge=1, le=MOST_STEPS, description="from the start")
+    changes: list[str] = Field(default=[], description="of the scene, as --set takes them")
 
 
-class _StoredNumber(_Strict):
-    unit: Literal["m", "J", "kg m/s"]
+class Number(_Strict):
+    """A number of the last frame, or a vector."""
+
+    unit: Unit
     value: Finite | list[Finite]
 
-
-class Stored(_Strict):
-    """What the file of numbers must be: it may be damaged, or from anywhere."""
-
-    run: _StoredRun
-    counts: dict[str, Count]
-    scales: dict[Literal["m", "J", "kg m/s"], Size]
-    numbers: dict[str, _StoredNumber]
+    def __str__(self) -> str:
+        return f"{np.array2string(np.asarray(self.value), precision=9)} {self.unit}"
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How a scene is run for its numbers.
+class Numbers(_Strict):
+    """What is stored of a run; scales: what errors are relative to. A file of them may be damaged, or from anywhere."""
 
-    cells   : valid cells asked for; None where the scene's own are meant
-    steps   : from the start
-    changes : of the scene, as ``--set`` takes them
-    """
-
-    cells: int | None
-    steps: int
-    changes: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, stored: Numbers) -> "Recipe":
-        """Return the recipe by which stored numbers were made."""
-        run = stored["run"]
-        return cls(run["cells asked for"], run["steps"], tuple(run["changes"]))
-
-    def record(self) -> dict[str, Any]:
-        """Return it as it is stored."""
-        return {
-            "cells asked for": self.cells, "error": ERROR, "steps": self.steps, "changes": list(self.changes),
-        }  # fmt: skip
+    run: Recipe
+    counts: dict[str, Annotated[int, Field(ge=0)]]
+    scales: dict[Unit, Size]
+    numbers: dict[str, Number]
 
 
 def simulate(scene: Path, recipe: Recipe, path: Path, ranks: int) -> None:
@@ -112,28 +94,26 @@ def summary(path: Path, recipe: Recipe) -> Numbers:
         counts = {name: len(lattice[name]) for name in ("cells", "nodes", "springs", "pinned")}
         counts["frames"] = len(frames.time)
         momentum = frames.momentum[-1]
-    scales = {
+    potential = energies["potential"]
+    scales: dict[Unit, float] = {
         "m": moved,
-        "J": max(np.abs(values - (values[0] if name == "potential" else 0)).max() for name, values in energies.items()),
+        "J": max(np.abs(values).max() for values in (energies | {"potential": potential - potential[0]}).values()),
         "kg m/s": np.sqrt(2 * mass.sum() * energies["kinetic"].max()),
     }
-    numbers = _numbers(q, mass, energies, momentum)
-    return {
-        "run": recipe.record(),
-        "counts": counts,
-        "scales": {unit: float(scale) for unit, scale in scales.items()},
-        "numbers": {
-            name: {"unit": unit, "value": np.asarray(value).tolist()} for name, (unit, value) in numbers.items()
-        },
+    numbers = {
+        name: Number.model_construct(unit=unit, value=np.asarray(value).tolist())
+        for name, (unit, value) in _numbers(q, mass, energies, momentum).items()
     }
+    sizes = {unit: float(scale) for unit, scale in scales.items()}
+    return Numbers.model_construct(run=recipe, counts=counts, scales=sizes, numbers=numbers)
 
 
 def _numbers(
     q: np.ndarray, mass: np.ndarray, energies: dict[str, np.ndarray], momentum: np.ndarray
-) -> dict[str, tuple[str, Any]]:
+) -> dict[str, tuple[Unit, Any]]:
     """Return unit and value of each number of the last frame; q (n, 3) [m], mass (n,) [kg]."""
     some = np.linspace(0, len(q) - 1, NODES).astype(int)
-    numbers: dict[str, tuple[str, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
+    numbers: dict[str, tuple[Unit, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
     numbers |= {"momentum": ("kg m/s", momentum), "centre of mass": ("m", mass @ q / mass.sum())}
     numbers |= {"lowest corner": ("m", q.min(axis=0)), "highest corner": ("m", q.max(axis=0))}
     return numbers | {f"node {node}": ("m", q[node]) for node in some}
@@ -146,64 +126,49 @@ def allowed(steps: int, unit: str) -> float:
 
 def differences(found: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
     """Yield of each number what it is called, how far it is off, relative, and how much is allowed."""
-    steps = stored["run"]["steps"]
-    for name in found["numbers"].keys() | stored["numbers"].keys():
-        one, other = found["numbers"].get(name), stored["numbers"].get(name)
-        if (
-            one is None
-            or other is None
-            or one["unit"] != other["unit"]
-            or np.shape(one["value"]) != np.shape(other["value"])
-        ):
+    for name in found.numbers.keys() | stored.numbers.keys():
+        one, other = found.numbers.get(name), stored.numbers.get(name)
+        if one is None or other is None or one.unit != other.unit or np.shape(one.value) != np.shape(other.value):
             yield name, np.inf, 0.0
             continue
-        apart = np.abs(np.subtract(one["value"], other["value"], dtype=float)).max()
-        scale = min(numbers["scales"][one["unit"]] for numbers in (found, stored))  # of a damaged file any
-        relative = 0.0 if apart == 0 else float(apart / scale) if scale > 0 else np.inf
-        yield name, np.inf if np.isnan(relative) else relative, allowed(steps, one["unit"])
+        apart = np.abs(np.subtract(one.value, other.value, dtype=float)).max()
+        scale = min(found.scales[one.unit], stored.scales[one.unit])  # of a damaged file any
+        relative = np.inf
+        if apart == 0:
+            relative = 0.0
+        elif scale > 0 and np.isfinite(apart):
+            relative = float(apart / scale)
+        yield name, relative, allowed(stored.run.steps, one.unit)
 
 
 def judged(found: Numbers, stored: Numbers) -> dict[str, str]:
     """Return for each count and number what is wrong with it, nothing for what is as stored."""
     lines = {}
-    for name in found["counts"].keys() | stored["counts"].keys():
-        now, then = found["counts"].get(name), stored["counts"].get(name)
+    for name in found.counts.keys() | stored.counts.keys():
+        now, then = found.counts.get(name), stored.counts.get(name)
         lines[name] = "" if now == then else f"{name}: {now}, stored {then}"
     for name, off, most in differences(found, stored):
-        now, then = (shown(numbers["numbers"].get(name)) for numbers in (found, stored))
-        lines[name] = f"{name}: {now}, stored {then}: {off:.2g} off, {most:.2g} allowed" if off > most else ""
+        values = f"{found.numbers.get(name, 'not there')}, stored {stored.numbers.get(name, 'not there')}"
+        lines[name] = f"{name}: {values}: {off:.2g} off, {most:.2g} allowed" if off > most else ""
     return dict(sorted(lines.items()))
 
 
-def nearest_to_limit(found: Numbers, stored: Numbers) -> tuple[float, float]:
-    """Return how far off the number is that comes nearest to what is allowed of it, and how much that is."""
+def row(name: str, found: Numbers, stored: Numbers, seconds: float, verdict: str) -> str:
+    """Return the line of a scene under HEAD, with the number that comes nearest to what is allowed of it."""
     _, off, most = max(differences(found, stored), key=lambda row: row[1] / row[2] if row[2] else np.inf)
-    return off, most
-
-
-def shown(number: dict[str, Any] | None) -> str:
-    """Return a number with its unit."""
-    if number is None:
-        return "not there"
-    return f"{np.array2string(np.asarray(number['value']), precision=9)} {number['unit']}"
-
-
-def row(name: str, counts: dict[str, int], off: tuple[float, float], seconds: float, verdict: str) -> str:
-    """Return the line of a scene under HEAD; ``off``: by how much, and how much is allowed."""
-    sizes = f"{counts['cells']:6} {counts['nodes']:6} {counts['springs']:8}"
-    return f"{name:20} {sizes} {off[0]:9.1e} {off[1]:9.1e} {seconds:5.1f} s {verdict}"
+    sizes = f"{found.counts['cells']:6} {found.counts['nodes']:6} {found.counts['springs']:8}"
+    return f"{name:20} {sizes} {off:9.1e} {most:9.1e} {seconds:5.1f} s {verdict}"
 
 
 def write(path: Path, numbers: Numbers) -> None:
     """Store numbers. Raises InputError."""
-    write_whole(path, json.dumps(numbers, indent=1) + "\n")
+    write_whole(path, json.dumps(numbers.model_dump(by_alias=True), indent=1) + "\n")
 
 
 def read(path: Path) -> Numbers:
     """Return stored numbers. Raises InputError for what are none."""
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        Stored.model_validate(stored)
+        stored = Numbers.model_validate_json(path.read_text(encoding="utf-8"))
         judged(stored, stored)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
@@ -211,6 +176,6 @@ def read(path: Path) -> Numbers:
         first = error.errors()[0]
         where = printable(".".join(map(str, first["loc"])) or "all", 60)
         raise InputError(f"{path} is damaged, or has no numbers of a scene: {where}: {first['msg']}") from None
-    except (ValueError, LookupError, RecursionError):
+    except (ValueError, LookupError):
         raise InputError(f"{path} is damaged, or has no numbers of a scene") from None
     return stored

@@ -51,10 +51,6 @@ class Grid:
         """Return the positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
 
-    def nearest_nodes(self, points: Positions) -> Indices:
-        """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
-        return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
-
 
 @dataclass(frozen=True)
 class BodyGrids:
@@ -106,15 +102,11 @@ class BodyGrids:
 
     def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
-        if not self.room:
-            return self.grids[0].node_positions(ijk)
         body = self.body_of(ijk)
         return self._origins[body] + (ijk - self.first(body)) * self.cell_size
 
     def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
         """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
-        if not self.room:
-            return self.grids[0].nearest_nodes(points)
         return np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64) + self.first(body)
 
 

@@ -48,12 +48,11 @@ def enclosed_gaps(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
     boundary : (b, 3) int64 distinct boundary cells of this rank's slab, in lexicographic order
     returns  : (g, 4) int64 rows (i, j, k first, k last) of this slab
     """
-    halo = _next_plane(comm, boundary, slab)
-    cells = np.concatenate([boundary, halo])
-    gaps, label = _flood(cells, slab)
+    halo = _to_previous(comm, boundary[boundary[:, 0] == slab.first])
+    gaps, label = _flood(np.concatenate([boundary, halo]), slab)
     own = gaps[:, 0] < slab.last
-    label = _join(comm, gaps, label, own, slab)
-    return gaps[own][label[own] != EXTERIOR]
+    enclosed: Mask = own & (_join(comm, gaps, label, own, slab) != EXTERIOR)
+    return gaps[enclosed]
 
 
 def cells_of_gaps(gaps: Indices) -> Indices:
@@ -68,10 +67,6 @@ def _to_previous(comm: MPI.Comm, rows: Indices) -> Indices:
     """Send rows to the rank before this one; rank 0 has none and sends nothing."""
     rows = rows if comm.rank > 0 else rows[:0]
     return Route(comm, np.full(len(rows), comm.rank - 1)).send(rows)
-
-
-def _next_plane(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
-    return _to_previous(comm, boundary[boundary[:, 0] == slab.first])
 
 
 def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) -> Indices:

@@ -173,7 +173,8 @@ def part_labels(surface: Surface) -> Indices:
     links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
     n = len(surface.points)
     _, labels = connected_components(coo_array((np.ones(len(links[0])), links), shape=(n, n)))
-    return np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
+    parts: Indices = np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
+    return parts
 
 
 def _solid(part: Surface, number: int) -> "manifold3d.Manifold":

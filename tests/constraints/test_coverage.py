@@ -245,7 +245,7 @@ import logging, sys
 import numpy as np
 from msmpetsc.backend.compiling import cache_is_empty, compilation_logged
 empty = cache_is_empty()
-from msmpetsc.contact.obstacles.faces import depth
+from msmpetsc.contact.obstacles.solids import depth
 from msmpetsc.comm import log
 log.addHandler(logging.StreamHandler(sys.stdout))
 log.setLevel(logging.INFO)

@@ -14,8 +14,6 @@ from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 
 from msmpetsc.build import Model, build_model
-from msmpetsc.contact.obstacles.penalty import Contact
-from msmpetsc.contact.surface.barrier import Barrier
 from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
@@ -23,9 +21,6 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.linear.explicit import explicit
-from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import Simulation, refuse_bad_options
 
 COMM = MPI.COMM_SELF
@@ -85,17 +80,6 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     assert below / above == pytest.approx(1, rel=0.01)  # where one formula takes over from the other
 
 
-@pytest.mark.parametrize("slid", [0.0, 1e-4])
-def test_forces_keep_momentum(model, slid: float):
-    term, q = contact(model, slid)
-    gradient = np.zeros_like(q)
-    term.add_gradient(q, gradient)
-    moments = np.cross(q, gradient).sum(axis=0)
-    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
-    if slid == 0:  # lagged friction acts along where it was
-        assert np.abs(moments).max() < 1e-10 * np.abs(gradient).sum() * HALF
-
-
 @pytest.mark.parametrize("slid", [0.0, 1e-7])
 def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: float):
     term, q = contact(model, slid)
@@ -131,24 +115,6 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     bound = term.bound(q)
     assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
     assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
-
-
-def test_the_written_hessian_has_the_contacts_entries(model):
-    """Which couple nodes that no spring joins: `-ksp_view_mat` writes it."""
-    term, q = contact(model)
-    stepper = Stepper(COMM, model.lattice, T, find_preset("newton"), 1e-3, touches=True)
-    hessian, operator = stepper.jacobian.hessian, stepper.jacobian.operator
-    hessian.linearise(q, Contact([], model.lattice.owned, term))
-    x, y = operator.createVecs()
-    x.array[:] = np.random.default_rng(0).normal(size=x.getLocalSize())
-    operator.mult(x, y)
-    found = y.duplicate()
-    matrix = explicit(operator, stepper.unknowns, hessian.coupled())
-    matrix.mult(x, found)
-    np.testing.assert_allclose(found.array, y.array, rtol=1e-9, atol=1e-9 * np.abs(y.array).max())
-    for owned in (matrix, x, y, found):
-        owned.destroy()
-    stepper.destroy()
 
 
 def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
@@ -243,19 +209,13 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
         build_model(COMM, load_scene(path))
 
 
-def test_a_coarser_surface_lies_on_the_body(tmp_path):
-    path = pinch_scene(tmp_path, self_contact={"surface": 400})
-    model = build_model(COMM, load_scene(path))
-    surface = model.collision.surface
-    assert 300 < len(surface.triangles) <= 400
-    squares = igl.point_mesh_squared_distance(surface.points, model.surface.points, model.surface.triangles)[0]
-    assert squares.max() < 1e-18
-    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
-
-
-def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
+def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
     model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
     surface, whole = model.collision.surface, model.surface.points
+    assert 300 < len(surface.triangles) <= 400
+    squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
+    assert squares.max() < 1e-18
+    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
     off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
     assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
     diagonal = np.linalg.norm(np.ptp(whole, axis=0))
@@ -264,26 +224,6 @@ def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path
     far = {"surface": 400, "distance": 1.01 * off.max()}
     assert build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact=far))).collision.law.distance > off.max()
     assert "the surface drawn" not in caplog.text
-
-
-def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
-    q, collision, reach = closed(model), model.collision, 8e-4
-    touching = collision.points(q)
-    end = np.clip(model.lattice.nodes[:, 2] / ARM, 0, None) ** 2
-    q[:, 0] -= (2e-3 - GAP) * end * (q[:, 0] < 0)  # the arms are 2 mm apart, of a distance of 1 mm
-    barrier, points = Barrier(collision.surface, collision.law), collision.points(q)
-    barrier.leave_out_neighbours(collision.surface.points)
-    candidates = barrier.candidates(points, reach)
-    clear, anywhere = barrier.clear_reach(candidates, points, reach)
-    assert 1e-4 < clear < reach and anywhere == clear  # the tube has no creases
-    least = barrier._least(barrier._pairs(candidates, points, 4e-3), points)
-    assert least == pytest.approx(collision.law.distance + 2 * clear)  # both parts come nearer
-    for seed in range(10):
-        way = np.random.default_rng(seed).normal(size=points.shape)
-        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
-        assert not barrier.pushing(barrier.contacts(candidates, moved))
-    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == (1e-4, 1e-4)
-    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -334,15 +274,6 @@ def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
     mass = model.lattice.mass * free
     along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
     return np.diff(along)[50:] / 0.01, frames[51:]
-
-
-@pytest.mark.slow
-def test_a_block_slides_down_another_as_coulomb_has_it(tmp_path):
-    speed, _ = along_and_frames(sliding(tmp_path, 35.0))
-    tilt = np.radians(35.0)
-    acceleration = np.polyfit(0.01 * np.arange(len(speed)), speed, 1)[0]
-    friction = np.tan(tilt) - acceleration / (9.81 * np.cos(tilt))
-    assert friction == pytest.approx(0.5, rel=0.01)
 
 
 def test_a_block_sticks_to_a_tilted_one_but_for_the_creep_of_its_friction(tmp_path):

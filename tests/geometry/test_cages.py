@@ -21,7 +21,7 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, compact, examine
@@ -43,12 +43,6 @@ def test_morton_round_trip_in_the_order_of_the_interleaved_bits(ijk):
     assert np.array_equal(decode_morton(keys), ijk)
     bits = ["".join(f"{k:021b}"[b] + f"{j:021b}"[b] + f"{i:021b}"[b] for b in range(21)) for i, j, k in ijk.tolist()]
     assert keys.tolist() == [int(b, 2) for b in bits]
-
-
-def test_morton_is_minus_one_outside():
-    outside = np.array([[-1, 0, 0], [0, LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
-    assert (encode_morton(outside) == -1).all()
-    assert encode_morton(outside[:, None]).shape == (4, 1)
 
 
 # --- boundary cells ---
@@ -110,36 +104,6 @@ def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
     assert np.isin(encode_morton(np.floor(points).astype(np.int64)), encode_morton(marked)).all()
 
 
-def through_grid_points(count: int) -> np.ndarray:
-    """Triangles of one side through a grid point, at a place where interpolation rounds: (count, 3, 3)."""
-    rng = np.random.default_rng(2)
-    grid_point, side = rng.integers(5, 15, (count, 3)), rng.normal(size=(count, 3))
-    before, after = rng.integers(1, 4, (2, count, 1))
-    a, b = grid_point - before * side, grid_point + after * side
-    return np.stack([a, b, rng.uniform(0, 20, (count, 3))], axis=1)
-
-
-def test_cut_into_slabs_a_triangle_marks_the_same_cells():
-    for triangle in through_grid_points(1000):
-        slabs = [cells_of(triangle, low=(i, -9, -9), high=(i + 1, 30, 30)) for i in range(20)]
-        assert set.union(*slabs) == cells_of(triangle, low=(0, -9, -9), high=(20, 30, 30))
-
-
-def test_a_long_sliver_marks_what_its_axis_passes():
-    # its edges rise from y = 1/2 at x = 1/2 and reach y = 1 at x = 500.5 and 500.99: both in cell 500
-    corners = np.array([[0.5, 0.5, 0.5], [1000.5, 1.5, 0.5], [1000.5, 1.5 - 1 / 1024, 0.5]])
-    lower, upper = {(i, 0, 0) for i in range(501)}, {(i, 1, 0) for i in range(500, 1001)}
-    assert cells_of(corners, high=(1001, 9, 9)) == lower | upper
-
-
-def test_points_and_segments_are_triangles_too():
-    assert cells_of(np.full((3, 3), 2.5)) == {(2, 2, 2)}
-    assert cells_of(np.full((3, 3), 2.0)) == {(2, 2, 2)}  # low faces are the cell's own
-    segment = np.array([[0.5, 0.5, 0.5], [4.5, 0.5, 0.5], [2.0, 0.5, 0.5]])
-    assert cells_of(segment) == {(i, 0, 0) for i in range(5)}
-    assert assert_exact(np.array([[1, 3, 5], [381, 211, 77], [1, 3, 5]]))  # a slanted one
-
-
 @pytest.mark.parametrize("mark", [touched_cells, sampled_cells])
 def test_cells_outside_the_limits_are_left_out(mark):
     rng = np.random.default_rng(3)
@@ -159,22 +123,15 @@ def test_the_papers_samples_miss_cells_that_a_sphere_grazes():
     assert len(exact - sample) > 0.02 * len(exact)
 
 
-def test_the_papers_samples_hold_every_corner():
-    triangles = np.random.default_rng(4).uniform(0, SIDE, (500, 3, 3))
-    triangles[:, :, 0] = np.floor(triangles[:, :, 0])  # on grid planes, where rounding down changes the cell
-    corners = set(map(tuple, np.floor(triangles).astype(int).reshape(-1, 3).tolist()))
-    assert corners <= cells_of(triangles, sampled_cells)
-
-
 # --- interior cells ---
 
 
-def body_of(mesh: trimesh.Trimesh | Surface) -> Body:
+def body_of(mesh: trimesh.Trimesh | Surface) -> BodySurface:
     if isinstance(mesh, trimesh.Trimesh):
         mesh = Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
     surface = compact(mesh.points, mesh.triangles)
     bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return Body(MPI.COMM_SELF, surface, examine(surface), bounds)
+    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)
 
 
 def dense(cages: Cages, kind: int) -> np.ndarray:
@@ -237,7 +194,7 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
 # --- cages ---
 
 
-def aligned_box(lid: bool = True) -> Body:
+def aligned_box(lid: bool = True) -> BodySurface:
     box = trimesh.creation.box((1, 0.5, 0.3))
     box.vertices = np.array([1, 0.5, 0.3]) * (box.vertices > 0)
     if not lid:

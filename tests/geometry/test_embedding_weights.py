@@ -92,7 +92,7 @@ def plain_cages(p, mask, h):
 
 def test_mvc_and_cages_agree_with_their_equations_evaluated_plainly():
     rng = np.random.default_rng(0)
-    points = [*rng.uniform(0.05, 0.95, (4, 3)), np.array([0.005, 0.4, 0.7]), np.array([0.3, 0.995, 0.002])]
+    points = [*rng.uniform(0.05, 0.95, (2, 3)), np.array([0.005, 0.4, 0.7]), np.array([0.3, 0.995, 0.002])]
     masks = random_masks(rng, len(points))
     masks[0] = np.isin(np.arange(27), [13, 14])  # 4 of the corners are not in B_c
     for u, mask in zip(points, masks, strict=True):
@@ -273,11 +273,6 @@ def test_error_on_a_bent_bar_falls_with_the_square_of_the_cell_size(kind):
     assert 1.8 < slope < 2.3
 
 
-def test_affine_is_the_most_accurate():
-    errors = {kind: rms_error(kind, 1 / 8) for kind in KINDS}
-    assert errors["affine"] < 0.7 * min(errors["mvc"], errors["cages"])
-
-
 # ---- single cells, smoothing, misuse
 
 
@@ -287,14 +282,6 @@ def test_a_cell_without_neighbours_keeps_its_own_coordinates():
     np.testing.assert_array_equal(stencil_weights("cages", u, alone), stencil_weights("mvc", u, alone))
     # 8 nodes fix F_v; at a corner the affine map gives the corner itself
     np.testing.assert_allclose(weights("affine", (1, 0, 1), alone[0])[NODES.tolist().index([1, 0, 1])], 1.0)
-
-
-def test_less_smoothing_keeps_more_of_the_cells_own_coordinates():
-    one_neighbour = BLOCK.tolist().index([1, 0, 0])
-    mask = np.isin(np.arange(27), [13, one_neighbour])
-    u = (0.4, 0.5, 0.5)  # the corners shared at x = 1 weigh less than 0.6: 1 - that >= h for h = 0.4
-    np.testing.assert_array_equal(weights("cages", u, mask, 0.4), weights("mvc", u, mask))
-    assert np.abs(weights("cages", u, mask, 1.0) - weights("mvc", u, mask)).max() > 1e-3
 
 
 def test_misuse_is_named():

@@ -139,13 +139,6 @@ def test_orient_refuses_a_one_sided_surface():
         prepare(Surface(points, band), ["orient"])
 
 
-def test_rotate_turns_about_the_axis_through_the_origin():
-    surface = box((1, 0, 0))
-    turned = prepare(surface, [{"rotate": {"axis": [0, 0, 2], "degrees": 90}}])
-    assert turned.points.mean(axis=0) == pytest.approx([0, 1, 0], abs=1e-12)
-    assert examine(turned).volume == pytest.approx(1)
-
-
 @given(
     size=st.floats(1e-3, 1e3),
     base=st.tuples(*[st.floats(-10, 10)] * 3),

@@ -14,7 +14,7 @@ from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regio
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange
@@ -22,7 +22,7 @@ from msmpetsc.contact.surface.collision_surface import collision_surface
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import FORCES
-from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.embedding import Embedding, embed
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
@@ -65,7 +65,7 @@ class Model:
     penalties: list[Penalty]
     start: InitialState
     collision: CollisionSurface | None = None
-    bodies: tuple[Body, ...] = ()
+    bodies: tuple[BodySurface, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
@@ -153,9 +153,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         penalties=penalties,
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds),
         bodies=bodies,
-        collision=collision_surface(comm, scene.self_contact, scene, bodies, cages, lattice)
-        if scene.self_contact
-        else None,
+        collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
         reaches=reaches,
         damping=scene.material.damping,
         obstacles=tuple(obstacles),
@@ -186,7 +184,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
     )
 
 
-def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[Body, ...]:
+def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[BodySurface, ...]:
     """Return the prepared surfaces on rank 0, and on all ranks what they need to know of them (collective)."""
 
     def read() -> tuple[list[Surface], list[tuple[SurfaceReport, Rows]]]:
@@ -195,7 +193,9 @@ def read_bodies(comm: MPI.Comm, scene: Scene) -> tuple[Body, ...]:
 
     surfaces, facts = on_root(comm, read) or (None, None)
     of_bodies: Sequence[Surface | None] = surfaces or [None] * len(scene.meshes)
-    return tuple(Body(comm, surface, *known) for surface, known in zip(of_bodies, comm.bcast(facts), strict=True))
+    return tuple(
+        BodySurface(comm, surface, *known) for surface, known in zip(of_bodies, comm.bcast(facts), strict=True)
+    )
 
 
 def _prepared(scene: Scene) -> Iterator[tuple[Surface, SurfaceReport]]:
@@ -238,7 +238,7 @@ def _doubtful_unit(surface: Surface, size: float | None) -> list[str]:
     return [f"the body is {side:.3g} m long, and the scene gives no mesh.size: is the mesh in {unit}?"]
 
 
-def fill_cages(bodies: Sequence[Body], scene: Scene) -> Cages:
+def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
     cages = scene.cages
     cell_size = cages.cell_size

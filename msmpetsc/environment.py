@@ -11,7 +11,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.build import Model
 from msmpetsc.constraints.loads import Anchor, Load, OwnForce
 from msmpetsc.contact.obstacles.friction import Movers, apply_friction
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import Contact, ContactState, Penalty
 from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
@@ -36,7 +36,7 @@ class Environment:
         self._contacts = Contacts(self.self_contact) if self.self_contact else None  # of the last step that was begun
         self.touches = bool(self.penalties or self.self_contact)
         self.obstacles = [p.obstacle for p in self.penalties] + [e.obstacle for e in self.exchanges]
-        self.has_sides = any(obstacle.has_sides for obstacle in self.obstacles)
+        self.has_sides = any(obstacle.solid.has_sides for obstacle in self.obstacles)
         self.pressing, self.exchanging = slice(len(self.penalties)), slice(len(self.penalties), None)  # rows of sides
         self.strikes = bool(self.exchanges) or any(p.restitution is not None for p in self.penalties)
         nodes = self.lattice.nodes
@@ -148,7 +148,7 @@ class Environment:
             return self.no_sides[:, : len(q)]
         sides = np.zeros((len(self.obstacles), len(q)), np.int8, like=q)
         for row, obstacle in enumerate(self.obstacles):
-            if obstacle.has_sides:
+            if obstacle.solid.has_sides:
                 side_before = None if before is None else before[row]
                 sides[row] = np.where(held, 0, obstacle.sides(q, end, time, time_step, side_before))
         return sides

@@ -5,8 +5,8 @@
 
 Runs the paper's scenes, clamped beams of 9,000 and 96,000 cells and, with --large, of 995,000, each to a step error of
 1e-3 on one core: `newton` with `-pc_type jacobi` and `gamg`, with --ranks `newton` on so many, and `newton`, one after
-the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --gpu takes `newton` alone,
-on one core, with --ranks on so many, and on the GPU of the machine.
+the other, and all of that again for each repeat. --only takes rows whose name contains NAME. --gpu takes `newton`
+alone, on one core, with --ranks on so many, and on the GPU of the machine.
 
 Figures are of all frames but the first, for what is done once shows in it: the mean time, its median over the repeats
 with the least and the greatest of them in brackets; `slowest tenth` is the mean of those frames. KSP iterations and

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import spherical_jn
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -54,7 +54,7 @@ def lattice_of(mesh: trimesh.Trimesh, h: float, boundary: str = "fill", offset: 
     """The calibrated lattice of a mesh in a grid that begins ``offset`` (3,) cells before it."""
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
-    cages = fill([Body(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
+    cages = fill([BodySurface(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
     return build_lattice(cages, DENSITY, young_modulus=E)
 
 

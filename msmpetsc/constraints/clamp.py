@@ -39,7 +39,8 @@ def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, poin
     body = lattice.body[free]
 
     def within(x: Positions) -> Mask:
-        return np.any([np.zeros(len(x), bool), *(finder.inside(table, x, body) for table in tables)], axis=0)
+        where: Mask = np.any([np.zeros(len(x), bool), *(finder.inside(table, x, body) for table in tables)], axis=0)
+        return where
 
     start, end = lattice.nodes[free], lattice.nodes[fast]
     theta, of_body = _free_part(within, start, end), _free_part(within, start, points[fast])

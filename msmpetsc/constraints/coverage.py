@@ -62,7 +62,7 @@ def reach_of(
     """
 
     def count(where: Mask) -> int:
-        return comm.allreduce(int(where[: lattice.owned].sum()))
+        return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
     reaches, pinned = [], np.zeros_like(lattice.pinned)
     for pin in scene.tables("pin"):

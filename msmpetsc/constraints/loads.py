@@ -170,4 +170,5 @@ def spread_by_mass(comm: "MPI.Comm", total: Iterable[float], where: Mask, mass: 
     """
     loaded = np.where(where, mass, 0.0)
     whole = comm.allreduce(loaded.sum())
-    return loaded[:, None] / whole * np.array([*total])
+    force: Rows = loaded[:, None] / whole * np.array([*total])
+    return force

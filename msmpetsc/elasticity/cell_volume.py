@@ -11,13 +11,14 @@ loops sum the corners: ``CellScatter`` on a CPU, ``CellGather`` on a GPU, which 
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.elasticity.springs import Product
+from msmpetsc.elasticity.springs import Product, Vector, between
 from msmpetsc.lattice.lattice import Lattice
 
 # each corner of a cell (VTK's order), then the corners at the far ends of its three edges, right-handed
@@ -29,48 +30,43 @@ FRAMES = np.array(
 ROLE = np.full((8, 8), -1)
 np.put_along_axis(ROLE, FRAMES, np.arange(4)[None, :], axis=1)
 
-Vector = tuple[float, float, float]
+Frame = tuple[Vector, Vector, Vector]  # of a corner's three edges, one each
 
 
 @numba.njit(cache=True, inline="always")
-def _between(q, a, b):
-    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
-
-
-@numba.njit(cache=True, inline="always")
-def _cross(a, b):
+def _cross(a: Vector, b: Vector) -> Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @numba.njit(cache=True, inline="always")
-def _dot(a, b):
+def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @numba.njit(cache=True, inline="always")
-def _sum(a, b, c):
+def _sum(a: Vector, b: Vector, c: Vector) -> Vector:
     return a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2]
 
 
 @numba.njit(cache=True)
-def edges(q: Positions, cell: Indices, frame: int) -> tuple[Vector, Vector, Vector]:
+def edges(q: Positions, cell: Indices, frame: int) -> Frame:
     """Return the edges [m] from a corner of a cell to the far ends of its three edges."""
     corner = cell[FRAMES[frame, 0]]
     return (
-        _between(q, corner, cell[FRAMES[frame, 1]]),
-        _between(q, corner, cell[FRAMES[frame, 2]]),
-        _between(q, corner, cell[FRAMES[frame, 3]]),
+        between(q, corner, cell[FRAMES[frame, 1]]),
+        between(q, corner, cell[FRAMES[frame, 2]]),
+        between(q, corner, cell[FRAMES[frame, 3]]),
     )
 
 
 @numba.njit(cache=True)
-def cofactors(e: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
+def cofactors(e: Frame) -> Frame:
     """Return the slopes of the volume of three edges [m^2], one for each edge."""
     return _cross(e[1], e[2]), _cross(e[2], e[0]), _cross(e[0], e[1])
 
 
 @numba.njit(cache=True)
-def _volume(a, b, c):
+def _volume(a: Vector, b: Vector, c: Vector) -> float:
     """Return a . (b x c)."""
     return _dot(a, _cross(b, c))
 
@@ -82,7 +78,7 @@ def lack_of(volume: float, least: float) -> float:
 
 
 @numba.njit(cache=True)
-def corner_change(q, base, cell, frame, resistance, least):
+def corner_change(q: Positions, base: Positions, cell: Indices, frame: int, resistance: float, least: float) -> float:
     """Return the energy of a corner at q less that at base [J].
 
     It comes from how the nodes moved, so that a small change keeps its digits: with d_k = e_k - e'_k,
@@ -105,7 +101,7 @@ def corner_change(q, base, cell, frame, resistance, least):
 
 
 @numba.njit(cache=True, inline="always")
-def _farther(q, base, a, b):
+def _farther(q: Positions, base: Positions, a: int, b: int) -> Vector:
     """Return how an edge changed, from how its ends moved."""
     return (
         (q[b, 0] - base[b, 0]) - (q[a, 0] - base[a, 0]),
@@ -115,14 +111,14 @@ def _farther(q, base, a, b):
 
 
 @numba.njit(cache=True)
-def corner_slope(e, n, resistance, least):
+def corner_slope(e: Frame, n: Frame, resistance: float, least: float) -> float:
     """Return d energy / d volume of a corner with the edges e and cofactors n [N/m^2]: not positive."""
     lack = max(lack_of(_dot(e[0], n[0]), least), 0.0)
     return -3.0 * resistance * lack * lack / least
 
 
 @numba.njit(cache=True)
-def corner_product(e, n, w, resistance, least, projected):
+def corner_product(e: Frame, n: Frame, w: Frame, resistance: float, least: float, projected: bool) -> Frame:
     """Return the product of a corner's Hessian with changes w of its edges, one vector for each edge [N].
 
     projected : without what the curvature of J adds
@@ -140,7 +136,7 @@ def corner_product(e, n, w, resistance, least, projected):
 
 
 @numba.njit(cache=True, inline="always")
-def _turned(change, n, slope, w_1, e_2, e_1, w_2):
+def _turned(change: float, n: Vector, slope: float, w_1: Vector, e_2: Vector, e_1: Vector, w_2: Vector) -> Vector:
     """Return change n + slope (w_1 x e_2 + e_1 x w_2)."""
     a, b = _cross(w_1, e_2), _cross(e_1, w_2)
     return (
@@ -153,21 +149,23 @@ def _turned(change, n, slope, w_1, e_2, e_1, w_2):
 @numba.njit(cache=True)
 def least_volume(q: Positions, c: Indices) -> float:
     """Return the least of the eight corner volumes of a cell [m^3]; each edge is read once."""
-    x0, x1, x2, x3 = _between(q, c[0], c[1]), _between(q, c[3], c[2]), _between(q, c[4], c[5]), _between(q, c[7], c[6])
-    y0, y1, y2, y3 = _between(q, c[0], c[3]), _between(q, c[1], c[2]), _between(q, c[4], c[7]), _between(q, c[5], c[6])
-    z0, z1, z2, z3 = _between(q, c[0], c[4]), _between(q, c[1], c[5]), _between(q, c[2], c[6]), _between(q, c[3], c[7])
+    x0, x1, x2, x3 = between(q, c[0], c[1]), between(q, c[3], c[2]), between(q, c[4], c[5]), between(q, c[7], c[6])
+    y0, y1, y2, y3 = between(q, c[0], c[3]), between(q, c[1], c[2]), between(q, c[4], c[7]), between(q, c[5], c[6])
+    z0, z1, z2, z3 = between(q, c[0], c[4]), between(q, c[1], c[5]), between(q, c[2], c[6]), between(q, c[3], c[7])
     volume = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
-    return min(volume, _volume(x2, y2, z0), _volume(x2, y3, z1), _volume(x3, y3, z2), _volume(x3, y2, z3))
+    return float(min(volume, _volume(x2, y2, z0), _volume(x2, y3, z1), _volume(x3, y3, z2), _volume(x3, y2, z3)))
 
 
 @kernel
-def _least_volume_of(first, count, step, q, cells, least):
+def _least_volume_of(first: int, count: int, step: int, q: Positions, cells: Indices, least: Floats) -> None:
     for i in range(first, count, step):
         least[i] = least_volume(q, cells[i])
 
 
 @kernel
-def _energy_of(first, count, step, q, cells, resistance, least, parts):
+def _energy_of(
+    first: int, count: int, step: int, q: Rows, cells: Indices, resistance: Floats, least: float, parts: Floats
+) -> None:
     for i in range(first, count, step):
         energy = 0.0
         for frame in range(8):
@@ -178,12 +176,14 @@ def _energy_of(first, count, step, q, cells, resistance, least, parts):
 
 
 @kernel
-def _change_of(first, count, step, q, base, cells, resistance, least, parts):
+def _change_of(
+    first: int, count: int, step: int, q: Rows, base: Rows, cells: Indices, stiffness: Floats, least: float, parts: Rows
+) -> None:
     for i in range(first, count, step):
         change = 0.0
         if min(least_volume(q, cells[i]), least_volume(base, cells[i])) < least:  # of few; it reads each edge once
             for frame in range(8):
-                change += corner_change(q, base, cells[i], frame, resistance[i], least)
+                change += corner_change(q, base, cells[i], frame, stiffness[i], least)
         parts[i] = change
 
 
@@ -194,39 +194,39 @@ def least_volumes(q: Positions, cells: Indices) -> Floats:
     return least
 
 
-def inverted_cells(q: Positions, cells: Indices) -> tuple[int, int, float]:
-    """Return how many cells are inverted, which has the least corner volume (-1 without cells), and that [m^3]."""
-    if not len(cells):
-        return 0, -1, np.inf
-    least = least_volumes(q, cells)
-    worst = int(least.argmin())
-    return int((least <= 0).sum()), worst, float(least[worst])
+class Resistance(NamedTuple):
+    """Cells that resist: their local corner nodes (c, 8), K (c,) [J] of each, and J_0 h^3 [m^3]."""
+
+    cells: Indices
+    stiffness: Floats
+    volume: float
 
 
-def resistance_energy(q: Positions, cells: Indices, resistance: Floats, volume: float) -> float:
-    """Return the energy [J]. resistance: K (c,) [J]; volume: J_0 h^3 [m^3]."""
-    parts = np.empty(len(cells), like=q)
-    _energy_of(len(cells), q, cells, resistance, volume, parts)
+def resistance_energy(q: Positions, law: Resistance) -> float:
+    """Return the energy [J]."""
+    parts = np.empty(len(law.cells), like=q)
+    _energy_of(len(parts), q, *law, parts)
     return float(parts.sum())
 
 
-def resistance_change(q: Positions, base: Positions, cells: Indices, resistance: Floats, volume: float) -> float:
+def resistance_change(q: Positions, base: Positions, law: Resistance) -> float:
     """Return the energy at q less that at base [J], summed corner by corner so that a small change keeps its digits."""
-    parts = np.empty(len(cells), like=q)
-    _change_of(len(cells), q, base, cells, resistance, volume, parts)
+    parts = np.empty(len(law.cells), like=q)
+    _change_of(len(parts), q, base, *law, parts)
     return float(parts.sum())
 
 
 @numba.njit(cache=True, inline="always")
-def _add(rows, row, factor, vector):
+def _add(rows: Rows, row: int, factor: float, vector: Vector) -> None:
     rows[row, 0] += factor * vector[0]
     rows[row, 1] += factor * vector[1]
     rows[row, 2] += factor * vector[2]
 
 
 @numba.njit(cache=True)
-def _add_corner(rows, cell, frame, factor, a, b, c):
+def _add_corner(rows: Rows, cell: Indices, frame: int, factor: float, vectors: Frame) -> None:
     """Three vectors to the far ends of a corner's edges, and what balances them to the corner."""
+    a, b, c = vectors
     _add(rows, cell[FRAMES[frame, 1]], factor, a)
     _add(rows, cell[FRAMES[frame, 2]], factor, b)
     _add(rows, cell[FRAMES[frame, 3]], factor, c)
@@ -234,39 +234,33 @@ def _add_corner(rows, cell, frame, factor, a, b, c):
 
 
 @numba.njit(cache=True)
-def add_resistance_gradient(q: Positions, cells: Indices, resistance: Floats, volume: float, gradient: Rows) -> None:
+def add_resistance_gradient(q: Positions, law: Resistance, gradient: Rows) -> None:
     """Add the gradient [N] to ``gradient`` (l, 3)."""
+    cells, stiffness, volume = law
     for i in range(len(cells)):
         for frame in range(8):
             e = edges(q, cells[i], frame)
             n = cofactors(e)
-            slope = corner_slope(e, n, resistance[i], volume)
+            slope = corner_slope(e, n, stiffness[i], volume)
             if slope < 0.0:
-                _add_corner(gradient, cells[i], frame, slope, n[0], n[1], n[2])
+                _add_corner(gradient, cells[i], frame, slope, n)
 
 
 @numba.njit(cache=True)
-def add_resistance_hessian(
-    q: Positions,
-    cells: Indices,
-    resistance: Floats,
-    volume: float,
-    projected: bool,
-    v: Rows,
-    product: Rows,
-) -> None:
+def add_resistance_hessian(q: Positions, law: Resistance, projected: bool, v: Rows, product: Rows) -> None:
     """Add (Hessian at q) v [N] to ``product`` (l, 3); ``projected`` leaves out what the curvature of J adds."""
+    cells, stiffness, volume = law
     for i in range(len(cells)):
         for frame in range(8):
             e = edges(q, cells[i], frame)
             n = cofactors(e)
-            if corner_slope(e, n, resistance[i], volume) < 0.0:
-                p = corner_product(e, n, edges(v, cells[i], frame), resistance[i], volume, projected)
-                _add_corner(product, cells[i], frame, 1.0, p[0], p[1], p[2])
+            if corner_slope(e, n, stiffness[i], volume) < 0.0:
+                p = corner_product(e, n, edges(v, cells[i], frame), stiffness[i], volume, projected)
+                _add_corner(product, cells[i], frame, 1.0, p)
 
 
 @numba.njit(cache=True)
-def corner_curvature(e: tuple[Vector, Vector, Vector], n: Vector, resistance: float, least: float) -> float:
+def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> float:
     """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors [N/m^5]: not
     negative, and 0 where it does not resist."""
     return 6.0 * resistance * max(lack_of(_dot(e[0], n), least), 0.0) / least**2
@@ -281,20 +275,21 @@ def add_square(block: Floats, factor: float, g: Vector) -> None:
 
 
 @numba.njit(cache=True)
-def add_resistance_bound(q: Positions, cells: Indices, resistance: Floats, volume: float, blocks: Rows) -> None:
+def add_resistance_bound(q: Positions, law: Resistance, blocks: Rows) -> None:
     """Add twice the diagonal blocks of the Hessian at q, without what the curvature of J adds, to ``blocks`` (l, 9)."""
+    cells, stiffness, volume = law
     for i in range(len(cells)):
         for frame in range(8):
             e = edges(q, cells[i], frame)
             n = cofactors(e)
-            curvature = corner_curvature(e, n[0], resistance[i], volume)
+            curvature = corner_curvature(e, n[0], stiffness[i], volume)
             if curvature > 0.0:
                 for role in range(4):
                     add_square(blocks[cells[i, FRAMES[frame, role]]], 2.0 * curvature, vector_of(role, n))
 
 
 @numba.njit(cache=True)
-def vector_of(role, vectors):
+def vector_of(role: int, vectors: Frame) -> Vector:
     """Return, of three vectors at the far ends of a corner's edges, that of a role; the corner's balances them."""
     a, b, c = vectors
     if role == 0:
@@ -306,34 +301,30 @@ def vector_of(role, vectors):
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a rank that resist.
+    """The cells of a rank that resist: all that its nodes are corners of, and those that it ``owns``."""
 
-    cells      : (c, 8) local corner nodes; the first ``cells_owned`` belong to this rank
-    resistance : K (c,) [J]
-    volume     : J_0 h^3 [m^3]
-    """
-
-    cells: Indices
-    cells_owned: int
-    resistance: Floats
-    volume: float
+    law: Resistance
+    owned: Resistance
 
     @property
-    def _owned(self) -> tuple[Indices, Floats, float]:
-        return self.cells[: self.cells_owned], self.resistance[: self.cells_owned], self.volume
-
-    @property
-    def law(self) -> tuple[Indices, Floats, float]:
-        """What a kernel takes of each cell: its corners and its K; and J_0 h^3."""
-        return self.cells, self.resistance, self.volume
+    def cells(self) -> Indices:
+        """Local corner nodes (c, 8)."""
+        return self.law.cells
 
     def energy(self, q: Positions) -> float:
         """Return the energy [J] of the cells that this rank owns."""
-        return resistance_energy(q, *self._owned)
+        return resistance_energy(q, self.owned)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy at q less that at base [J], of the cells that this rank owns."""
-        return resistance_change(q, base, *self._owned)
+        return resistance_change(q, base, self.owned)
+
+
+def _laws_of(lattice: Lattice, stiffness: Floats, volume: float) -> tuple[Resistance, Resistance]:
+    """Return the cells around the nodes of a rank, and those that it owns."""
+    owned = slice(lattice.cells_owned)
+    cells = lattice.local_cells
+    return Resistance(cells, stiffness, volume), Resistance(cells[owned], stiffness[owned], volume)
 
 
 @dataclass(frozen=True)
@@ -341,27 +332,26 @@ class CellScatter(Cells):
     """The cells one after another, those that the rank owns first: how a CPU sums them."""
 
     @classmethod
-    def of_lattice(cls, lattice: Lattice, resistance: Floats, volume: float) -> "CellScatter":
+    def of_lattice(cls, lattice: Lattice, stiffness: Floats, volume: float) -> "CellScatter":
         """Return the cells of a lattice whose arrays are in the memory of the CPU."""
-        return cls(lattice.local_cells, lattice.cells_owned, resistance, volume)
+        return cls(*_laws_of(lattice, stiffness, volume))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to ``gradient`` (l, 3)."""
-        add_resistance_gradient(q, *self.law, gradient)
+        add_resistance_gradient(q, self.law, gradient)
 
-    def resisting(self, q: Positions) -> Indices:
-        """Return which cells (r,) resist at q: few, so that products with the Hessian need not visit the others."""
-        return np.flatnonzero(least_volumes(q, self.cells) < self.volume)
+    def resisting(self, q: Positions) -> Resistance:
+        """Return the cells that resist at q: few, so that products with the Hessian need not visit the others."""
+        few = np.flatnonzero(least_volumes(q, self.cells) < self.law.volume)
+        return Resistance(self.cells[few], self.law.stiffness[few], self.law.volume)
 
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
         """Return what adds (Hessian at q) v [N] to its second argument."""
-        few = self.resisting(q)
-        return partial(add_resistance_hessian, q.copy(), self.cells[few], self.resistance[few], self.volume, projected)
+        return partial(add_resistance_hessian, q.copy(), self.resisting(q), projected)
 
     def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
-        few = self.resisting(q)
-        add_resistance_bound(q, self.cells[few], self.resistance[few], self.volume, blocks)
+        add_resistance_bound(q, self.resisting(q), blocks)
 
 
 @dataclass(frozen=True)
@@ -376,7 +366,7 @@ class CellGather(Cells):
     corner: Array
 
     @classmethod
-    def of_lattice(cls, lattice: Lattice, resistance: Floats, volume: float) -> "CellGather":
+    def of_lattice(cls, lattice: Lattice, stiffness: Floats, volume: float) -> "CellGather":
         """Return the cells of a lattice, in the memory that its nodes are in."""
         nodes, owned = to_host(lattice.local_cells).ravel(), lattice.owned
         by_node = np.argsort(nodes, kind="stable")
@@ -385,8 +375,8 @@ class CellGather(Cells):
         slot = np.arange(len(node)) - np.searchsorted(node, node)
         around, corner = np.full((8, owned), -1, np.int32), np.zeros((8, owned), np.uint8)
         around[slot, node], corner[slot, node] = by_node // 8, by_node % 8
-        resistance, around, corner = (like(lattice.nodes, a) for a in (resistance, around, corner))
-        return cls(lattice.local_cells, lattice.cells_owned, resistance, volume, around, corner)
+        stiffness, around, corner = (like(lattice.nodes, a) for a in (stiffness, around, corner))
+        return cls(*_laws_of(lattice, stiffness, volume), around, corner)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] to the owned rows of ``gradient``."""

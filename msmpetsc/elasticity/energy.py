@@ -57,7 +57,7 @@ class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
     It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening ones and of cells that
-    resist being turned inside out (elasticity.inversion).
+    resist being turned inside out (elasticity.cell_volume).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
     owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
@@ -101,7 +101,7 @@ class Elasticity:
         """Return whether a cell of this rank resists at q, whose Hessian then may have negative parts."""
         if self.cells is None or not len(self.cells.cells):
             return False
-        return bool(least_volumes(q, self.cells.cells).min() < self.cells.volume)
+        return bool(least_volumes(q, self.cells.cells).min() < self.cells.law.volume)
 
     def hessian_at(self, q: Positions, projected: bool = False, dtype: type = np.float64) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].

@@ -4,7 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
-from msmpetsc.elasticity.cell_volume import inverted_cells
+from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -25,14 +25,16 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> tuple[int, str]:
     """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective)."""
     cells = lattice.local_cells[: lattice.cells_owned]
-    count, worst, least = inverted_cells(q, cells)
-    total = comm.allreduce(count)
+    volumes = least_volumes(q, cells)
+    total = comm.allreduce(int((volumes <= 0).sum()))
     if not total:
         return 0, ""
-    number, point = 0, np.zeros(3)
-    if worst >= 0:
-        number, point = lattice.global_numbers[int(cells[worst][0])], to_host(lattice.nodes[cells[worst]].mean(axis=0))
-    _, number, point = min(comm.allgather((least, number, point)), key=lambda candidate: candidate[0])
+    candidate = np.inf, 0, np.zeros(3)
+    if len(cells):
+        worst = int(volumes.argmin())
+        point = to_host(lattice.nodes[cells[worst]].mean(axis=0))
+        candidate = float(volumes[worst]), lattice.global_numbers[int(cells[worst][0])], point
+    _, number, point = min(comm.allgather(candidate), key=lambda candidate: candidate[0])
     return total, rest_point(lattice, number, point)
 
 

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -26,6 +27,7 @@ from msmpetsc.backend.kernel import kernel
 from msmpetsc.lattice.lattice import Lattice
 
 Product = Callable[[Array, Array], None]  # adds (a Hessian) v [N] to the second argument
+Vector = tuple[float, float, float]
 
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])  # where the 9 numbers of a symmetric block stand among 6
 
@@ -99,108 +101,96 @@ def block_product(
     return c * dx + along * ex, c * dy + along * ey, c * dz + along * ez
 
 
-@dataclass(frozen=True)
-class SpringScatter:
-    """The springs of a rank one after another, those that it owns first: how a CPU sums them.
+class Springs(NamedTuple):
+    """Springs of one law: local ends (s, 2), rest lengths (s,) [m], stiffnesses (s,) [N/m], and b of the law [-]."""
 
-    springs       : (s, 2) local ends; the first ``springs_owned`` belong to this rank
-    rest_length   : (s,) [m]
-    stiffness     : (s,) [N/m]
-    stiffening    : b of the law [-]
-    """
-
-    springs: Indices
+    ends: Indices
     rest_length: Floats
     stiffness: Floats
     stiffening: float
-    springs_owned: int
+
+
+@dataclass(frozen=True)
+class SpringScatter:
+    """The springs of a rank one after another, those that it ``owns`` first: how a CPU sums them."""
+
+    springs: Springs
+    owned: Springs
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringScatter":
         """Return the springs of a lattice whose arrays are in the memory of the CPU."""
-        return cls(lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening, lattice.springs_owned)
-
-    @property
-    def _all(self) -> tuple[Indices, Floats, Floats, float]:
-        return self.springs, self.rest_length, self.stiffness, self.stiffening
-
-    @property
-    def _owned(self) -> tuple[Indices, Floats, Floats, float]:
-        owned = slice(self.springs_owned)
-        return self.springs[owned], self.rest_length[owned], self.stiffness[owned], self.stiffening
+        springs = Springs(lattice.springs, lattice.rest_length, lattice.stiffness, lattice.stiffening)
+        owned = slice(lattice.springs_owned)
+        own = Springs(springs.ends[owned], springs.rest_length[owned], springs.stiffness[owned], lattice.stiffening)
+        return cls(springs, own)
 
     def energy(self, q: Positions) -> float:
         """Return E [J] of the springs that this rank owns."""
-        return elastic_energy(q, *self._owned)
+        return elastic_energy(q, self.owned)
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of the springs that this rank owns."""
-        return elastic_change(q, base, *self._owned)
+        return elastic_change(q, base, self.owned)
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
-        add_elastic_gradient(q, *self._all, gradient)
+        add_elastic_gradient(q, self.springs, gradient)
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to ``concavity`` (l,) [N/m] what ``add_spring_concavity`` does."""
-        add_spring_concavity(q, *self._all, concavity)
+        add_spring_concavity(q, self.springs, concavity)
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
         """Return what adds (Hessian of E at q) v [N] to its second argument; its blocks are stored."""
-        blocks: Rows = np.empty((len(self.springs), 4), dtype)
-        elastic_hessian(q, *self._all, projected, blocks)
-        return partial(add_elastic_product, self.springs, blocks)
+        blocks: Rows = np.empty((len(self.springs.ends), 4), dtype)
+        elastic_hessian(q, self.springs, projected, blocks)
+        return partial(add_elastic_product, self.springs.ends, blocks)
 
     def add_half_bound(self, q: Positions, blocks: Rows) -> None:
         """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
-        add_elastic_diagonal(q, *self._all, blocks)
+        add_elastic_diagonal(q, self.springs, blocks)
+
+
+@numba.njit(cache=True, inline="always")
+def between(q: Positions, a: int, b: int) -> Vector:
+    """Return the way from node a to node b."""
+    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
 
 
 @numba.njit(cache=True)
-def elastic_energy(q: Positions, springs: Indices, rest_length: Floats, stiffness: Floats, stiffening: float) -> float:
+def elastic_energy(q: Positions, springs: Springs) -> float:
     """Return the sum of 1/2 k (|p1 - p2| - r)^2 over springs (Eq. 13), and of what stiffening adds, [J]."""
+    ends, rest_length, stiffness, stiffening = springs
     energy = 0.0
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+    for s in range(len(ends)):
+        x, y, z = between(q, ends[s, 1], ends[s, 0])
         energy += spring_energy(x, y, z, rest_length[s], stiffness[s], stiffening)
     return energy
 
 
 @numba.njit(cache=True)
-def elastic_change(
-    q: Positions,
-    base: Positions,
-    springs: Indices,
-    rest_length: Floats,
-    stiffness: Floats,
-    stiffening: float,
-) -> float:
+def elastic_change(q: Positions, base: Positions, springs: Springs) -> float:
     """Return E(q) - E(base) [J], summed spring by spring so that a small change keeps its digits."""
+    ends, rest_length, stiffness, stiffening = springs
     change = 0.0
     moved = q - base
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        u, v, w = base[a, 0] - base[b, 0], base[a, 1] - base[b, 1], base[a, 2] - base[b, 2]
+    for s in range(len(ends)):
+        u, v, w = between(base, ends[s, 1], ends[s, 0])
         # how the ends moved, from node to node: a difference of springs would keep only the digits of a spring
-        dx, dy, dz = moved[a, 0] - moved[b, 0], moved[a, 1] - moved[b, 1], moved[a, 2] - moved[b, 2]
+        dx, dy, dz = between(moved, ends[s, 1], ends[s, 0])
         change += spring_change(u, v, w, dx, dy, dz, rest_length[s], stiffness[s], stiffening)
     return change
 
 
 @numba.njit(cache=True)
-def add_elastic_gradient(
-    q: Positions,
-    springs: Indices,
-    rest_length: Floats,
-    stiffness: Floats,
-    stiffening: float,
-    gradient: Rows,
-) -> None:
+def add_elastic_gradient(q: Positions, springs: Springs, gradient: Rows) -> None:
     """Add grad E [N] to ``gradient`` (l, 3); without stiffening it is L x - J d(x) (Eq. 14-15)."""
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+    ends, rest_length, stiffness, stiffening = springs
+    for s in range(len(ends)):
+        a = ends[s, 0]
+        b = ends[s, 1]
+        x, y, z = between(q, b, a)
         f = spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening)
         gradient[a, 0] += f * x
         gradient[a, 1] += f * y
@@ -211,100 +201,62 @@ def add_elastic_gradient(
 
 
 @numba.njit(cache=True)
-def add_spring_concavity(
-    q: Positions,
-    springs: Indices,
-    rest_length: Floats,
-    stiffness: Floats,
-    stiffening: float,
-    concavity: Floats,
-) -> None:
+def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> None:
     """Add to ``concavity`` (l,) [N/m], at both ends of each compressed spring, twice what it pushes across itself.
 
     With d = v_a - v_b a spring's Hessian c I + e e^T makes, for c < 0,
     c |d|^2 + (e . d)^2 >= -2 |c| (|v_a|^2 + |v_b|^2).
     """
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+    ends, rest_length, stiffness, stiffening = springs
+    for s in range(len(ends)):
+        x, y, z = between(q, ends[s, 1], ends[s, 0])
         push = -2.0 * min(spring_pull(x, y, z, rest_length[s], stiffness[s], stiffening), 0.0)
-        concavity[a] += push  # also where there is none: to step over these takes longer
-        concavity[b] += push
+        concavity[ends[s, 0]] += push  # also where there is none: to step over these takes longer
+        concavity[ends[s, 1]] += push
 
 
 @numba.njit(cache=True)
-def elastic_hessian(
-    q: Positions,
-    springs: Indices,
-    rest_length: Floats,
-    stiffness: Floats,
-    stiffening: float,
-    projected: bool,
-    blocks: Rows,
-) -> None:
+def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Rows) -> None:
     """Write the Hessian of E at q as the c and e of ``spring_block`` into ``blocks`` (s, 4).
 
     projected : makes the whole positive semidefinite
     """
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
-        c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, projected)
-        blocks[s, 0], blocks[s, 1], blocks[s, 2], blocks[s, 3] = c, ex, ey, ez
+    ends, rest_length, stiffness, stiffening = springs
+    for s in range(len(ends)):
+        x, y, z = between(q, ends[s, 1], ends[s, 0])
+        block = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, projected)
+        for i in range(4):
+            blocks[s, i] = block[i]
 
 
 @numba.njit(cache=True)
-def add_elastic_diagonal(
-    q: Positions,
-    springs: Indices,
-    rest_length: Floats,
-    stiffness: Floats,
-    stiffening: float,
-    blocks: Rows,
-) -> None:
+def add_elastic_diagonal(q: Positions, springs: Springs, blocks: Rows) -> None:
     """Add the diagonal blocks of the projected Hessian of E at q to ``blocks`` (l, 9) [N/m]."""
+    ends, rest_length, stiffness, stiffening = springs
     sums = np.zeros((len(blocks), 6))  # xx, xy, xz, yy, yz, zz
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
-        x, y, z = q[a, 0] - q[b, 0], q[a, 1] - q[b, 1], q[a, 2] - q[b, 2]
+    for s in range(len(ends)):
+        x, y, z = between(q, ends[s, 1], ends[s, 0])
         c, ex, ey, ez = spring_block(x, y, z, rest_length[s], stiffness[s], stiffening, True)
-        xx, xy, xz, yy, yz, zz = c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez
-        for i in (a, b):
-            sums[i, 0] += xx
-            sums[i, 1] += xy
-            sums[i, 2] += xz
-            sums[i, 3] += yy
-            sums[i, 4] += yz
-            sums[i, 5] += zz
+        block = (c + ex * ex, ex * ey, ex * ez, c + ey * ey, ey * ez, c + ez * ez)
+        for end in range(2):
+            for entry in range(6):
+                sums[ends[s, end], entry] += block[entry]
     for i in range(len(blocks)):
         for entry in range(9):
             blocks[i, entry] += sums[i, SYMMETRIC[entry]]
 
 
 @numba.njit(cache=True)
-def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -> None:
-    """Add c I + e e^T to a block (9,)."""
-    block[0] += c + ex * ex
-    block[1] += ex * ey
-    block[2] += ex * ez
-    block[3] += ex * ey
-    block[4] += c + ey * ey
-    block[5] += ey * ez
-    block[6] += ex * ez
-    block[7] += ey * ez
-    block[8] += c + ez * ez
-
-
-@numba.njit(cache=True)
-def add_elastic_product(springs: Indices, blocks: Rows, v: Rows, product: Rows) -> None:
+def add_elastic_product(ends: Indices, blocks: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian of E) v [N] to ``product`` (l, 3), its ``blocks`` those of elastic_hessian.
 
     Springs of the same first end follow each other: what they have in common is read and written once.
     """
     none = v.dtype.type(0)  # so that single precision stays single
     first, x, y, z, sx, sy, sz = -1, none, none, none, none, none, none
-    for s in range(len(springs)):
-        a, b = springs[s, 0], springs[s, 1]
+    for s in range(len(ends)):
+        a = ends[s, 0]
+        b = ends[s, 1]
         if a != first:
             if first >= 0:
                 product[first, 0] += sx
@@ -323,6 +275,20 @@ def add_elastic_product(springs: Indices, blocks: Rows, v: Rows, product: Rows) 
         product[first, 0] += sx
         product[first, 1] += sy
         product[first, 2] += sz
+
+
+@numba.njit(cache=True)
+def add_spring_block(block: Floats, c: float, ex: float, ey: float, ez: float) -> None:
+    """Add c I + e e^T to a block (9,)."""
+    block[0] += c + ex * ex
+    block[1] += ex * ey
+    block[2] += ex * ez
+    block[3] += ex * ey
+    block[4] += c + ey * ey
+    block[5] += ey * ez
+    block[6] += ex * ez
+    block[7] += ey * ez
+    block[8] += c + ez * ez
 
 
 @dataclass(frozen=True)

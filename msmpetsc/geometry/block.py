@@ -11,17 +11,20 @@ axes in cyclic order. An edge is (axis, i, j, k): cell i along its axis, nodes j
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Indices, Mask
+
 ITSELF = 13  # entry of the cell among its 27
 CELL_STRIDE = np.array([9, 3, 1])
 NODE_STRIDE = np.array([16, 4, 1])
 OUTSIDE = 27  # stands for every cell out of the block
 
 
-def _entry(stride, axis, i, j, k):
-    return i * stride[axis] + j * stride[(axis + 1) % 3] + k * stride[(axis + 2) % 3]
+def _entry(stride: Indices, axis: Indices, i: Indices, j: Indices, k: Indices) -> Indices:
+    entry: Indices = i * stride[axis] + j * stride[(axis + 1) % 3] + k * stride[(axis + 2) % 3]
+    return entry
 
 
-def _edge(axis, i, j, k):
+def _edge(axis: Indices, i: Indices, j: Indices, k: Indices) -> Indices:
     return ((axis % 3 * 3 + i) * 4 + j) * 4 + k
 
 
@@ -56,19 +59,19 @@ OF_CORNER = np.nonzero(AROUND[:, CELLS].any(2))[1].reshape(8, 36).copy()  # the 
 
 
 @numba.njit(cache=True)
-def corner_bit(v, axis):
+def corner_bit(v: int, axis: int) -> int:
     """Return the coordinate, 0 or 1, of corner v along an axis."""
     return (v >> (2 - axis)) & 1
 
 
 @numba.njit(cache=True)
-def corner_node(v):
+def corner_node(v: int) -> int:
     """Return the entry of corner v among the 64 nodes."""
     return 16 * (1 + corner_bit(v, 0)) + 4 * (1 + corner_bit(v, 1)) + 1 + corner_bit(v, 2)
 
 
 @numba.njit(cache=True)
-def cells_around(v, valid):
+def cells_around(v: int, valid: Mask) -> int:
     """Return which of the 8 cells around corner v are valid: bit 4i + 2j + k for the cell at (i,j,k) in {0,1}^3."""
     first = 9 * corner_bit(v, 0) + 3 * corner_bit(v, 1) + corner_bit(v, 2)
     mask = 0
@@ -79,14 +82,14 @@ def cells_around(v, valid):
 
 
 @numba.njit(cache=True)
-def smoothstep(z):
+def smoothstep(z: float) -> float:
     """Return z^2 (3 - 2z) on [0,1], constant beyond: its slope is 0 at both ends."""
     z = min(max(z, 0.0), 1.0)
     return z * z * (3.0 - 2.0 * z)
 
 
 @numba.njit(cache=True)
-def corner_blend(v, u):
+def corner_blend(v: int, u: Floats) -> float:
     """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
 
     It sums to 1 over the 8 corners.

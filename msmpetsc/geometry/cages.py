@@ -31,7 +31,7 @@ MARK = {"exact": touched_cells, "sample": sampled_cells}
 
 
 @dataclass(frozen=True)
-class Body:
+class BodySurface:
     """What all ranks know of a surface, and on rank 0 the surface itself.
 
     bounds : (2, 3) bounding box [m]
@@ -85,11 +85,15 @@ class SlabCells:
 
     def count(self, comm: MPI.Comm) -> int:
         """Return the number of valid cells on all ranks (collective)."""
-        return comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum()))
+        return int(comm.allreduce(len(self.boundary) + int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())))
 
 
 def fill(
-    bodies: Sequence[Body], cell_size: float, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[BodySurface],
+    cell_size: float,
+    method: str = "exact",
+    max_cells: int = 5_000_000,
+    boundary: str = "fill",
 ) -> Cages:
     """Return the valid cells of side ``cell_size`` [m] of all bodies (collective).
 
@@ -114,7 +118,7 @@ def fill(
     return Cages(grids, table, route.send(kind)[order], share, fills)
 
 
-def _cells_of(body: Body, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Rows | None]:
+def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Rows | None]:
     """Return grid index (n, 3), kind (n,) and shares (n, 2, 2, 2) of this rank's cells of a body (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
@@ -123,7 +127,7 @@ def _cells_of(body: Body, grid: Grid, cells: SlabCells, boundary: str) -> tuple[
     return ijk, kind, None if share is None else np.concatenate([share, np.ones((len(interior), 2, 2, 2))])
 
 
-def _share(body: Body, grid: Grid, cells: SlabCells) -> Rows | None:
+def _share(body: BodySurface, grid: Grid, cells: SlabCells) -> Rows | None:
     """Return the shares (b, 2, 2, 2) of boundary cells; None, with a warning, if the surface does not tell."""
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
@@ -137,41 +141,37 @@ def _share(body: Body, grid: Grid, cells: SlabCells) -> Rows | None:
 
 
 def slabs_of_all(
-    bodies: Sequence[Body], grids: BodyGrids, method: str, max_cells: int, boundary: str
+    bodies: Sequence[BodySurface], grids: BodyGrids, method: str, max_cells: int, boundary: str
 ) -> list[SlabCells]:
     """Return the valid cells of this rank's slab of each body (collective); arguments as of ``fill``."""
     found: list[SlabCells] = []
-    before = 0
+    comm, before = bodies[0].comm, 0
     for body, grid in zip(bodies, grids.grids, strict=True):
-        found.append(slab_cells(body, grid, method, max_cells, boundary, before))
-        before += found[-1].count(body.comm)
+        least = before + _least_cells(body, grid)
+        _refuse_above(max_cells, least, grid)
+        refuse_beyond_memory(comm, least)
+        found.append(_slab_cells(body, grid, method, boundary))
+        before += found[-1].count(comm)
+        _refuse_above(max_cells, before, grid)
     return found
 
 
-def slab_cells(body: Body, grid: Grid, method: str, max_cells: int, boundary: str, before: int = 0) -> SlabCells:
-    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``.
-
-    before : number of cells of other bodies, which count, too
-    """
+def _slab_cells(body: BodySurface, grid: Grid, method: str, boundary: str) -> SlabCells:
+    """Return the valid cells of this rank's slab (collective); arguments as of ``fill``."""
     axes = _axes(body)
     slab = Slab.of_rank(body.comm.rank, body.comm.size, int(grid.shape[axes[0]]))
-    _refuse_above(max_cells, before + _least_cells(body, grid), grid)
-    refuse_beyond_memory(body.comm, before + _least_cells(body, grid))
     corners = _slab_triangles(body, grid, axes)
     touched = _mark(corners, grid.shape[axes], slab, method)
-    if body.report.closed:
-        gaps = enclosed_gaps(body.comm, touched, slab)
-    else:
-        gaps = _gaps_by_winding(body, grid, axes, slab, touched)
-    columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" and body.report.closed else None
+    if not body.report.closed:
+        return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
+    gaps = enclosed_gaps(body.comm, touched, slab)
+    columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" else None
     if columns is not None:  # a cave that a surface of its own bounds is enclosed, but not inside
         gaps = gaps[columns.corner_shares(gaps[:, [0, 1, 3]])[:, 0, 0, 0] > OUTSIDE]
-    cells = SlabCells(touched, gaps, columns)
-    _refuse_above(max_cells, before + cells.count(body.comm), grid)
-    return cells
+    return SlabCells(touched, gaps, columns)
 
 
-def _columns(body: Body, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
+def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
     """Return what the triangles cut out of this rank's cells, None if they are not wound one way (collective)."""
     outwards = corners if body.report.volume > 0 else corners[:, ::-1]
     columns = Columns.crossed(outwards, *_limits(shape, slab))
@@ -183,7 +183,7 @@ def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
     return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
 
 
-def _least_cells(body: Body, grid: Grid) -> float:
+def _least_cells(body: BodySurface, grid: Grid) -> float:
     """Return fewer cells than there will be, known before they are made."""
     return max(abs(body.report.volume) / grid.cell_size**3 / 2, body.report.area / grid.cell_size**2 / 8)
 
@@ -197,7 +197,7 @@ def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
             raise InputError(f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, and {has}")
 
 
-def _axes(body: Body) -> Indices:
+def _axes(body: BodySurface) -> Indices:
     return np.roll([0, 1, 2], -int(np.argmax(body.bounds[1] - body.bounds[0])))
 
 
@@ -209,7 +209,7 @@ def _refuse_above(max_cells: int, cells: float, grid: Grid) -> None:
         )
 
 
-def _slab_triangles(body: Body, grid: Grid, axes: Indices) -> Rows:
+def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices) -> Rows:
     """Return the triangles (f, 3, 3) in cell units that reach this rank's slab, sent from rank 0."""
     corners = np.empty((0, 3, 3))
     if body.surface is not None:
@@ -236,7 +236,7 @@ def _mark(corners: Rows, shape: Indices, slab: Slab, method: str) -> Indices:
     return unpacked(np.unique(np.concatenate(keys)))
 
 
-def _gaps_by_winding(body: Body, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
+def _gaps_by_winding(body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices) -> Indices:
     """Return the interior of an open surface: cells whose centre has a generalized winding number above 1/2 in size.
 
     (Jacobson et al. 2013.) Time follows the bounding box here, memory does not.
@@ -258,7 +258,7 @@ def _gaps_by_winding(body: Body, grid: Grid, axes: Indices, slab: Slab, boundary
 
 
 def choose_cell_size(
-    bodies: Sequence[Body], count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[BodySurface], count: int, method: str = "exact", max_cells: int = 5_000_000, boundary: str = "fill"
 ) -> float:
     """Return the cell size [m] that gives bodies ``count`` cells within 1%, or the nearest with a warning (collective).
 
@@ -286,7 +286,7 @@ def choose_cell_size(
     return float(np.exp(nearest))
 
 
-def _first_guess(bodies: Sequence[Body], count: int) -> float:
+def _first_guess(bodies: Sequence[BodySurface], count: int) -> float:
     """Return the size h with V / h^3 + 3/4 A / h^2 = count: the volume, and what boundary cells stick out."""
     area, volume = sum(body.report.area for body in bodies), sum(abs(body.report.volume) for body in bodies)
     roots = np.roots([count, 0, -0.75 * area, -volume])

@@ -3,9 +3,11 @@
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Array, Rows
+
 
 @numba.njit(cache=True)
-def grown(rows, used):
+def grown(rows: Array, used: int) -> Array:
     """Return the rows (r, n), of which so many are used, in an array that has room for one more."""
     if used < len(rows):
         return rows
@@ -15,7 +17,7 @@ def grown(rows, used):
 
 
 @numba.njit(cache=True)
-def _clip(polygon, n, axis, plane, side, out):
+def _clip(polygon: Rows, n: int, axis: int, plane: float, side: float, out: Rows) -> int:
     """Sutherland-Hodgman: the part of the polygon with side * (x[axis] - plane) >= 0. Returns its size."""
     m = 0
     for a in range(n):
@@ -35,14 +37,14 @@ def _clip(polygon, n, axis, plane, side, out):
 
 
 @numba.njit(cache=True)
-def clip_to_layer(polygon, n, axis, index, slack, work, out):
-    """Cut the polygon to between the planes ``index`` and ``index + 1`` of an axis, widened by ``slack``."""
-    m = _clip(polygon, n, axis, index - slack, 1.0, work)
-    return _clip(work, m, axis, index + 1 + slack, -1.0, out)
+def clip_between(polygon: Rows, n: int, axis: int, planes: tuple[float, float], work: Rows, out: Rows) -> int:
+    """Cut the polygon to between two planes of an axis. Return its size."""
+    m = _clip(polygon, n, axis, planes[0], 1.0, work)
+    return _clip(work, m, axis, planes[1], -1.0, out)
 
 
 @numba.njit(cache=True)
-def extent(polygon, n, axis):
+def extent(polygon: Rows, n: int, axis: int) -> tuple[float, float]:
     """Return the smallest and largest coordinate along an axis."""
     smallest, largest = polygon[0, axis], polygon[0, axis]
     for a in range(1, n):

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Rows
-from msmpetsc.geometry.clipping import clip_to_layer, extent, grown
+from msmpetsc.backend.arrays import Floats, Indices, Rows
+from msmpetsc.geometry.clipping import clip_between, extent, grown
 from msmpetsc.geometry.grid import CHUNK, LIMIT, Grid, packed
 from msmpetsc.geometry.surface import Surface, is_inside
 
@@ -86,7 +86,7 @@ def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
 
 
 @numba.njit(cache=True)
-def _sums_above(column, values):
+def _sums_above(column: Indices, values: Rows) -> Rows:
     """Return for each row the sum of the values (c, 2, 2) from it to the end of its column, (c,) ascending."""
     sums = values.copy()
     for c in range(len(column) - 2, -1, -1):
@@ -96,7 +96,7 @@ def _sums_above(column, values):
 
 
 @numba.njit(cache=True)
-def _pieces(triangles, low, high):
+def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows]:
     """Cut triangles into cells.
 
     returns : cell (p, 3) of each piece, and its sums (p, 12) of ``_add_sums``
@@ -104,17 +104,18 @@ def _pieces(triangles, low, high):
     cells = np.empty((4 * len(triangles) + 16, 3), np.int64)
     values = np.empty((len(cells), 12))
     used = 0
-    work, across, along, piece = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
+    rooms = np.empty((4, 12, 3))
+    work, across, along, piece = rooms[0], rooms[1], rooms[2], rooms[3]
     for triangle in triangles:
         i0, i1 = _layers(triangle, 3, 0, low, high)
         for i in range(i0, i1):
-            n = clip_to_layer(triangle, 3, 0, i, 0.0, work, across)
+            n = clip_between(triangle, 3, 0, (float(i), i + 1.0), work, across)
             j0, j1 = _layers(across, n, 1, low, high)
             for j in range(j0, j1):
-                m = clip_to_layer(across, n, 1, j, 0.0, work, along)
+                m = clip_between(across, n, 1, (float(j), j + 1.0), work, along)
                 k0, k1 = _layers(along, m, 2, low, high)
                 for k in range(k0, k1):
-                    corners = clip_to_layer(along, m, 2, k, 0.0, work, piece)
+                    corners = clip_between(along, m, 2, (float(k), k + 1.0), work, piece)
                     cells, values = grown(cells, used), grown(values, used)
                     cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
                     values[used] = 0.0
@@ -125,7 +126,7 @@ def _pieces(triangles, low, high):
 
 
 @numba.njit(cache=True)
-def _layers(polygon, n, axis, low, high):
+def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
     """Return the first cell index that a polygon reaches along an axis, and the one after its last."""
     if n == 0:
         return 0, 0
@@ -134,7 +135,7 @@ def _layers(polygon, n, axis, low, high):
 
 
 @numba.njit(cache=True)
-def _add_sums(p, q, r, cell, sums):
+def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> None:
     """Add the integrals over a triangle of a cell, as seen along the last axis, to ``sums`` (12,).
 
     With z the height in the cell and N_ab the bilinear function of the edge at (a, b) of its base, they are of N_ab,

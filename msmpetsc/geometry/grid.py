@@ -51,10 +51,6 @@ class Grid:
         """Return the positions [m] of grid nodes (..., 3)."""
         return self.origin + ijk * self.cell_size
 
-    def nearest_nodes(self, points: Positions) -> Indices:
-        """Return the grid index (..., 3) of the nodes nearest to points (..., 3) [m]."""
-        return np.rint((points - self.origin) / self.cell_size).astype(np.int64)
-
 
 @dataclass(frozen=True)
 class BodyGrids:
@@ -98,7 +94,8 @@ class BodyGrids:
 
     def first(self, body: int | Indices) -> Indices:
         """Return the grid index (..., 3) of a body's first cell."""
-        return np.asarray(body)[..., None] * np.array([self.room, 0, 0])
+        first: Indices = np.asarray(body)[..., None] * np.array([self.room, 0, 0])
+        return first
 
     def body_of(self, ijk: Indices) -> Indices:
         """Return the number (...,) of the body that grid indices (..., 3) are of."""
@@ -106,20 +103,17 @@ class BodyGrids:
 
     def node_positions(self, ijk: Array) -> Positions:
         """Return the positions [m] of grid nodes (..., 3), or of what lies between nodes."""
-        if not self.room:
-            return self.grids[0].node_positions(ijk)
         body = self.body_of(ijk)
         return self._origins[body] + (ijk - self.first(body)) * self.cell_size
 
     def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
         """Return the grid index (..., 3) of the nodes of bodies (...,) nearest to points (..., 3) [m]."""
-        if not self.room:
-            return self.grids[0].nearest_nodes(points)
-        return np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64) + self.first(body)
+        nodes: Indices = np.rint((points - self._origins[body]) / self.cell_size).astype(np.int64) + self.first(body)
+        return nodes
 
 
 @numba.njit(cache=True)
-def _spread(x):
+def _spread(x: int) -> int:
     """Return the bits of x with two zeros between each two."""
     x &= 0x1FFFFF
     x = (x | x << 32) & 0x1F00000000FFFF
@@ -130,7 +124,7 @@ def _spread(x):
 
 
 @numba.njit(cache=True)
-def _gather(x):
+def _gather(x: int) -> int:
     """Return the bits that ``_spread`` has parted."""
     x &= 0x1249249249249249
     x = (x | x >> 2) & 0x10C30C30C30C30C3
@@ -141,7 +135,7 @@ def _gather(x):
 
 
 @numba.njit(cache=True)
-def _encode(ijk, keys):
+def _encode(ijk: Indices, keys: Indices) -> None:
     for n in range(len(ijk)):
         keys[n] = -1
         if 0 <= ijk[n, 0] < LIMIT and 0 <= ijk[n, 1] < LIMIT and 0 <= ijk[n, 2] < LIMIT:
@@ -149,14 +143,15 @@ def _encode(ijk, keys):
 
 
 @numba.njit(cache=True)
-def _decode(keys, ijk):
+def _decode(keys: Indices, ijk: Indices) -> None:
     for n in range(len(keys)):
         ijk[n, 0], ijk[n, 1], ijk[n, 2] = _gather(keys[n]), _gather(keys[n] >> 1), _gather(keys[n] >> 2)
 
 
 def packed(ijk: Indices) -> Indices:
     """Return one key (n,) for each grid index (n, 3), which sorts as (i, j, k) does."""
-    return ijk @ PACK
+    keys: Indices = ijk @ PACK
+    return keys
 
 
 def unpacked(keys: Indices) -> Indices:

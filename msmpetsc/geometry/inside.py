@@ -27,13 +27,16 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
         low, high = origin + np.array(region.box) * scale
         low = np.where(low <= bounds[0] + edge, -np.inf, low)
         high = np.where(high >= bounds[1] - edge, np.inf, high)
-        return ((points >= low - edge) & (points <= high + edge)).all(axis=1)
+        in_box: Mask = ((points >= low - edge) & (points <= high + edge)).all(axis=1)
+        return in_box
     if region.sphere is not None:
         distance = np.linalg.norm(points - (origin + np.array(region.sphere.center) * scale), axis=1)
-        return distance <= region.sphere.radius * length + edge
+        in_sphere: Mask = distance <= region.sphere.radius * length + edge
+        return in_sphere
     assert region.half_space is not None  # the schema has one of the four, and the painted ones are not asked for
     point = origin + np.array(region.half_space.point) * scale
-    return (points - point) @ np.asarray(region.half_space.normal) >= -edge
+    beyond: Mask = (points - point) @ np.asarray(region.half_space.normal) >= -edge
+    return beyond
 
 
 def inside_bodies(region: Region, points: Positions, bounds: Rows, body: Indices, meant: int | None) -> Mask:

@@ -8,7 +8,6 @@ through one small graph of labels.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array
@@ -16,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Indices, Mask
 from msmpetsc.comm import Route
+from msmpetsc.geometry.grid import LIMIT, packed
 
 EXTERIOR = 0
 
@@ -48,12 +48,11 @@ def enclosed_gaps(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
     boundary : (b, 3) int64 distinct boundary cells of this rank's slab, in lexicographic order
     returns  : (g, 4) int64 rows (i, j, k first, k last) of this slab
     """
-    halo = _next_plane(comm, boundary, slab)
-    cells = np.concatenate([boundary, halo])
-    gaps, label = _flood(cells, slab.first, slab.last, slab.first == 0)
+    halo = _to_previous(comm, boundary[boundary[:, 0] == slab.first])
+    gaps, label = _flood(np.concatenate([boundary, halo]), slab)
     own = gaps[:, 0] < slab.last
-    label = _join(comm, gaps, label, own, slab)
-    return gaps[own][label[own] != EXTERIOR]
+    enclosed: Mask = own & (_join(comm, gaps, label, own, slab) != EXTERIOR)
+    return gaps[enclosed]
 
 
 def cells_of_gaps(gaps: Indices) -> Indices:
@@ -68,10 +67,6 @@ def _to_previous(comm: MPI.Comm, rows: Indices) -> Indices:
     """Send rows to the rank before this one; rank 0 has none and sends nothing."""
     rows = rows if comm.rank > 0 else rows[:0]
     return Route(comm, np.full(len(rows), comm.rank - 1)).send(rows)
-
-
-def _next_plane(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
-    return _to_previous(comm, boundary[boundary[:, 0] == slab.first])
 
 
 def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) -> Indices:
@@ -90,105 +85,45 @@ def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) 
     return np.where(np.isin(label, outside), EXTERIOR, label)
 
 
-@numba.njit(cache=True)
-def _root(parent, a):
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    return a
-
-
-@numba.njit(cache=True)
-def _union(parent, a, b):
-    a, b = _root(parent, a), _root(parent, b)
-    parent[max(a, b)] = min(a, b)  # so that EXTERIOR, the smallest, stays a root
-
-
-@numba.njit(cache=True)
-def _columns(cells):
-    """Return where each column (i, j) starts in the sorted cells, with the end appended."""
-    start = np.empty(len(cells) + 1, np.int64)
-    n = 0
-    for c in range(len(cells)):
-        if c == 0 or cells[c, 0] != cells[c - 1, 0] or cells[c, 1] != cells[c - 1, 1]:
-            start[n] = c
-            n += 1
-    start[n] = len(cells)
-    return start[: n + 1]
-
-
-@numba.njit(cache=True)
-def _gaps(cells, start):
-    """Return all gaps (i, j, k first, k last), and where those of each column begin."""
-    gaps = np.empty((len(cells), 4), np.int64)
-    begin = np.zeros(len(start), np.int64)
-    n = 0
-    for c in range(len(start) - 1):
-        begin[c] = n
-        for a in range(start[c], start[c + 1] - 1):
-            if cells[a + 1, 2] - cells[a, 2] > 1:
-                gaps[n, 0], gaps[n, 1] = cells[a, 0], cells[a, 1]
-                gaps[n, 2], gaps[n, 3] = cells[a, 2] + 1, cells[a + 1, 2] - 1
-                n += 1
-    begin[len(start) - 1] = n
-    return gaps[:n], begin
-
-
-@numba.njit(cache=True)
-def _find_column(cells, start, i, j):
-    """Return the number of the column (i, j), -1 where it has no boundary cell."""
-    low, high = 0, len(start) - 1
-    while low < high:
-        middle = (low + high) // 2
-        ci, cj = cells[start[middle], 0], cells[start[middle], 1]
-        if ci < i or (ci == i and cj < j):
-            low = middle + 1
-        else:
-            high = middle
-    if low < len(start) - 1 and cells[start[low], 0] == i and cells[start[low], 1] == j:
-        return low
-    return -1
-
-
-@numba.njit(cache=True)
-def _meet(parent, gaps, begin, cells, start, column, neighbour):
-    """Join the gaps of a column with what touches them in the column ``neighbour``."""
-    for g in range(begin[column], begin[column + 1]):
-        if neighbour < 0:
-            _union(parent, EXTERIOR, g + 1)
-            continue
-        if gaps[g, 2] < cells[start[neighbour], 2] or gaps[g, 3] > cells[start[neighbour + 1] - 1, 2]:
-            _union(parent, EXTERIOR, g + 1)
-        for h in range(begin[neighbour], begin[neighbour + 1]):
-            if gaps[h, 2] <= gaps[g, 3] and gaps[h, 3] >= gaps[g, 2]:
-                _union(parent, g + 1, h + 1)
-
-
-@numba.njit(cache=True)
-def _flood(cells, first, last, lowest):
-    """Return gaps and their labels: EXTERIOR, or 1, 2, ... a component.
+def _flood(cells: Indices, slab: Slab) -> tuple[Indices, Indices]:
+    """Return gaps (g, 4) and their labels (g,): EXTERIOR, or the number of a component.
 
     Planes first..last-1 are owned, plane ``last`` may be given as a halo: its own neighbours beyond it are its
     owner's business.
     """
-    start = _columns(cells)
-    gaps, begin = _gaps(cells, start)
-    parent = np.arange(len(gaps) + 1)
-    for column in range(len(start) - 1):
-        i, j = cells[start[column], 0], cells[start[column], 1]
-        for step in (-1, 1):
-            owned = i < last
-            if owned:
-                _meet(parent, gaps, begin, cells, start, column, _find_column(cells, start, i, j + step))
-            if (step == 1 and owned) or (step == -1 and (i > first or lowest)):
-                _meet(parent, gaps, begin, cells, start, column, _find_column(cells, start, i + step, j))
-    label = np.empty(len(gaps), np.int64)
-    name = np.zeros(len(gaps) + 1, np.int64)
-    names = 0
-    for g in range(len(gaps)):
-        root = _root(parent, g + 1)
-        if root != EXTERIOR and name[root] == 0:
-            names += 1
-            name[root] = names
-        label[g] = name[root]
-    return gaps, label
+    gaps = _gaps(cells)
+    plane, owned = gaps[:, 0], gaps[:, 0] < slab.last
+    before = (plane > slab.first) | (slab.first == 0)
+    sides = (([0, -1], owned), ([0, 1], owned), ([1, 0], owned), ([-1, 0], before))
+    links = [_links(cells, gaps, np.flatnonzero(asked), np.array(side)) for side, asked in sides]
+    ends = np.concatenate(links, axis=1)
+    graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(gaps) + 1, len(gaps) + 1))
+    component = connected_components(graph, directed=False)[1]
+    return gaps, np.where(component == component[EXTERIOR], EXTERIOR, component + 1)[1:]
+
+
+def _gaps(cells: Indices) -> Indices:
+    """Return the gaps (i, j, k first, k last) between sorted cells (c, 3) of one column, (g, 4)."""
+    low, high = cells[:-1], cells[1:]
+    parted = (low[:, :2] == high[:, :2]).all(axis=1) & (high[:, 2] - low[:, 2] > 1)
+    return np.column_stack([low[parted, :2], low[parted, 2] + 1, high[parted, 2] - 1])
+
+
+def _links(cells: Indices, gaps: Indices, asked: Indices, side: Indices) -> Indices:
+    """Return the pairs (2, p) of each gap asked for and what touches it in the column beside it.
+
+    Gap g is node g + 1 of the graph. A gap that reaches past the column's cells touches EXTERIOR.
+    """
+    column = gaps[asked, :2] + side
+    first, last = (packed(np.column_stack([column, gaps[asked, end]])) for end in (2, 3))
+    begins, ends = (packed(gaps[:, [0, 1, end]]) for end in (2, 3))
+    low = np.searchsorted(ends, first)
+    count = np.searchsorted(begins, last, side="right") - low
+    others = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
+    keys = packed(cells)
+    columns = np.append(keys // LIMIT, -2 * LIMIT)  # the last is no column: that of a cell before all, or after
+    below = columns[np.searchsorted(keys, first, side="right") - 1]
+    above = columns[np.searchsorted(keys, last)]
+    past = (below != first // LIMIT) | (above != first // LIMIT)
+    touched = np.append(others + 1, np.full(past.sum(), EXTERIOR))
+    return np.stack([np.append(np.repeat(asked, count), asked[past]) + 1, touched])

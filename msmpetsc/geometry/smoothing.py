@@ -25,12 +25,13 @@ from functools import cache
 import numba
 import numpy as np
 
+from msmpetsc.backend.arrays import Floats, Mask, Rows
 from msmpetsc.geometry.block import AROUND, ITSELF, cells_around, corner_bit, corner_blend, corner_node, smoothstep
 from msmpetsc.geometry.mvc import joined_cage, new_view, set_view
 
 
 @numba.njit(cache=True)
-def own_weight(own, valid, smoothing):
+def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
     """Return b(p) of Eq. 9: 0 on everything shared with a valid neighbour, 1 away from it; f_h is smoothstep(x / h).
 
     own (64,): the cell's own coordinates; the sum in Eq. 9 is taken over the corners shared with that neighbour.
@@ -47,17 +48,17 @@ def own_weight(own, valid, smoothing):
 
 
 @numba.njit(cache=True)
-def boundary_blends(u, valid, blends):
+def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
     """Set W(v, p) of Eq. 8 in blends (8,), 0 off B_c: the corners shared with another valid cell. Return their sum."""
     for v in range(8):
         mask = cells_around(v, valid)
         alone = mask & (mask - 1) == 0
         blends[v] = 0.0 if alone else corner_blend(v, u)
-    return blends.sum()
+    return float(blends.sum())
 
 
 @numba.njit(cache=True)
-def cages_weights(u, neighbours, smoothing, weights):
+def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) -> None:
     """Set s(p) of Eq. 7: u (p,3) in [0,1]; neighbours (p,27) bool; smoothing h in (0,1]; weights (p,64), result."""
     alone = np.zeros(27, np.bool_)
     alone[ITSELF] = True
@@ -79,7 +80,7 @@ def cages_weights(u, neighbours, smoothing, weights):
 
 
 @cache
-def gradient_table():
+def gradient_table() -> Rows:
     """Return a table (256,3,27): column a of F_v is table[mask, a] @ x over the 3x3x3 nodes around v.
 
     The mask is that of cells_around.
@@ -99,7 +100,7 @@ def gradient_table():
 
 
 @numba.njit(cache=True)
-def _affine_weights(u, neighbours, table, weights):
+def _affine_weights(u: Rows, neighbours: Mask, table: Rows, weights: Rows) -> None:
     weights[:] = 0.0
     for p in range(len(u)):
         for v in range(8):
@@ -114,6 +115,6 @@ def _affine_weights(u, neighbours, table, weights):
                 weights[p, node] += blend * lever
 
 
-def affine_weights(u, neighbours, weights):
+def affine_weights(u: Rows, neighbours: Mask, weights: Rows) -> None:
     """Set J(p) of Eq. 8 with affine L_v: u (p,3) in [0,1]; neighbours (p,27) bool; weights (p,64), result."""
     _affine_weights(u, neighbours, gradient_table(), weights)

@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -30,7 +30,7 @@ def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> S
     """
     if len(surface.triangles) < LEAST_TRIANGLES:
         return step(surface, *values)
-    path = _folder() / f"{_key(step, surface, values)}.npz"
+    path = Path(pooch.os_cache("msmpetsc")) / "prepared" / f"{_key(step, surface, values)}.npz"
     with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile):  # not there, or damaged
         with np.load(path) as arrays:
             result = Surface(arrays["points"], arrays["triangles"])
@@ -42,26 +42,16 @@ def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> S
     return result
 
 
-def _folder() -> Path:
-    return Path(pooch.os_cache("msmpetsc")) / "prepared"
-
-
 def _key(step: Callable[..., Surface], surface: Surface, values: tuple[object, ...]) -> str:
     """Return a hash of all that the result depends on: mesh, step, values, our sources and the libraries."""
-    digest = hashlib.sha256(json.dumps([step.__name__, values, [_version(name) for name in LIBRARIES]]).encode())
+    versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
+    digest = hashlib.sha256(json.dumps([step.__name__, values, versions]).encode())
     for array in (surface.points, surface.triangles):
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(array.tobytes())
     for source in ("prepare.py", "surface.py"):
         digest.update((Path(__file__).parent / source).read_bytes())
     return digest.hexdigest()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
 
 
 def _store(path: Path, surface: Surface) -> None:

@@ -115,31 +115,25 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 def _warnings(report: SurfaceReport) -> list[str]:
     """Return a line for each doubtful property of the surface, with its remedy."""
-    warnings = []
-    if report.boundary_edges:
-        warnings.append(
-            f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding "
-            'number will decide what is inside; prepare = ["repair"] closes holes'
-        )
-    if report.nonmanifold_edges:
-        warnings.append(f"{report.nonmanifold_edges} edges have more than two triangles")
-    if report.inconsistent_edges:
-        warnings.append(
-            f"{report.inconsistent_edges} edges have triangles wound against each other: "
-            'prepare = ["orient"] mends that'
-        )
-    if report.volume < 0:
-        warnings.append(
-            f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them'
-        )
-    return warnings
+    doubts = {
+        f"the mesh is open ({report.boundary_edges} boundary edges): the generalized winding number will decide what "
+        'is inside; prepare = ["repair"] closes holes': report.boundary_edges,
+        f"{report.nonmanifold_edges} edges have more than two triangles": report.nonmanifold_edges,
+        f"{report.inconsistent_edges} edges have triangles wound against each other: "
+        'prepare = ["orient"] mends that': report.inconsistent_edges,
+        f'the faces are wound inwards (volume {report.volume:.3g} m^3): prepare = ["orient"] turns them': (
+            report.volume < 0
+        ),
+    }
+    return [line for line, doubtful in doubts.items() if doubtful]
 
 
 def is_inside(surface: Surface, points: Positions) -> Mask:
     """Return which points (n, 3) are inside: their winding number is above 1/2 in size (Jacobson et al. 2013)."""
     import igl  # for open surfaces, and scenes with obstacles
 
-    return np.abs(igl.fast_winding_number(surface.points, surface.triangles, points)) > 0.5
+    inside: Mask = np.abs(igl.fast_winding_number(surface.points, surface.triangles, points)) > 0.5
+    return inside
 
 
 def merged_triangles(surface: Surface) -> Indices:
@@ -149,7 +143,8 @@ def merged_triangles(surface: Surface) -> Indices:
     """
     triangles = first_of_equal(surface.points)[surface.triangles]
     a, b, c = triangles.T
-    return triangles[(a != b) & (b != c) & (c != a)]
+    whole: Mask = (a != b) & (b != c) & (c != a)
+    return triangles[whole]
 
 
 def first_of_equal(points: Positions) -> Indices:

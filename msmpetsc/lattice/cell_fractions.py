@@ -29,9 +29,11 @@ STRENGTH = np.where(KIND > 0, ISOTROPIC[KIND] / np.maximum(CELLS_AROUND[KIND], 1
 
 def shares_of_pairs(share: Rows) -> Rows:
     """Return the shares (c, 8, 8) of a whole cell's springs, by their two ends, from those of corners (c, 8)."""
-    return np.einsum("cv,abv->cab", share, MEAN, optimize=True)
+    of_pairs: Rows = np.einsum("cv,abv->cab", share, MEAN, optimize=True)
+    return of_pairs
 
 
 def shares_of_mass(of_pairs: Rows) -> Rows:
     """Return the share (c, 8) of an eighth of a whole cell's mass that each corner has, from the springs' (c, 8, 8)."""
-    return np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(axis=1)
+    of_mass: Rows = np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(axis=1)
+    return of_mass

@@ -45,7 +45,7 @@ def initial_state(
 def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Positions:
     """Return where a start moves a body's nodes (n, 3) [m]; ``numbers`` (n,) are their global ones."""
     middle = bounds.mean(axis=0)
-    q = middle + np.array(start.scale) * (nodes - middle)
+    q: Positions = middle + np.array(start.scale) * (nodes - middle)
     if start.twist is not None:
         q = twisted(q, start.twist, nodes, bounds)
     if start.scatter > 0:
@@ -66,7 +66,8 @@ def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Posit
     angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]
     p = q - middle
     along = (p @ a)[:, None] * a
-    return middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+    turned: Positions = middle + along + (p - along) * np.cos(angle) + np.cross(a, p) * np.sin(angle)
+    return turned
 
 
 def uniform(numbers: Indices) -> Rows:
@@ -85,5 +86,6 @@ def centre_of_mass(comm: MPI.Comm, q: Positions, mass: Floats) -> Floats:
 
     q, mass : (l, 3) [m]; (owned,) [kg]
     """
-    total = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
-    return total[:3] / total[3]
+    total: Floats = comm.allreduce(np.append(mass @ q[: len(mass)], mass.sum()))
+    centre: Floats = total[:3] / total[3]
+    return centre

@@ -89,7 +89,7 @@ class Lattice:
 
     def stiffest(self, comm: MPI.Comm) -> float:
         """Return the greatest stiffness of any spring [N/m] (collective)."""
-        return comm.allreduce(self.stiffness.max(initial=0), MPI.MAX)
+        return float(comm.allreduce(self.stiffness.max(initial=0), MPI.MAX))
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""
@@ -204,7 +204,8 @@ def _sums(
         made_of = of_cells(net.ijk[net.cells[:, 0]])
     share = np.ones((cells, 8)) if net.share is None else net.share
     of_pairs = shares_of_pairs(share)
-    mass = h**3 / 8 * _sums_of_nodes(net.cells, made_of.density[:, None] * shares_of_mass(of_pairs), owned)
+    of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
+    mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
     return mass, of_spring, share.mean(axis=1) * made_of.spring
 
@@ -237,11 +238,6 @@ def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mas
     return decode_morton(keys), local, octants
 
 
-def _sums_of_nodes(cells: Indices, values: Rows, owned: int) -> Array:
-    """Return the sum (owned,) of the ``values`` (c, 8) of the corners of cells (c, 8) that are each owned node."""
-    return np.bincount(cells.ravel(), values.ravel(), owned)[:owned]
-
-
 def _sums_of_springs(cells: Indices, values: Floats, share: Rows, ijk: Indices, springs: Indices, owned: int) -> Floats:
     """Return the sum (s,) of the ``values`` (c,) of the cells (c, 8) that share each spring (s, 2).
 
@@ -249,11 +245,12 @@ def _sums_of_springs(cells: Indices, values: Floats, share: Rows, ijk: Indices, 
     ijk   : (l, 3) grid index of the nodes. Ranks that have the same spring add in the same order, that of the cells.
     """
     direction = (ijk[springs[:, 1]] - ijk[springs[:, 0]] + 1) @ np.array([9, 3, 1])
-    return _sums_by_direction(cells, values, share, owned)[springs[:, 0], direction]
+    sums: Floats = _sums_by_direction(cells, values, share, owned)[springs[:, 0], direction]
+    return sums
 
 
 @numba.njit(cache=True)
-def _sums_by_direction(cells, values, share, owned):
+def _sums_by_direction(cells: Indices, values: Floats, share: Rows, owned: int) -> Rows:
     sums = np.zeros((owned, 27))
     for i in range(len(cells)):
         for a in range(8):
@@ -264,7 +261,7 @@ def _sums_by_direction(cells, values, share, owned):
 
 
 @numba.njit(cache=True)
-def _springs(cells, numbers, owned):
+def _springs(cells: Indices, numbers: Indices, owned: int) -> tuple[Indices, int, Indices, Indices]:
     """Return the springs between the corners of cells, each once.
 
     cells   : (c, 8) local nodes; numbers (l,) global; nodes below ``owned`` are owned

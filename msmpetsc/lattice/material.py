@@ -40,7 +40,8 @@ def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: 
     kind          : (s,) EDGE, FACE_DIAGONAL or SPACE_DIAGONAL
     cells         : (s,) number of valid cells that share the spring
     """
-    return edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+    stiffness: Floats = edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
+    return stiffness
 
 
 def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | Floats:

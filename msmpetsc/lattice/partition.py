@@ -11,7 +11,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.comm import sample_of, splitters_of
-from msmpetsc.geometry.cages import Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.interior import Slab
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.scene.body import CagesTable
@@ -50,12 +50,13 @@ class Partition:
     @property
     def nonzeros(self) -> Array:
         """Number of nonzeros (R,) of A: a row for each node, its diagonal and the far ends of its springs."""
-        return self.nodes + 2 * self.inner + self.cut
+        nonzeros: Array = self.nodes + 2 * self.inner + self.cut
+        return nonzeros
 
     @property
     def all_springs(self) -> float:
         """Number of springs, each counted once."""
-        return self.inner.sum() + self.cut.sum() / 2
+        return float(self.inner.sum() + self.cut.sum() / 2)
 
     def scaled(self, cells: float) -> "Partition":
         """Return the partition of the same body with more cells on as many ranks.
@@ -83,7 +84,7 @@ def _cut_springs(side: float) -> float:
     return 26 * side**3 - 2 * (3 * side**2 * (side - 1) + 6 * side * (side - 1) ** 2 + 4 * (side - 1) ** 3)
 
 
-def partition_of(bodies: Sequence[Body], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
+def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, most: int) -> tuple[Partition, int]:
     """Return the partition among ``ranks`` ranks, and the cells of the lattice that it was counted on.
 
     That lattice has about ``most`` cells where more are wanted, and its numbers are scaled.
@@ -118,7 +119,7 @@ def _cells(volume: float, area: float, h: float) -> float:
     return volume / h**3 + area / h**2
 
 
-def count_partition(bodies: Sequence[Body], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
+def count_partition(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice, ranks: int) -> Partition:
     """Return the partition among ``ranks`` ranks; cages and lattice are whole, built on one rank."""
     cell_rank = _ranks_of_cells(bodies, cages, ranks)
     rank = _ranks_of_nodes(lattice, cell_rank, ranks)
@@ -138,7 +139,7 @@ def count_partition(bodies: Sequence[Body], cages: Cages, lattice: Lattice, rank
     return Partition(**{name: np.bincount(rank_of, minlength=ranks) for name, rank_of in counts.items()})
 
 
-def _ranks_of_cells(bodies: Sequence[Body], cages: Cages, ranks: int) -> Indices:
+def _ranks_of_cells(bodies: Sequence[BodySurface], cages: Cages, ranks: int) -> Indices:
     """Return the rank (c,) of each cell; each rank first finds those of its slab along each body's longest side."""
     grids, ijk, slab = cages.grids, cages.ijk, np.empty(len(cages.kind), np.int64)
     of_cell = grids.body_of(ijk)

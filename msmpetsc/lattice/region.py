@@ -13,7 +13,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
 from msmpetsc.lattice.cell_fractions import CORNERS
@@ -31,7 +31,7 @@ class Finder:
     folder : where files of painted points lie
     """
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[BodySurface, ...]
     cages: Cages
     folder: Path
 
@@ -111,7 +111,8 @@ class Finder:
                 )
             return np.unique(grid.to_cells(points[numbers]).astype(np.int64), axis=0)
 
-        return self.comm.bcast(on_root(self.comm, cells)) + self.cages.grids.first(number)
+        of_body: Indices = self.comm.bcast(on_root(self.comm, cells))
+        return of_body + self.cages.grids.first(number)
 
     def _numbers(self, key: str, painted: str | tuple[int, ...]) -> list[int]:
         if not isinstance(painted, str):

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Positions
 from msmpetsc.checkpoint import ANY, COUNT, Range
 from msmpetsc.comm import log
-from msmpetsc.contact.obstacles.obstacle import describe_overlap
+from msmpetsc.contact.obstacles.moving_solid import describe_overlap
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.lattice.lattice import Lattice

@@ -22,7 +22,7 @@ def test_a_change_of_any_kernels_source_gives_another_folder(tmp_path: Path):
     assert first.parent == tmp_path / "msmpetsc" / "__pycache__" and folder() == first
     (tmp_path / "msmpetsc" / "scene" / "schema.py").write_text("")  # no kernels in it
     assert folder() == first
-    with open(tmp_path / "msmpetsc" / "contact" / "obstacles" / "faces.py", "a") as file:
+    with open(tmp_path / "msmpetsc" / "contact" / "obstacles" / "solids.py", "a") as file:
         file.write("# of another version\n")
     assert folder() != first
 

@@ -224,7 +224,7 @@ COMPILES = """
 import logging, sys
 import numpy as np
 from msmpetsc.backend.compiling import compilation_logged
-from msmpetsc.contact.obstacles.faces import depth
+from msmpetsc.contact.obstacles.solids import depth
 from msmpetsc.comm import log
 log.addHandler(logging.StreamHandler(sys.stdout))
 log.setLevel(logging.INFO)

@@ -70,13 +70,6 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2  # it stays above, and is hardly dented
 
 
-def test_without_self_contact_they_pass_through_each_other(folder: Path):
-    path = fall(folder, "through", 0.02, time={"step": 0.01, "duration": 0.15})
-    text = path.read_text()
-    path.write_text(text.replace("[self_contact]\ndistance = 0.001\nfriction = 0.5\n", ""))
-    assert crossings(*play(path)) > 0
-
-
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_blocks_that_collide_in_space_keep_their_momentum(folder: Path, friction: float):
     bodies = [body("block", [0, 0, 0], start={"velocity": [0, 0, 1.0]})]

@@ -14,7 +14,6 @@ from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 
 from msmpetsc.build import Model, build_model
-from msmpetsc.contact.surface.barrier import Barrier
 from msmpetsc.contact.surface.pairs import NearPairs
 from msmpetsc.contact.surface.term import SMALL, SurfaceContact
 from msmpetsc.errors import InputError
@@ -79,17 +78,6 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     longest = np.abs(model.collision.points(forward)).max()
     below, above = (term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share for share in (0.999, 1.001))
     assert below / above == pytest.approx(1, rel=0.01)  # where one formula takes over from the other
-
-
-@pytest.mark.parametrize("slid", [0.0, 1e-4])
-def test_forces_keep_momentum(model, slid: float):
-    term, q = contact(model, slid)
-    gradient = np.zeros_like(q)
-    term.add_gradient(q, gradient)
-    moments = np.cross(q, gradient).sum(axis=0)
-    assert np.abs(gradient.sum(axis=0)).max() < 1e-12 * np.abs(gradient).sum()
-    if slid == 0:  # lagged friction acts along where it was
-        assert np.abs(moments).max() < 1e-10 * np.abs(gradient).sum() * HALF
 
 
 @pytest.mark.parametrize("slid", [0.0, 1e-7])
@@ -221,19 +209,13 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
         build_model(COMM, load_scene(path))
 
 
-def test_a_coarser_surface_lies_on_the_body(tmp_path):
-    path = pinch_scene(tmp_path, self_contact={"surface": 400})
-    model = build_model(COMM, load_scene(path))
-    surface = model.collision.surface
-    assert 300 < len(surface.triangles) <= 400
-    squares = igl.point_mesh_squared_distance(surface.points, model.surface.points, model.surface.triangles)[0]
-    assert squares.max() < 1e-18
-    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
-
-
-def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
+def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(tmp_path, caplog):
     model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
     surface, whole = model.collision.surface, model.surface.points
+    assert 300 < len(surface.triangles) <= 400
+    squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
+    assert squares.max() < 1e-18
+    np.testing.assert_allclose(model.collision.points(model.lattice.nodes), surface.points, atol=1e-12)
     off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
     assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
     diagonal = np.linalg.norm(np.ptp(whole, axis=0))
@@ -242,26 +224,6 @@ def test_a_coarser_surface_says_how_far_it_is_off_and_pushes_from_there(tmp_path
     far = {"surface": 400, "distance": 1.01 * off.max()}
     assert build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact=far))).collision.law.distance > off.max()
     assert "the surface drawn" not in caplog.text
-
-
-def test_parts_are_clear_as_long_as_they_cannot_come_near(model):
-    q, collision, reach = closed(model), model.collision, 8e-4
-    touching = collision.points(q)
-    end = np.clip(model.lattice.nodes[:, 2] / ARM, 0, None) ** 2
-    q[:, 0] -= (2e-3 - GAP) * end * (q[:, 0] < 0)  # the arms are 2 mm apart, of a distance of 1 mm
-    barrier, points = Barrier(collision.surface, collision.law), collision.points(q)
-    barrier.leave_out_neighbours(collision.surface.points)
-    candidates = barrier.candidates(points, reach)
-    clear, anywhere = barrier.clear_reach(candidates, points, reach)
-    assert 1e-4 < clear < reach and anywhere == clear  # the tube has no creases
-    least = barrier._least(barrier._pairs(candidates, points, 4e-3), points)
-    assert least == pytest.approx(collision.law.distance + 2 * clear)  # both parts come nearer
-    for seed in range(10):
-        way = np.random.default_rng(seed).normal(size=points.shape)
-        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
-        assert not barrier.pushing(barrier.contacts(candidates, moved))
-    assert barrier.clear_reach(barrier.candidates(points, 1e-4), points, 1e-4) == (1e-4, 1e-4)
-    assert barrier.clear_reach(barrier.candidates(touching, reach), touching, reach) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -312,15 +274,6 @@ def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
     mass = model.lattice.mass * free
     along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
     return np.diff(along)[50:] / 0.01, frames[51:]
-
-
-@pytest.mark.slow
-def test_a_block_slides_down_another_as_coulomb_has_it(tmp_path):
-    speed, _ = along_and_frames(sliding(tmp_path, 35.0))
-    tilt = np.radians(35.0)
-    acceleration = np.polyfit(0.01 * np.arange(len(speed)), speed, 1)[0]
-    friction = np.tan(tilt) - acceleration / (9.81 * np.cos(tilt))
-    assert friction == pytest.approx(0.5, rel=0.01)
 
 
 def test_a_block_sticks_to_a_tilted_one_but_for_the_creep_of_its_friction(tmp_path):

@@ -14,7 +14,7 @@ import msmpetsc as msm
 from msmpetsc.build import build_model
 from msmpetsc.contact.obstacles.distance import FunctionSolid
 from msmpetsc.contact.obstacles.mesh_solid import MeshSolid
-from msmpetsc.contact.obstacles.solids import Faces, Solid
+from msmpetsc.contact.obstacles.solids import Solid
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import OBSTACLES
 from msmpetsc.geometry.surface import Surface
@@ -168,16 +168,6 @@ def test_the_surface_of_a_function_is_in_the_file(tmp_path: Path):
     assert abs(far - RADIUS).max() < 0.02 and np.ptp(points, axis=0)[:2].min() > 0.59
 
 
-def test_a_static_state_on_a_mesh(tmp_path: Path):
-    """The block is let down on a plate and carried: the push is its weight."""
-    trimesh.creation.box(bounds=[[-1, -1, -1], [2, 2, 0.0]]).export(tmp_path / "plate.ply")
-    obstacle = [{"shape": "mesh", "mesh": {"source": "plate.ply"}, "response": "penalty"}]
-    time = {"step": 0.1, "duration": 0.1, "integrator": "static"}
-    held = [{"region": {"box": [[-1, -1, -1], [0.01, 2, 1]]}}]
-    _, frames = play(block_scene(tmp_path, obstacle=obstacle, pin=held, **FALLING | {"time": time}))
-    assert frames[-1].contact > 0 and frames[-1].position[:, 2].min() > -1e-3
-
-
 # ---- mistakes
 
 
@@ -218,10 +208,3 @@ def test_mistakes_are_one_line(tmp_path: Path, obstacle: dict, function, said: s
     with pytest.raises(InputError) as refused:
         build_model(MPI.COMM_SELF, load_scene(block_scene(tmp_path, obstacle=[obstacle], **FALLING)))
     assert said in str(refused.value) and "\n" not in str(refused.value)
-
-
-def test_planes_need_neither_package(tmp_path: Path):
-    """Where no obstacle is a mesh, igl's tree is not built: the solid is of faces."""
-    box = {"shape": "box", "box": [[-1, -1, -2], [1, 1, -1]]}
-    model = build_model(MPI.COMM_SELF, load_scene(block_scene(tmp_path, obstacle=[box], **FALLING)))
-    assert isinstance(model.penalties[0].obstacle.solid, Faces) and model.solids == {}

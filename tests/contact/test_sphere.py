@@ -8,8 +8,6 @@ from block_scene import G, block_scene, play
 from obstacles import sphere
 
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
-from msmpetsc.errors import InputError
-from msmpetsc.scene.reading import load_scene
 
 FLAT = 1e5  # [m]: over the block's 0.5 m it sinks by 3e-7 m, and a depth is rounded to 1e-11 m
 PLANE = {"shape": "plane", "point": [0, 0, -0.02], "normal": [0, 0, 1]}
@@ -44,34 +42,3 @@ def test_a_node_is_turned_back_along_the_radius():
     np.testing.assert_allclose((after - before)[0], (q - q_previous)[0] - 1.5 * speed * normal, atol=1e-14)
     np.testing.assert_array_equal(after[1:], q[1:])
     np.testing.assert_array_equal(before[1:], q_previous[1:])
-
-
-def test_a_block_on_the_top_of_a_sphere_stays_there_and_beside_it_slips_off(tmp_path: Path):
-    """Frictionless: over the top it is in balance, by symmetry, and off it the sphere pushes it aside."""
-    middles = []
-    for x in (0.25, 0.21):
-        ball = {"shape": "sphere", "center": [x, 0.25, -0.3], "radius": 0.3, "response": "penalty"}
-        time = {"step": 0.01, "duration": 0.3}
-        _, frames = play(block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -G]}, obstacle=[ball]))
-        middles.append([frame.position.mean(axis=0) for frame in frames])
-    top, beside = np.array(middles)
-    np.testing.assert_allclose(top[:, :2], 0.25, atol=1e-6)
-    assert top[-1, 2] > top[0, 2] - 0.1
-    assert (np.diff(beside[5::5, 0]) > 0).all() and beside[-1, 0] > 0.26
-    np.testing.assert_allclose(beside[:, 1], 0.25, atol=1e-6)
-
-
-MISTAKES = [
-    ({"shape": "sphere", "center": [0, 0, 0]}, 'needs radius for shape = "sphere"'),
-    ({"shape": "sphere", "radius": 1.0}, 'needs center for shape = "sphere"'),
-    ({**PLANE, "radius": 1.0}, "has radius, which is for 'sphere' only"),
-    ({"shape": "sphere", "center": [0, 0, 0], "radius": 1.0, "normal": [0, 0, 1]}, "normal, which is for 'plane' only"),
-    ({"shape": "sphere", "center": [0, 0, 0], "radius": 0.0}, "obstacle.0.radius: must be > 0"),
-]
-
-
-@pytest.mark.parametrize(("obstacle", "said"), MISTAKES)
-def test_a_sphere_that_is_none(tmp_path: Path, obstacle: dict, said: str):
-    with pytest.raises(InputError) as refused:
-        load_scene(block_scene(tmp_path, time={"step": 0.01, "duration": 0.1}, obstacle=[obstacle]))
-    assert said in str(refused.value)

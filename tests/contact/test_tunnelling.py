@@ -11,26 +11,18 @@ from block_scene import STIFFEST, block_scene, play
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from mpi4py import MPI
 from obstacles import box
 
-from msmpetsc.build import build_model
-from msmpetsc.constraints.loads import Motion
 from msmpetsc.contact.obstacles.penalty import Contact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
-from msmpetsc.scene.motion import Keyframe
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.energy_balance import Ledger
 from msmpetsc.solve.integrators.contact_faces import MOST_SOLVES
-from msmpetsc.solve.simulate import Simulation
 
 INTEGRATORS = ["implicit-euler", "bdf2", "verlet"]
 CUBE = box([0, 0, 0], [1, 1, 1])
 THIN = box([-5, -5, 0], [5, 5, 0.001])
 TOP, BOTTOM = 6, 3  # 1 + the faces of a box towards z and -z
-RISING = Motion.through([Keyframe(time=1.0, by=(0, 0, 100.0))])
 places = arrays(float, 3, elements=st.integers(-40, 40).map(lambda x: x / 16 + 0.511))
 
 
@@ -61,14 +53,6 @@ def test_no_plate_is_too_thin(thickness: float):
     plate = box([-5, -5, -thickness], [5, 5, 0])
     start = np.array([[0.3, 0.2, 0.7], [0.3, 0.2, -0.9]])
     assert plate.sides(start, -start, 1.0, 1.0).tolist() == [TOP, BOTTOM]
-
-
-def test_a_plate_that_moves_past_a_node_meets_it_on_the_side_it_came_from():
-    rising = box([-5, -5, 0], [5, 5, 0.001], RISING)
-    node, beside = np.array([[0.0, 0, 0.2], [6.0, 0, 0.2]]), np.array([[0.0, 0, 0.2], [6.0, 0, 0.2]])
-    assert rising.sides(node, beside, 0.005, 0.005).tolist() == [TOP, 0]
-    away = node + np.array([0, 0, 0.9])  # faster than the plate
-    assert rising.sides(node, away, 0.005, 0.005).tolist() == [0, 0]
 
 
 def test_a_side_is_kept_until_the_node_is_out_or_has_slid_off():
@@ -248,30 +232,6 @@ def totals(frames) -> np.ndarray:
     return np.array([frame.kinetic + frame.elastic + frame.potential + frame.contact for frame in frames])
 
 
-@pytest.mark.parametrize("restitution", [1.0, 0.5, 0.0])
-@pytest.mark.parametrize("thin", [False, True])
-def test_bdf2_gains_nothing_where_it_reflects(tmp_path: Path, restitution: float, thin: bool):
-    """A ball thrown down at 10 m/s, of which BDF2 loses 7% in so short an impact: it used to gain 20%."""
-    floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1]}
-    if thin:
-        floor = {"shape": "box", "box": [[-9, -9, -0.602], [9, 9, -0.6]]}
-    time = {"step": 0.001, "duration": 0.1, "integrator": "bdf2"}
-    gravity = {"acceleration": [0, 0, -9.81]}
-    path = ball(
-        tmp_path,
-        time=time,
-        gravity=gravity,
-        start={"velocity": [0, 0, -10.0]},
-        obstacle=[floor | {"restitution": restitution}],
-    )
-    model, frames = play(path)
-    total = totals(frames)
-    assert total.max() <= total[0] * (1 + 1e-6)
-    assert frames[-1].momentum[2] / model.lattice.mass.sum() > (6.5 if restitution == 1 else 3)
-    if restitution == 1:
-        assert total[-1] > 0.93 * total[0]
-
-
 def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
     floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "restitution": 0}
     time = {"step": 0.005, "duration": 1.0, "integrator": "bdf2"}
@@ -280,7 +240,7 @@ def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
     assert min(lowest) > -0.005 and abs(lowest[-1] - lowest[100]) < 1e-3
 
 
-@pytest.mark.parametrize("speed", [2.0, 5.0, 20.0])
+@pytest.mark.parametrize("speed", [2.0, 20.0])
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str, speed: float):
@@ -327,10 +287,6 @@ def test_swings_and_loose_steps_are_no_gain(tmp_path: Path, caplog: pytest.LogCa
     assert not told(caplog, "nowhere")
 
 
-def test_a_share_is_of_what_was_put_in():
-    assert Ledger().share == 0 and Ledger(put_in=4.0, gained=0.1, steady=0.2).share == 0.025
-
-
 # ---- nodes that begin inside
 
 
@@ -349,11 +305,3 @@ def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(tmp_path: 
     caplog.clear()
     play(path, "obstacle.1.point=[0, 0, 0]", "obstacle.2.start=9")
     assert not told(caplog, "inside obstacle")
-
-
-def test_a_scene_without_boxes_remembers_no_sides(tmp_path: Path):
-    ground = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
-    scene = load_scene(block_scene(tmp_path, time={"step": 0.01, "duration": 0.01}, obstacle=[ground]))
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        list(simulation.frames())
-        assert "sides" not in simulation.saved().rows and not simulation.state.sides.any()

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from lattices import one_spring
 
+from msmpetsc.elasticity.energy import Flops
 from msmpetsc.elasticity.springs import (
+    Springs,
     add_elastic_gradient,
     add_elastic_product,
     elastic_change,
@@ -18,66 +21,66 @@ REST = RNG.uniform(0.5, 1.5, len(SPRINGS))
 STIFFNESS = RNG.uniform(1, 100, len(SPRINGS))
 Q = RNG.normal(size=(N, 3))
 
-HOOKE = SPRINGS, REST, STIFFNESS, 0.0
-STIFFENING = SPRINGS, REST, STIFFNESS, 4.0
+HOOKE = Springs(SPRINGS, REST, STIFFNESS, 0.0)
+STIFFENING = Springs(SPRINGS, REST, STIFFNESS, 4.0)
 both_laws = pytest.mark.parametrize("elastic", [HOOKE, STIFFENING], ids=["linear", "stiffening"])
 
 
-def gradient(q: np.ndarray, elastic: tuple = HOOKE) -> np.ndarray:
+def gradient(q: np.ndarray, elastic: Springs = HOOKE) -> np.ndarray:
     g = np.zeros_like(q)
-    add_elastic_gradient(q, *elastic, g)
+    add_elastic_gradient(q, elastic, g)
     return g
 
 
-def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False, elastic: tuple = HOOKE) -> np.ndarray:
+def hessian_times(q: np.ndarray, v: np.ndarray, projected: bool = False, elastic: Springs = HOOKE) -> np.ndarray:
     product, blocks = np.zeros_like(q), np.empty((len(elastic[0]), 4))
-    elastic_hessian(q, *elastic, projected, blocks)
+    elastic_hessian(q, elastic, projected, blocks)
     add_elastic_product(elastic[0], blocks, v, product)
     return product
 
 
 def test_one_spring_has_hookes_energy_and_force():
     q = np.array([[0.0, 0, 0], [0, 3, 4]])
-    one = np.array([[0, 1]]), np.array([2.0]), np.array([10.0]), 0.0
-    assert elastic_energy(q, *one) == pytest.approx(0.5 * 10 * (5 - 2) ** 2)  # Eq. 13
+    one = Springs(np.array([[0, 1]]), np.array([2.0]), np.array([10.0]), 0.0)
+    assert elastic_energy(q, one) == pytest.approx(0.5 * 10 * (5 - 2) ** 2)  # Eq. 13
     g = np.zeros((2, 3))
-    add_elastic_gradient(q, *one, g)
+    add_elastic_gradient(q, one, g)
     np.testing.assert_allclose(g, [[0, -18, -24], [0, 18, 24]])  # k (l - r) along the spring
 
 
 def test_a_stiffening_spring_pulls_as_its_law_says():
     """k r (s + b s^3) at strain s = 3/2, and the energy k r^2 (s^2 / 2 + b s^4 / 4)."""
     q = np.array([[0.0, 0, 0], [0, 3, 4]])
-    one = np.array([[0, 1]]), np.array([2.0]), np.array([10.0]), 0.4
+    one = Springs(np.array([[0, 1]]), np.array([2.0]), np.array([10.0]), 0.4)
     g = np.zeros((2, 3))
-    add_elastic_gradient(q, *one, g)
+    add_elastic_gradient(q, one, g)
     pull = 10 * 2 * (1.5 + 0.4 * 1.5**3)
     np.testing.assert_allclose(g, [[0, -0.6 * pull, -0.8 * pull], [0, 0.6 * pull, 0.8 * pull]], rtol=1e-14)
-    assert elastic_energy(q, *one) == pytest.approx(10 * 2**2 * (1.5**2 / 2 + 0.4 * 1.5**4 / 4), rel=1e-14)
+    assert elastic_energy(q, one) == pytest.approx(10 * 2**2 * (1.5**2 / 2 + 0.4 * 1.5**4 / 4), rel=1e-14)
 
 
 @both_laws
-def test_gradient_is_the_slope_of_the_energy(elastic: tuple):
+def test_gradient_is_the_slope_of_the_energy(elastic: Springs):
     v = RNG.normal(size=Q.shape)
     step = 1e-5
-    slope = (elastic_energy(Q + step * v, *elastic) - elastic_energy(Q - step * v, *elastic)) / (2 * step)
+    slope = (elastic_energy(Q + step * v, elastic) - elastic_energy(Q - step * v, elastic)) / (2 * step)
     assert (gradient(Q, elastic) * v).sum() == pytest.approx(slope, rel=1e-8)
 
 
 @both_laws
-def test_hessian_is_the_slope_of_the_gradient(elastic: tuple):
+def test_hessian_is_the_slope_of_the_gradient(elastic: Springs):
     v = RNG.normal(size=Q.shape)
     step = 1e-5
     slope = (gradient(Q + step * v, elastic) - gradient(Q - step * v, elastic)) / (2 * step)
     np.testing.assert_allclose(hessian_times(Q, v, elastic=elastic), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
-def dense_hessian(q: np.ndarray, projected: bool, elastic: tuple) -> np.ndarray:
+def dense_hessian(q: np.ndarray, projected: bool, elastic: Springs) -> np.ndarray:
     return np.array([hessian_times(q, unit.reshape(N, 3), projected, elastic).ravel() for unit in np.eye(3 * N)])
 
 
 @both_laws
-def test_projected_hessian_is_positive_where_the_true_one_is_not(elastic: tuple):
+def test_projected_hessian_is_positive_where_the_true_one_is_not(elastic: Springs):
     pressed = 0.2 * Q
     true, projected = dense_hessian(pressed, False, elastic), dense_hessian(pressed, True, elastic)
     np.testing.assert_allclose(true, true.T, atol=1e-13 * abs(true).max())
@@ -88,22 +91,27 @@ def test_projected_hessian_is_positive_where_the_true_one_is_not(elastic: tuple)
 
 
 @both_laws
-def test_a_change_of_energy_keeps_its_digits(elastic: tuple):
+def test_a_change_of_energy_keeps_its_digits(elastic: Springs):
     """Against the first and second derivative: a plain difference of energies has no digit left here."""
     v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q  # as it is after rounding
     first, second = (gradient(Q, elastic) * v).sum(), 0.5 * (hessian_times(Q, v, elastic=elastic) * v).sum()
-    change = elastic_change(Q + v, Q, *elastic)
+    change = elastic_change(Q + v, Q, elastic)
     assert change - first == pytest.approx(
         second, rel=1e-4, abs=0
     )  # near a minimum only this is left, without the loads
     far = 3 * Q + 1
-    plain = elastic_energy(far, *elastic) - elastic_energy(Q, *elastic)
-    assert elastic_change(far, Q, *elastic) == pytest.approx(plain, rel=1e-12)
+    plain = elastic_energy(far, elastic) - elastic_energy(Q, elastic)
+    assert elastic_change(far, Q, elastic) == pytest.approx(plain, rel=1e-12)
 
 
 @both_laws
-def test_springs_without_length_pull_nothing_and_give_no_nan(elastic: tuple):
+def test_springs_without_length_pull_nothing_and_give_no_nan(elastic: Springs):
     q = np.zeros((N, 3))
     np.testing.assert_array_equal(gradient(q, elastic), 0)
     assert np.isfinite(hessian_times(q, Q, elastic=elastic)).all()
-    assert elastic_energy(q, *elastic) == pytest.approx((0.5 + elastic[3] / 4) * STIFFNESS @ REST**2)
+    assert elastic_energy(q, elastic) == pytest.approx((0.5 + elastic[3] / 4) * STIFFNESS @ REST**2)
+
+
+def test_a_lattice_has_the_operations_of_its_springs_and_nodes():
+    counts = Flops.of_lattice(one_spring(1.0, 1.0, 1.0))
+    assert (counts.gradient, counts.change, counts.hessian, counts.product) == (22 + 30, 38 + 72, 20, 23 + 18)

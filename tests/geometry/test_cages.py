@@ -21,9 +21,8 @@ from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, Body, Cages, choose_cell_size, fill
+from msmpetsc.geometry.cages import BOUNDARY, INTERIOR, BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.grid import LIMIT, decode_morton, encode_morton
-from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, compact, examine
 from msmpetsc.geometry.touched_cells import sampled_cells, touched_cells
@@ -44,19 +43,6 @@ def test_morton_round_trip_in_the_order_of_the_interleaved_bits(ijk):
     assert np.array_equal(decode_morton(keys), ijk)
     bits = ["".join(f"{k:021b}"[b] + f"{j:021b}"[b] + f"{i:021b}"[b] for b in range(21)) for i, j, k in ijk.tolist()]
     assert keys.tolist() == [int(b, 2) for b in bits]
-
-
-@given(st.integers(0, LIMIT - 2), st.integers(0, 2), arrays(np.int64, 3, elements=st.integers(0, 99_999)))
-def test_morton_keeps_the_order_along_each_axis(at, axis, ijk):
-    low, high = ijk.copy(), ijk.copy()
-    low[axis], high[axis] = at, at + 1
-    assert encode_morton(low) < encode_morton(high)
-
-
-def test_morton_is_minus_one_outside():
-    outside = np.array([[-1, 0, 0], [0, LIMIT, 0], [5, 5, -7], [0, 0, 1 << 40]])
-    assert (encode_morton(outside) == -1).all()
-    assert encode_morton(outside[:, None]).shape == (4, 1)
 
 
 # --- boundary cells ---
@@ -105,12 +91,6 @@ def test_touched_cells_are_those_of_a_separating_axis_test(triangle):
     assert_exact(triangle)
 
 
-def test_for_most_triangles_the_oracle_leaves_no_choice():
-    rng = np.random.default_rng(1)
-    decided = [assert_exact(2 * rng.integers(0, SIDE * UNIT // 2, (3, 3)) + 1) for _ in range(200)]
-    assert np.mean(decided) > 0.95
-
-
 @settings(max_examples=300, deadline=None)  # the first example compiles
 @given(arrays(np.int64, (3, 3), elements=st.integers(0, 300 * 1024)), st.integers(0, 8), st.sampled_from([1, 1024]))
 def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
@@ -122,48 +102,6 @@ def test_every_point_of_a_triangle_lies_in_a_marked_cell(corners, power, unit):
     points = a + i[:, None] * (b - a) + j[:, None] * (c - a)
     marked = touched_cells(corners[None], np.zeros(3, np.int64), np.full(3, 301))
     assert np.isin(encode_morton(np.floor(points).astype(np.int64)), encode_morton(marked)).all()
-
-
-def through_grid_points(count: int) -> np.ndarray:
-    """Triangles of one side through a grid point, at a place where interpolation rounds: (count, 3, 3)."""
-    rng = np.random.default_rng(2)
-    grid_point, side = rng.integers(5, 15, (count, 3)), rng.normal(size=(count, 3))
-    before, after = rng.integers(1, 4, (2, count, 1))
-    a, b = grid_point - before * side, grid_point + after * side
-    return np.stack([a, b, rng.uniform(0, 20, (count, 3))], axis=1)
-
-
-def test_cut_into_slabs_a_triangle_marks_the_same_cells():
-    for triangle in through_grid_points(1000):
-        slabs = [cells_of(triangle, low=(i, -9, -9), high=(i + 1, 30, 30)) for i in range(20)]
-        assert set.union(*slabs) == cells_of(triangle, low=(0, -9, -9), high=(20, 30, 30))
-
-
-def test_a_long_sliver_marks_what_its_axis_passes():
-    # its edges rise from y = 1/2 at x = 1/2 and reach y = 1 at x = 500.5 and 500.99: both in cell 500
-    corners = np.array([[0.5, 0.5, 0.5], [1000.5, 1.5, 0.5], [1000.5, 1.5 - 1 / 1024, 0.5]])
-    lower, upper = {(i, 0, 0) for i in range(501)}, {(i, 1, 0) for i in range(500, 1001)}
-    assert cells_of(corners, high=(1001, 9, 9)) == lower | upper
-
-
-def test_points_and_segments_are_triangles_too():
-    assert cells_of(np.full((3, 3), 2.5)) == {(2, 2, 2)}
-    assert cells_of(np.full((3, 3), 2.0)) == {(2, 2, 2)}  # low faces are the cell's own
-    segment = np.array([[0.5, 0.5, 0.5], [4.5, 0.5, 0.5], [2.0, 0.5, 0.5]])
-    assert cells_of(segment) == {(i, 0, 0) for i in range(5)}
-    assert assert_exact(np.array([[1, 3, 5], [381, 211, 77], [1, 3, 5]]))  # a slanted one
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_triangle_in_a_grid_plane_marks_the_layer_above_it(axis):
-    flat = np.array([[0.3, 0.2, 3.0], [5.7, 1.1, 3.0], [2.9, 5.3, 3.0]])
-    assert {cell[axis] for cell in cells_of(np.roll(flat, axis + 1, axis=1))} == {3}
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_triangle_that_stands_on_a_grid_plane_marks_nothing_below(axis):
-    standing = np.array([[0.5, 0.5, 3.0], [5.3, 0.7, 3.0], [2.1, 4.4, 5.2]])
-    assert {cell[axis] for cell in cells_of(np.roll(standing, axis + 1, axis=1))} == {3, 4, 5}
 
 
 @pytest.mark.parametrize("mark", [touched_cells, sampled_cells])
@@ -185,22 +123,15 @@ def test_the_papers_samples_miss_cells_that_a_sphere_grazes():
     assert len(exact - sample) > 0.02 * len(exact)
 
 
-def test_the_papers_samples_hold_every_corner():
-    triangles = np.random.default_rng(4).uniform(0, SIDE, (500, 3, 3))
-    triangles[:, :, 0] = np.floor(triangles[:, :, 0])  # on grid planes, where rounding down changes the cell
-    corners = set(map(tuple, np.floor(triangles).astype(int).reshape(-1, 3).tolist()))
-    assert corners <= cells_of(triangles, sampled_cells)
-
-
 # --- interior cells ---
 
 
-def body_of(mesh: trimesh.Trimesh | Surface) -> Body:
+def body_of(mesh: trimesh.Trimesh | Surface) -> BodySurface:
     if isinstance(mesh, trimesh.Trimesh):
         mesh = Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
     surface = compact(mesh.points, mesh.triangles)
     bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return Body(MPI.COMM_SELF, surface, examine(surface), bounds)
+    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)
 
 
 def dense(cages: Cages, kind: int) -> np.ndarray:
@@ -238,15 +169,6 @@ def test_interior_is_what_a_dense_flood_fill_finds(name):
     assert np.array_equal(dense(cages, INTERIOR), enclosed(dense(cages, BOUNDARY)))
 
 
-@pytest.mark.parametrize("name", ["torus", "two balls"])
-def test_valid_cells_have_the_bodys_volume_and_half_its_boundary_cells_more(name):
-    mesh, cell_size = SHAPES[name]
-    cages = fill([body_of(mesh)], cell_size)
-    boundary = (cages.kind == BOUNDARY).sum()
-    # a smooth surface cuts its cells in half on average
-    assert (len(cages.kind) - boundary / 2) * cell_size**3 == pytest.approx(mesh.volume, rel=0.02)
-
-
 @pytest.mark.parametrize("turned", [True, False])
 @pytest.mark.parametrize("boundary", ["whole", "fill"])
 def test_a_cavity_is_filled_but_where_cells_count_by_what_is_inside_and_it_is_wound_as_one(turned, boundary):
@@ -272,7 +194,7 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
 # --- cages ---
 
 
-def aligned_box(lid: bool = True) -> Body:
+def aligned_box(lid: bool = True) -> BodySurface:
     box = trimesh.creation.box((1, 0.5, 0.3))
     box.vertices = np.array([1, 0.5, 0.3]) * (box.vertices > 0)
     if not lid:
@@ -293,14 +215,6 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     cages = fill([body], 0.1)
     assert len(cages.kind) == 150
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2  # one layer more: no triangle marks the upper
-
-
-def test_the_longest_side_may_be_any():
-    whole = fill([aligned_box()], 0.1).ijk
-    for turns in (1, 2):
-        points = np.roll(aligned_box().surface.points, turns, axis=1)
-        turned = fill([body_of(Surface(points, aligned_box().surface.triangles))], 0.1).ijk
-        assert set(map(tuple, np.roll(turned, -turns, axis=1))) == set(map(tuple, whole))
 
 
 @pytest.fixture(scope="module")
@@ -340,24 +254,12 @@ def test_too_many_cells_are_refused():
         fill([aligned_box()], 1e-8)
 
 
-@with_meshes
-def test_an_unrepaired_scan_has_the_cells_of_the_repaired_one():
-    scan = read_surface(MESHES / "nasty_bunny_nonmanifold.ply")
-    whole = body_of(prepare(scan, ["repair"]))
-    open_body = body_of(scan)
-    assert whole.report.closed and not open_body.report.closed
-    cells = fill([whole], 2.0), fill([open_body], 2.0)
-    found, expected = (set(map(tuple, np.rint(c.grids.node_positions(c.ijk) / 2 * 4))) for c in cells)
-    assert len(found) == pytest.approx(len(expected), rel=0.03)
-    assert len(expected) > 3000
-
-
 # --- cell size ---
 
 
 @with_meshes
-@pytest.mark.parametrize("count", [1000, 9946, 30_000])
-@pytest.mark.parametrize("name", ["armadillo", "bunny", "dragon", "heart", "lung"])
+@pytest.mark.parametrize("count", [1000, 9946])
+@pytest.mark.parametrize("name", ["armadillo", "heart", "lung"])
 def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
     body = body_of(read_surface(MESHES / f"{name}.ply"))
     cages = fill([body], choose_cell_size([body], count))

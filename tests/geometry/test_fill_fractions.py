@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from mpi4py import MPI
 
-from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, Body, Cages, fill
+from msmpetsc.geometry.cages import BOUNDARY, LEAST_SHARE, BodySurface, Cages, fill
 from msmpetsc.geometry.fill_fractions import Columns
 from msmpetsc.geometry.surface import Surface, examine
 
@@ -74,9 +74,9 @@ def test_corners_of_an_oblique_cell_are_those_of_many_samples():
 # ---- cages
 
 
-def body_of(mesh: trimesh.Trimesh) -> Body:
+def body_of(mesh: trimesh.Trimesh) -> BodySurface:
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
-    return Body(MPI.COMM_SELF, surface, examine(surface), np.array(mesh.bounds))
+    return BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(mesh.bounds))
 
 
 def volume(cages: Cages) -> float:

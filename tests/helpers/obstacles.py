@@ -3,7 +3,7 @@
 import numpy as np
 
 from msmpetsc.constraints.loads import Motion
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces
 
 STILL = Motion.through(())

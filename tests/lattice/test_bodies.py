@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,11 @@ from mpi4py import MPI
 import msmpetsc as package
 from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.grid import LIMIT, BodyGrids, decode_morton, encode_morton
+from msmpetsc.geometry.grid import LIMIT, BodyGrids, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
 from msmpetsc.results.compare import compare
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.multigrid.grids import grid_indices
 from msmpetsc.study.metrics import distance_of_shapes, shape_error
-from msmpetsc.view.overlays import Rest, fixed_nodes
 
 H = 0.125
 UPPER = {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}
@@ -188,11 +185,6 @@ def test_coarse_cells_join_no_bodies_until_they_are_as_large():
         assert not reached[0] & reached[1] and not reached[1] & reached[2]
 
 
-def test_multigrid_knows_the_numbers_of_nodes(folder: Path):
-    lattice = build_model(MPI.COMM_SELF, load_scene(write(folder, "numbers", body=BODIES))).lattice
-    np.testing.assert_array_equal(grid_indices(SimpleNamespace(lattice=lattice)), decode_morton(lattice.table.keys))
-
-
 def test_more_cells_than_can_be_numbered_are_refused():
     with pytest.raises(InputError, match="too small to number the cells of 40000 bodies: at most 13 along a side"):
         grids(*[(20, 20, 20)] * 40_000)
@@ -222,21 +214,6 @@ def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
     assert lattice.pinned[first].any() and not lattice.pinned[~first].any()
     assert (velocity[first & ~lattice.pinned] == [1, 0, 0]).all() and (velocity[~first] == [0, 1, 0]).all()
     np.testing.assert_allclose(lattice.mass[first], lattice.mass[~first], rtol=1e-12)  # the part is of both
-
-
-def test_pins_are_drawn_on_their_own_body(folder: Path):
-    scene = load_scene(write(folder, "drawn", body=BODIES))
-    model = build_model(MPI.COMM_SELF, scene)
-    surface, lattice = model.surface, model.lattice
-    of_point = np.repeat(range(3), [len(body.surface.points) for body in model.bodies])
-    rest = Rest(lattice.nodes, lattice.cells, surface.points, lattice.body, of_point)
-    fixed = fixed_nodes(scene, 0.05, rest)
-    assert not fixed[lattice.body == 0].any()
-    np.testing.assert_array_equal(fixed & (lattice.body == 1), lattice.pinned)
-    np.testing.assert_array_equal(fixed & (lattice.body == 2), model.anchors[0].where)
-    (force,) = scene.tables("force")
-    (load,) = [load for load in model.loads[1:]]
-    np.testing.assert_array_equal(rest.find(force), load.force.any(axis=1))
 
 
 def test_in_statics_each_body_must_be_held(folder: Path):
@@ -299,11 +276,3 @@ def test_mistakes_in_a_body_name_it(folder: Path, change: str, said: str):
     with pytest.raises(InputError) as refused:
         build_model(MPI.COMM_SELF, load_scene(path, [change], by_user="../" not in change))
     assert said in str(refused.value)
-
-
-def test_a_mistake_in_a_body_has_its_line(folder: Path):
-    text = write(folder, "lines", body=BODIES).read_text().replace('source = "bar.ply"', "source = 1")
-    (folder / "lines.toml").write_text(text)
-    line = text.split("\n").index("source = 1") + 1
-    with pytest.raises(InputError, match=rf"body\.1\.mesh\.source: must be a string, got 1 \(line {line}\)"):
-        load_scene(folder / "lines.toml")

@@ -10,10 +10,10 @@ from conftest import ROOT
 from mpi4py import MPI
 
 from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
-from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import build_lattice
 
 STUDY = runpy.run_path(str(ROOT / "scripts" / "material_study.py"))
 E, DENSITY = STUDY["E"], STUDY["DENSITY"]
@@ -86,7 +86,7 @@ def test_a_ball_rings_as_lambs():
 
 def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():
     surface = Surface(*(np.array(part) for part in (BALL.vertices, BALL.faces)))
-    body = Body(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
+    body = BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
     cages = fill([body], 0.2)
     lattice = build_lattice(cages, DENSITY, E)
     outside = distance_outside(lattice, nearest_of_body([body], cages, lattice))
@@ -98,13 +98,3 @@ def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_do
 
 
 BALL = trimesh.creation.icosphere(4)
-
-
-def whole(lattice: Lattice) -> bool:
-    return bool((lattice.cell_share == 1).all())
-
-
-def test_whole_cells_are_those_of_the_paper():
-    lattice = STUDY["lattice_of"](BALL, 0.2, "whole")
-    assert whole(lattice) and lattice.mass.sum() == pytest.approx(DENSITY * len(lattice.cells) * 0.2**3)
-    assert not whole(STUDY["lattice_of"](BALL, 0.2, "fill"))

@@ -5,12 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lattices import DENSITY, E, H, block, cages_of
-from mpi4py import MPI
 
-from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.lattice.lattice import CORNERS, Lattice, build_lattice
-from msmpetsc.lattice.material import EDGE, FACE_DIAGONAL, SPACE_DIAGONAL, calibrated_stiffness
+from msmpetsc.lattice.material import calibrated_stiffness
 
 
 def springs_by_definition(cells: np.ndarray) -> dict[frozenset, int]:
@@ -57,41 +55,6 @@ def test_cells_name_their_corners_in_vtk_order():
     place = np.array(grid_index(lattice, cages))
     np.testing.assert_array_equal(place[lattice.cells] - place[lattice.cells][:, :1], np.tile(CORNERS, (12, 1, 1)))
     np.testing.assert_array_equal(lattice.stiffness, 7.0)
-
-
-def test_an_inner_node_has_26_springs_and_no_node_more():
-    lattice = build_lattice(cages_of(block(3, 3, 3)), DENSITY, stiffness=1.0)
-    count = np.bincount(lattice.springs.ravel())
-    assert sorted(count)[-8:] == [26] * 8 and sorted(count)[:8] == [7] * 8  # 8 inner nodes, 8 corners
-
-
-STRAINS = {
-    # strain, and 2 * energy density / E for E, nu = 1/4: C11 = 6/5 E, C12 = C44 = 2/5 E
-    "stretch": (np.diag([1.0, 0, 0]), 6 / 5),
-    "shear": (np.array([[0, 0.5, 0], [0.5, 0, 0], [0, 0, 0]]), 2 / 5),
-    "swelling": (np.eye(3), 3 * 6 / 5 + 6 * 2 / 5),
-    "uniaxial stress": (np.diag([1, -0.25, -0.25]), 1.0),  # E itself, Poisson's ratio 1/4
-}
-
-
-@pytest.mark.parametrize("name", STRAINS)
-@pytest.mark.parametrize("rotation", [np.eye(3), np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])])
-def test_a_strained_block_stores_the_energy_of_an_isotropic_solid(name: str, rotation: np.ndarray):
-    """Small uniform strain in any direction; exact for a whole block, its boundary included."""
-    strain, twice_density = STRAINS[name]
-    lattice = build_lattice(cages_of(block(4, 3, 2)), DENSITY, young_modulus=E)
-    size = 1e-7
-    q = lattice.nodes @ (np.eye(3) + size * rotation @ strain @ rotation.T)
-    energy = Elasticity(MPI.COMM_SELF, lattice).energy(q)
-    assert energy == pytest.approx(0.5 * twice_density * E * size**2 * 24 * H**3, rel=1e-5)
-
-
-def test_the_three_stiffnesses_of_a_bulk_lattice():
-    """E = 7/4 k1 / h and isotropy k1 = k2 + 8/3 k3 (msmpetsc/README.md: lattice elasticity)."""
-    kinds = np.array([EDGE, FACE_DIAGONAL, SPACE_DIAGONAL])
-    k1, k2, k3 = calibrated_stiffness(E, H, kinds, np.array([4, 2, 1]))
-    assert 7 / 4 * k1 / H == pytest.approx(E) and k1 == pytest.approx(k2 + 8 / 3 * k3)
-    assert 5 / 2 * (k2 + 4 / 3 * k3) / H == pytest.approx(E)
 
 
 def test_pins_are_kept_together():

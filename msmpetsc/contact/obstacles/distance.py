@@ -1,11 +1,11 @@
 """Solids known by the distance to their surface, which may be a function of the user's own."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
-from msmpetsc.contact.obstacles.solids import TINY, Send, one_face
+from msmpetsc.contact.obstacles.solids import TINY, Solid, one_face
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
@@ -15,16 +15,13 @@ BEYOND = 1.0  # around the bodies, of their longest side: so far it is shown
 NEAR = 1e-4  # of the depth: over a shorter way a depth's slope gives more digits of its change than two depths
 
 
-class DistanceSolid(ABC):
+class DistanceSolid(Solid):
     """A solid that is asked on the CPU, where a step often asks for the same positions again."""
-
-    has_sides = False
 
     def __init__(self) -> None:
         self._last: tuple[Positions, Floats, Indices] | None = None
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m] and their faces (n,), known of the positions asked for last."""
         on_host = to_host(q)
         if self._last is None or not np.array_equal(self._last[0], on_host):
             self._last = (on_host.copy(), *self._find(on_host))
@@ -32,7 +29,6 @@ class DistanceSolid(ABC):
         return like(q, depths.copy()), like(q, face.copy())
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return like(q, self._behind(to_host(q), to_host(face))[1])
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
@@ -47,10 +43,6 @@ class DistanceSolid(ABC):
         near &= (normal * normal_before).sum(axis=1) > 0
         slope = -0.5 * (way * (normal + normal_before)).sum(axis=1)
         return like(q, np.where(near, slope, depth - depth_before))
-
-    def sent(self, send: Send) -> "DistanceSolid":
-        """Return the solid itself: what is asked on the CPU stays there."""
-        return self
 
     @abstractmethod
     def surface(self, low: Positions, high: Positions) -> Surface:

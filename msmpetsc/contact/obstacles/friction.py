@@ -50,7 +50,9 @@ class Friction:
         beyond = np.maximum(length, e) - np.maximum(length_0, e)
         within = np.where(np.maximum(length, length_0) < e, longer, low - low_0)
         beyond = np.where(np.minimum(length, length_0) >= e, longer, beyond)
-        return self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
+        return float(
+            self.limit @ (within * ((low + low_0) / e - (low**2 + low * low_0 + low_0**2) / (3 * e**2)) + beyond)
+        )
 
     def slope(self, u: Floats) -> Floats:
         """Return f'(u) / u, (a,) [1/m]."""
@@ -68,7 +70,8 @@ class Friction:
     def passes_kink(self, q: Positions, base: Positions) -> Mask:
         """Return which nodes turn round or come to stick on their way from base to q, (a,) bool."""
         (u, length), (u_0, length_0) = self.slip(q), self.slip(base)
-        return ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
+        passes: Mask = ((u * u_0).sum(axis=1) < 0) | ((length < self.stick) & (length_0 >= self.stick))
+        return passes
 
     def blocks(self, q: Positions, true: bool, secant: Mask | None = None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) d d^T), d the slip's direction, (a, 3, 3) [N/m].

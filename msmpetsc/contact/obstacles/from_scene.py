@@ -10,7 +10,7 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.comm import log, on_root, together
 from msmpetsc.constraints.loads import Motion
 from msmpetsc.contact.obstacles.distance import DistanceSolid, FunctionSolid
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Solid
 from msmpetsc.errors import InputError
 from msmpetsc.extensions import OBSTACLES

@@ -1,5 +1,6 @@
 """The inside of a closed surface mesh as a solid."""
 
+from collections.abc import Callable
 from weakref import finalize
 
 import igl
@@ -11,6 +12,10 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.solids import TINY
 from msmpetsc.geometry.surface import Surface
+
+# of triangles (n, 3, 3), each with a point (n, 3); trimesh says no types
+NEAREST_POINTS: Callable[[Rows, Positions], Positions] = closest_point
+BARYCENTRIC: Callable[[Rows, Positions], Rows] = points_to_barycentric
 
 ON_AN_EDGE = 1e-9  # barycentric
 ROUNDED = 1e-14  # of the largest coordinate: a nearest point that is no farther gives no direction
@@ -29,7 +34,10 @@ class MeshSolid(DistanceSolid):
         self.points = np.ascontiguousarray(mesh.vertices, float)
         self.triangles = np.ascontiguousarray(mesh.faces, np.int64)
         self._normals, self._of_corners = np.array(mesh.face_normals), np.array(mesh.vertex_normals)
-        self._of_edges = self._normals[:, None] + self._normals[_neighbours(mesh)]
+        normals, _, of_edge = igl.per_edge_normals(
+            self.points, self.triangles, igl.PerEdgeNormalsWeightingType.PER_EDGE_NORMALS_WEIGHTING_TYPE_UNIFORM
+        )
+        self._of_edges = normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)  # of each triangle, facing its corners
         self._bounds = np.array(mesh.bounds)
         tree = igl.AABB()
         tree.init(self.points, self.triangles)
@@ -52,7 +60,7 @@ class MeshSolid(DistanceSolid):
         return depths, face
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        out = closest_point(self.points[self.triangles[face]], q) - q
+        out = NEAREST_POINTS(self.points[self.triangles[face]], q) - q
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]
@@ -60,20 +68,10 @@ class MeshSolid(DistanceSolid):
 
     def _pseudonormals(self, on_surface: Positions, face: Indices) -> Rows:
         """Return directions (n, 3) outwards at points (n, 3) of triangles (n,)."""
-        weights = points_to_barycentric(self.points[self.triangles[face]], on_surface)
+        weights = BARYCENTRIC(self.points[self.triangles[face]], on_surface)
         zero = weights < ON_AN_EDGE
         count, normals = zero.sum(axis=1), self._normals[face]
         edge, corner = count == 1, count > 1
         normals[edge] = self._of_edges[face[edge], zero[edge].argmax(axis=1)]
         normals[corner] = self._of_corners[self.triangles[face[corner], weights[corner].argmax(axis=1)]]
         return normals
-
-
-def _neighbours(mesh: trimesh.Trimesh) -> Indices:
-    """Return of each triangle the one across the edge that faces each corner, (t, 3); itself where there is none."""
-    neighbours = np.repeat(np.arange(len(mesh.faces))[:, None], 3, axis=1)
-    for own, other in ((0, 1), (1, 0)):
-        triangle = mesh.face_adjacency[:, own]
-        on_edge = (mesh.faces[triangle][:, :, None] == mesh.face_adjacency_edges[:, None, :]).any(axis=2)
-        neighbours[triangle, (~on_edge).argmax(axis=1)] = mesh.face_adjacency[:, other]
-    return neighbours

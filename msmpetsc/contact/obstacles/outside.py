@@ -11,7 +11,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.comm import Route
-from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.lattice.lattice import Lattice
@@ -19,7 +19,7 @@ from msmpetsc.lattice.lattice import Lattice
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
 
 
-def nearest_of_body(bodies: Sequence[Body], cages: Cages, lattice: Lattice) -> Positions:
+def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice) -> Positions:
     """Return the point (l, 3) [m] of its body that each node is nearest to at rest (collective).
 
     It is the node itself but where that sticks out of the surface.
@@ -51,4 +51,5 @@ def _drawn_in(surface: Surface, points: Positions) -> Positions:
 
 def distance_outside(lattice: Lattice, nearest: Positions) -> Floats:
     """Return how far each node (l,) sticks out of its body at rest [m], from the nearest points (l, 3) of that."""
-    return np.linalg.norm(lattice.nodes - nearest, axis=1)
+    outside: Floats = np.linalg.norm(lattice.nodes - nearest, axis=1)
+    return outside

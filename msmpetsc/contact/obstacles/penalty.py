@@ -1,5 +1,5 @@
 """Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
-and Coulomb friction (contact.friction) on those that were.
+and Coulomb friction (contact.obstacles.friction) on those that were.
 
 A node at depth d > 0 has the energy 1/2 k d^2. It is convex for one face, and so is what a step minimises.
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 if TYPE_CHECKING:
     from msmpetsc.contact.surface.term import SurfaceContact
@@ -85,7 +85,7 @@ class ContactState:
 
     stiffness : [N/m] on each node
     friction  : of the step, if any
-    sides     : (owned or more,) by which face each node came in (faces.side_of); None: the nearest
+    sides     : (owned or more,) by which face each node came in (solids.side_of); None: the nearest
     """
 
     obstacle: Obstacle
@@ -146,7 +146,7 @@ class Contact:
         for state in self.states:
             total += state.change(q[: self.owned], base[: self.owned])
             if state.friction:
-                total += float(state.friction.change(q, base))
+                total += state.friction.change(q, base)
         return total
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:

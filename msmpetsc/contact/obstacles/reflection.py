@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, like
-from msmpetsc.contact.obstacles.obstacle import Obstacle
+from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ def striking(obstacle: Obstacle, q: Positions, q_previous: Positions, step: Step
     if not obstacle.acts_at(time):
         return np.zeros(0, np.int64), np.zeros((0, 3))
     sides = step.sides
-    if sides is None and obstacle.has_sides:
+    if sides is None and obstacle.solid.has_sides:
         sides = obstacle.sides(q_previous, q, time, step.length)
     inside, face = obstacle.depths(q, time, sides)
     behind = inside >= 0
-    if sides is not None and obstacle.has_sides:
+    if sides is not None and obstacle.solid.has_sides:
         behind &= sides > 0
     rows = np.flatnonzero(behind)
     normal = obstacle.normals_at(q[rows], time, face[rows])

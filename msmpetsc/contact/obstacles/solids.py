@@ -3,67 +3,143 @@
 Each at its place at time 0; where an obstacle has moved, positions are as seen from it.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
+import numba
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.contact.obstacles.faces import depth, side_of
 
 TINY = 1e-300  # [m]
+OPPOSITE = -1 + 1e-9  # cosine of two faces that look away from each other
+ROUNDED = 1e-12  # of a node's way: a plate as thin as that is not passed either
 
 Send = Callable[[Array], Array]
 
 
-class Solid(Protocol):
+class Solid(ABC):
     """A solid. Positions are (n, 3) [m]; a face is what a node comes in by, one of several or the only one, 0."""
 
     @property
     def has_sides(self) -> bool:
-        """Whether it matters by which of its faces a node came in: then there is a ``sides_of``, as of Faces."""
-        ...
+        """Whether it matters by which of its faces a node came in."""
+        return False
 
+    @abstractmethod
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
         """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or else the nearest, and
         that face (n,).
 
         Outside it is negative, and no less than minus the distance.
         """
-        ...
 
+    @abstractmethod
     def normals(self, q: Positions, face: Indices) -> Rows:
         """Return the unit normals (n, 3) of the faces (n,) at positions within."""
-        ...
 
+    @abstractmethod
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
         """Return how much deeper positions within lie behind faces (n,) than ``moved`` (n, 3) [m] before, (n,) [m].
 
         A difference of depths would keep only the digits of a position.
         """
-        ...
 
     def sent(self, send: Send) -> "Solid":
         """Return it with the arrays that each step works with sent where ``send`` takes them."""
-        ...
+        return self
+
+
+@numba.njit(cache=True)
+def behind(x: Positions, points: Positions, normals: Rows, face: int) -> float:
+    """Return how far x (3,) lies behind a face [m]; negative in front of it."""
+    distance = 0.0
+    for c in range(3):
+        distance -= normals[face, c] * (x[c] - points[face, c])
+    return distance
+
+
+@numba.njit(cache=True)
+def depth(x: Positions, points: Positions, normals: Rows, side: int) -> tuple[float, int]:
+    """Return how deep x (3,) lies behind the face of its ``side`` [m], and that face.
+
+    Without a side: how deep in the solid, not positive outside, and the nearest face.
+    """
+    if side > 0:
+        return behind(x, points, normals, side - 1), side - 1
+    least, face = np.inf, 0
+    for f in range(len(points)):
+        distance = behind(x, points, normals, f)
+        if distance < least:
+            least, face = distance, f
+    return least, face
+
+
+@numba.njit(cache=True)
+def _stays(x: Positions, points: Positions, normals: Rows, face: int) -> bool:
+    """Return whether x lies behind a face and has not slid off it past another.
+
+    The opposite face is left aside: that of a thin plate may be passed.
+    """
+    if behind(x, points, normals, face) <= 0.0:
+        return False
+    for f in range(len(points)):
+        along = 0.0
+        for c in range(3):
+            along += normals[f, c] * normals[face, c]
+        if along > OPPOSITE and behind(x, points, normals, f) <= 0.0:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side: int) -> int:
+    """Return 1 + the face by which a node is in contact on its straight way from x to ``end`` (3,), 0 if it meets none.
+
+    side : by which it was before: it keeps that until it is out of the solid
+
+    It is the node that counts here, however far it sticks out of the surface: with a side, but no depth yet, it is on
+    its way in, or out again.
+    """
+    if side > 0 and _stays(x, points, normals, side - 1):
+        return side
+    inside, face = depth(x, points, normals, 0)
+    if inside > 0.0:
+        return face + 1
+    enter, leave, side = -1.0, 1.0, 0  # fractions of the way
+    for f in range(len(points)):
+        first, last = behind(x, points, normals, f), behind(end, points, normals, f)
+        if first <= 0.0:
+            if last < 0.0 or last == first:
+                return 0
+            crossing = first / (first - last)
+            if crossing > enter:
+                enter, side = crossing, f + 1
+        elif last <= 0.0:
+            leave = min(leave, first / (first - last))
+    return side if enter <= leave + ROUNDED else 0
 
 
 @kernel
-def _depths_of(first, count, step, q, points, normals, sides, depths, face):
+def _depths_of(
+    first: int, count: int, step: int, q: Rows, points: Rows, normals: Rows, sides: Indices, depths: Rows, face: Indices
+) -> None:
     for i in range(first, count, step):
         depths[i], face[i] = depth(q[i], points, normals, sides[i])
 
 
 @kernel
-def _sides_of(first, count, step, q, end, points, normals, before, sides):
+def _sides_of(
+    first: int, count: int, step: int, q: Rows, end: Rows, points: Rows, normals: Rows, before: Indices, sides: Indices
+) -> None:
     for i in range(first, count, step):
         sides[i] = side_of(q[i], end[i], points, normals, before[i])
 
 
 @dataclass(frozen=True)
-class Faces:
+class Faces(Solid):
     """The points behind all faces: one face is a plane, six are a box.
 
     points, normals : (f, 3) a point of each face [m], its unit normal towards the free side
@@ -80,23 +156,20 @@ class Faces:
 
     @property
     def has_sides(self) -> bool:
-        """Whether there are several faces."""
         return len(self.points) > 1
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         depths, face = np.empty(len(q), like=q), np.empty(len(q), np.int64, like=q)
         sides = no_sides(q) if sides is None else sides
         _depths_of(len(q), q, self.points, self.normals_of_faces, sides, depths, face)
         return depths, face
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         return self.normals_of_faces[face]
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
-        """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m]."""
-        return -(moved * self.normals_of_faces[face]).sum(axis=1)
+        deeper: Floats = -(moved * self.normals_of_faces[face]).sum(axis=1)
+        return deeper
 
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
         """Return ``side_of`` (n,) of nodes that go straight from q to ``end`` (n, 3), ``before`` (n,) having sides."""
@@ -105,36 +178,33 @@ class Faces:
         return sides
 
     def sent(self, send: Send) -> "Faces":
-        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, points=send(self.points), normals_of_faces=send(self.normals_of_faces))
 
 
 @dataclass(frozen=True)
-class BallSolid:
+class BallSolid(Solid):
     """A ball: center (3,) and radius [m]. At its very center there is no normal."""
 
     center: Positions
     radius: float
-    has_sides = False
 
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m], and the faces (n,) that count."""
         return self.radius - np.linalg.norm(q - self.center, axis=1), one_face(q)
 
     def normals(self, q: Positions, face: Indices) -> Rows:
-        """Return the unit normals (n, 3) of the faces (n,) at positions within."""
         out = q - self.center
-        return out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
+        normals: Rows = out / np.maximum(np.linalg.norm(out, axis=1), TINY)[:, None]
+        return normals
 
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
         """Return how much deeper positions within lie: |u| - |v| = (u - v) (u + v) / (|u| + |v|), (n,) [m]."""
         u = q - self.center
         v = u - moved
         both = np.linalg.norm(u, axis=1) + np.linalg.norm(v, axis=1)
-        return -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
+        deeper: Floats = -(moved * (u + v)).sum(axis=1) / np.maximum(both, TINY)
+        return deeper
 
     def sent(self, send: Send) -> "BallSolid":
-        """Return it with its arrays sent where ``send`` takes them."""
         return replace(self, center=send(self.center))
 
 

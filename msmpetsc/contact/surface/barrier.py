@@ -7,7 +7,7 @@ pairs count, so that the energy is continuous: with fewer (Chen et al. 2025, Off
 one comes to count or ceases to, and line searches end there.
 
 Pairs that are near at rest for being neighbours push each other from smaller distances, each set of them from its own
-(self_contact.creases); so contacts are one set for each distance.
+(contact.surface.creases); so contacts are one set for each distance.
 
 ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
 """
@@ -135,7 +135,7 @@ class Barrier:
     def energy(self, contacts: ContactSets, points: Positions) -> float:
         """Return the barriers' energy [J]."""
         points = np.asfortranarray(points)
-        return sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts))
+        return float(sum(potential(pairs, self.mesh, points) for potential, pairs in self.pushing(contacts)))
 
     def gradient(self, contacts: ContactSets, points: Positions) -> Rows:
         """Return its gradient (p, 3) [N]."""
@@ -196,6 +196,45 @@ class Barrier:
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd
         return min((c.compute_collision_free_stepsize(*ways) for c in candidates if not c.empty()), default=1.0)
+
+
+class SurfaceFriction:
+    """Coulomb's friction between parts of the surface in one step, lagged: of the contacts where the step starts, with
+    their push there. It is a potential of the slip S - S_n, of the same law as an obstacle's (obstacles.friction).
+
+    contacts : where the step starts, the points at ``start`` (p, 3) [m]
+    stick    : slip [m] below which it fades to nothing
+    """
+
+    def __init__(self, barrier: Barrier, contacts: ContactSets, start: Positions, stick: float):
+        library, self.mesh, self.start = barrier.ipctk, barrier.mesh, start
+        self.contacts: list[ipctk.TangentialCollisions] = []
+        for potential, pairs in barrier.pushing(contacts):
+            self.contacts.append(library.TangentialCollisions())
+            self.contacts[-1].build(
+                self.mesh, np.asfortranarray(start), pairs, potential, barrier.law.friction
+            )  # its normals and pushes stay
+        self.potential = library.FrictionPotential(stick)
+
+    def energy(self, points: Positions) -> float:
+        """Return the potential [J] of points that came to S (p, 3) [m]."""
+        slip = self._slip(points)
+        return float(sum(self.potential(pairs, self.mesh, slip) for pairs in self.contacts))
+
+    def gradient(self, points: Positions) -> Rows:
+        """Return its gradient (p, 3) [N]."""
+        slip, gradient = self._slip(points), np.zeros(points.size)
+        for pairs in self.contacts:
+            gradient += self.potential.gradient(pairs, self.mesh, slip)
+        return gradient.reshape(-1, 3)
+
+    def hessian(self, points: Positions) -> "list[csc_matrix]":
+        """Return the terms (3p, 3p) [N/m] of its Hessian, which is positive semidefinite."""
+        slip = self._slip(points)
+        return [self.potential.hessian(pairs, self.mesh, slip) for pairs in self.contacts]
+
+    def _slip(self, points: Positions) -> Rows:
+        return np.asfortranarray(points - self.start)
 
 
 def _kept(share: float) -> float:

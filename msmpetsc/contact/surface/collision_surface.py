@@ -11,7 +11,7 @@ from msmpetsc.contact.surface.barrier import BarrierLaw, crossings
 from msmpetsc.contact.surface.pairs import CollisionSurface
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cages import Body, Cages
+from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, joined
@@ -27,17 +27,13 @@ PER_EDGE = 7 / 4  # Young's modulus over k_1 / h (lattice.material)
 
 
 def collision_surface(
-    comm: MPI.Comm,
-    table: SelfContactTable,
-    scene: Scene,
-    bodies: Sequence[Body],
-    cages: Cages,
-    lattice: Lattice,
+    table: SelfContactTable, scene: Scene, bodies: Sequence[BodySurface], cages: Cages, lattice: Lattice
 ) -> CollisionSurface:
     """Return the surface of all bodies that meets itself (collective).
 
     Raises InputError on all ranks where more than a tenth of its triangles cut others at rest.
     """
+    comm = bodies[0].comm
     prepared = on_root(comm, lambda: _prepared([body.surface for body in bodies if body.surface], table))
     surfaces, off = prepared or ([], 0.0)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
@@ -58,7 +54,7 @@ def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: flo
     """
     mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
     layer = (PER_EDGE * lattice.stiffest(comm) + mass / time_step**2) / lattice.cell_size**2
-    return distance**2 * layer
+    return float(distance**2 * layer)
 
 
 def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surface], float]:

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.contact.surface.creases import NEAREST
@@ -144,7 +144,7 @@ class NearPairs:
             most = np.empty_like(ends)
             self.comm.Allreduce(ends, most, MPI.MAX)
             ends = most
-        return self.points.spread * 0.5 * float(np.linalg.norm(ends[:3] + ends[3:]))
+        return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
         """Know nothing of the steps before."""
@@ -215,7 +215,7 @@ class Contacts:
             moved = points - pairs.points
             moved -= 0.5 * (moved.max(axis=0) + moved.min(axis=0))
             serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
-        return self.comm.bcast(serve)
+        return bool(self.comm.bcast(serve))
 
     def with_points(self, moment: ContactsAt) -> ContactsAt:
         """Return the same with the points, which friction asks for."""
@@ -223,11 +223,13 @@ class Contacts:
 
     def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts at q."""
-        moment, touch = self.find(q), Touch()
+        moment = self.find(q)
+        touch = Touch()
         if self.barrier and moment.contacts is not None and moment.points is not None and moment.count:
             least = self.barrier.least(moment.contacts, moment.points)
             touch = Touch(moment.count, least, self.barrier.energy(moment.contacts, moment.points))
-        return self.comm.bcast(touch)
+        of_all: Touch = self.comm.bcast(touch)
+        return of_all
 
     def free_share(self, q: Positions, end: Positions) -> float:
         """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
@@ -243,7 +245,7 @@ class Contacts:
             share = self._swept(q, end, start, moved)
         elif self.barrier and pairs.candidates is not None:
             share = self.barrier.free_share(start, moved, pairs.candidates)
-        return self.comm.bcast(share)
+        return float(self.comm.bcast(share))
 
     def _swept(self, q: Positions, end: Positions, start: Positions, moved: Rows) -> float:
         """Return the free share of a way that no known pairs serve for; those on it are kept."""
@@ -257,7 +259,7 @@ class Contacts:
 
 
 @numba.njit(cache=True)
-def _extend(end, start, ends):
+def _extend(end: Positions, start: Positions, ends: Floats) -> None:
     """Extend the greatest displacements along the axes and against them, ends (6,)."""
     for i in range(len(end)):
         for c in range(3):

@@ -12,9 +12,9 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
+from msmpetsc.contact.surface.barrier import SurfaceFriction
 from msmpetsc.contact.surface.pairs import Contacts, ContactsAt
 from msmpetsc.contact.surface.points import Carried
-from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
 SMALL = 1e-4  # of the barrier's distance: points that move less change the energy by their mean force times that
@@ -164,7 +164,8 @@ class SurfaceContact:
             return np.zeros(self.contacts.owned)
         sums = np.asarray(np.abs(kept.points - whole.points).sum(axis=1)).reshape(-1, 3).max(axis=1)
         at, weights = kept.carried
-        return self.contacts.points.spread * (np.abs(weights).T @ sums[at])
+        bound: Floats = self.contacts.points.spread * (np.abs(weights).T @ sums[at])
+        return bound
 
     def _curvature(self, moment: ContactsAt, projected: bool) -> tuple[Indices, csr_array] | None:
         """Return on rank 0 the points (k,) in contact, and the Hessian (3k, 3k) [N/m] of these."""

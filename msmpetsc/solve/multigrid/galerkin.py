@@ -134,7 +134,7 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
         (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        law, mass = (*self.law, self.elasticity.springs.stiffening), self.unknowns.ballast
+        law, mass = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast
         add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
@@ -161,7 +161,7 @@ def _by_cell(
     springs = to_host(lattice.springs)[: lattice.springs_owned]
     moving = np.flatnonzero(~held[springs].all(axis=1))
     cells = elasticity.cells
-    corners = np.empty((0, 8), np.int64) if cells is None else to_host(cells.cells[: cells.cells_owned])
+    corners = np.empty((0, 8), np.int64) if cells is None else to_host(cells.owned.cells)
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
     along = [apart[nodes].max(axis=1) // 2 for nodes in ends]  # what is held is moved with what it holds

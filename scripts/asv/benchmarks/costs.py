@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from mpi4py import MPI
 
-from msmpetsc.geometry.cages import Body, fill
+from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
 
 CELLS = "cages={count=2000}"
@@ -48,7 +48,7 @@ class Cages:
         """Make the ball."""
         ball = trimesh.creation.icosphere(5)
         surface = Surface(np.array(ball.vertices), np.array(ball.faces))
-        self.body = Body(MPI.COMM_SELF, surface, examine(surface), np.array(ball.bounds))
+        self.body = BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(ball.bounds))
 
     def time_fill(self) -> None:
         """Fill it."""

@@ -22,7 +22,7 @@ class Obstacle:
     path        : how it moves
     start, stop : it is there while start <= time < stop [s]; None: to the end
     key         : of its table in the scene, for messages
-    outside     : (l,) how far nodes stick out of the surface at rest [m] (contact.outside): they go so much deeper
+    outside     : (l,) how far nodes stick out of the surface at rest [m] (obstacles.outside): they go so much deeper
         before the surface meets the obstacle. None: they are the surface
     """
 
@@ -52,11 +52,6 @@ class Obstacle:
     def normals_at(self, q: Positions, time: float, face: Indices) -> Rows:
         """Return the unit normals (n, 3) of faces (n,) at positions (n, 3) [m] within, at a time [s]."""
         return self.solid.normals(self.seen_from(q, time), face)
-
-    @property
-    def has_sides(self) -> bool:
-        """Whether it matters by which of its faces a node came in."""
-        return self.solid.has_sides
 
     def sides(
         self, q: Positions, end: Positions, time: float, time_step: float, before: Indices | None = None

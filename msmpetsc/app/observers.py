@@ -18,7 +18,7 @@ from mpi4py import MPI
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
-from msmpetsc.results.progress import Progress
+from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.writer import ResultFile
 
 if TYPE_CHECKING:  # PETSc must first be given its options

@@ -39,7 +39,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "msmpetsc render my.toml --show cells",
     ),
     "export": (
-        "msmpetsc export out/my.h5 -o out/my.glb --every 2",
+        "msmpetsc export out/my.h5 -o out/my.glb --frames 0::2",
         "msmpetsc export out/my.h5 -o out/last.obj --frames -1",
     ),
     "check": (
@@ -301,7 +301,6 @@ def add_export(commands: Commands) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", type=checked_file, required=True, help="what to write")
     parser.add_argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold")
     add_frames(parser, "these frames, or slices like 0:250:5; default: all, or the last (-1) of one")
-    parser.add_argument("--every", metavar="N", type=int, default=1, help="every N-th of them (1)")
 
 
 # Scenes and meshes

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from time import monotonic
 from typing import TextIO
 
-from msmpetsc.results.progress import duration
+from msmpetsc.results.progress_bar import duration
 from msmpetsc.study.table import Row
 
 

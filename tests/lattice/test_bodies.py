@@ -18,7 +18,7 @@ from msmpetsc.build import build_model
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.grid import LIMIT, BodyGrids, decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
-from msmpetsc.results.compare import compare
+from msmpetsc.results.comparison import compare
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.multigrid.grids import grid_indices
 from msmpetsc.study.distances import distance_of_shapes, shape_error

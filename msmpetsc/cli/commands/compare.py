@@ -9,7 +9,7 @@ import numpy as np
 
 from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.errors import InputError
-from msmpetsc.results.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
+from msmpetsc.results.comparison import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.results.reader import Result, refuse_deadly
 from msmpetsc.results.surfaces import MEAN, compare_surfaces
 

@@ -2,7 +2,6 @@
 
 import argparse
 
-from msmpetsc.app.checks import refuse_below_one
 from msmpetsc.cli.ranks import refuse_ranks
 from msmpetsc.export.formats import export
 from msmpetsc.results.reader import refuse_deadly
@@ -11,7 +10,6 @@ from msmpetsc.results.reader import refuse_deadly
 def run(args: argparse.Namespace) -> int:
     """Export the result and print the path of what was written; return the exit status."""
     refuse_ranks("export", "it writes on one process")
-    refuse_below_one(every=args.every)
     refuse_deadly(args.result)
-    print(export(args.result, args.output, args.mesh, args.frames, args.every))
+    print(export(args.result, args.output, args.mesh, args.frames))
     return 0

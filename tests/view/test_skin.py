@@ -106,8 +106,8 @@ def test_pins_are_coloured_by_face():
     )  # fmt: skip
     composition = composition_of(subject, [0], Style(eye=(0, 0, 1)))
     stills = composition.stills([0])
-    with Renderer(composition, stills, (292, 100)) as renderer:
-        row = renderer.picture(stills[0])[50].astype(int)
+    with Renderer(composition, stills, (300, 60)) as renderer:
+        row = renderer.picture(stills[0])[30].astype(int)
     colours = row[(row < 250).any(axis=1)][3:-3]  # without the rim
     steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
     assert len(steps) and np.ptp(steps) <= 1, "one edge, which antialiasing may widen by a pixel"

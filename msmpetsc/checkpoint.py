@@ -58,9 +58,7 @@ class Checkpoint:
     numbers: dict[str, float] = field(default_factory=dict)
 
     def keep(self, rows: dict[str, np.ndarray] | None = None, numbers: dict[str, float] | None = None) -> None:
-        """Store a part's rows and numbers; no two parts may store one name."""
-        if twice := (self.rows.keys() & (rows or {}).keys()) | (self.numbers.keys() & (numbers or {}).keys()):
-            raise ValueError(f"two parts of a checkpoint store {', '.join(sorted(twice))}")
+        """Store a part's rows and numbers."""
         self.rows |= rows or {}
         self.numbers |= numbers or {}
 

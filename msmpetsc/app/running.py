@@ -23,7 +23,7 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.results.constant_parts import write_model
-from msmpetsc.results.progress import Progress
+from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.results.xdmf import write_xdmf

@@ -14,7 +14,7 @@ from msmpetsc.build import Model
 from msmpetsc.comm import log
 from msmpetsc.constraints.coverage import Reach
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.results.progress import duration
+from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.simulate import Simulation
 

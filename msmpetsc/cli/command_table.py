@@ -264,7 +264,7 @@ COMMANDS = {
     "export": Command(
         "write frames of a result in another format",
         (
-            "msmpetsc export out/my.h5 -o out/my.glb --every 2",
+            "msmpetsc export out/my.h5 -o out/my.glb --frames 0::2",
             "msmpetsc export out/my.h5 -o out/last.obj --frames -1",
         ),
         (
@@ -272,7 +272,6 @@ COMMANDS = {
             argument("-o", "--output", metavar="FILE", type=checked_file, required=True, help="what to write"),
             argument("--mesh", choices=("surface", "lattice"), help="default: the first that the format can hold"),
             frames("these frames, or slices like 0:250:5; default: all, or the last (-1) of one"),
-            whole("--every", "N", "every N-th of them (1)", default=1),
         ),
         description="Write frames of a result for another program; the name's ending says in which format: .glb "
         "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",

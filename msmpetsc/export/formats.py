@@ -1,6 +1,5 @@
 """The formats that a result is exported to, in one table, and the export itself."""
 
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -22,45 +21,38 @@ BARE = (".obj", ".ply", ".stl")  # formats of points and triangles alone
 class Format(NamedTuple):
     """A format of files.
 
-    writer : module, below this folder, and function that writes moments under a path
+    module, writer : below this folder; the function writes moments under a path, and needs packages of its own
     moves  : whether a file holds frames in time, or one frame
     meshes : of which it can hold one; the first if none is asked for
     about  : what reads it
     """
 
-    writer: tuple[str, str]
+    module: str
+    writer: str
     moves: bool
     meshes: tuple[Mesh, ...]
     about: str
 
-    def load(self) -> Callable[[Moments, Path], None]:
-        """Import the writer: each needs packages of its own."""
-        module, function = self.writer
-        return getattr(import_module(EXPORT + module), function)
 
-
-ONE_FRAME = ("formats", "write_one_frame")
-USD = Format(("usd", "write_usd"), True, ("surface",), "Blender, Houdini, Omniverse, usdview")
+ONE_FRAME = ("formats", "write_one_frame", False)
+USD = Format("usd", "write_usd", True, ("surface",), "Blender, Houdini, Omniverse, usdview")
 FORMATS = {
-    ".glb": Format(("gltf", "write_glb"), True, ("surface",), "Blender, browsers"),
+    ".glb": Format("gltf", "write_glb", True, ("surface",), "Blender, browsers"),
     ".usd": USD,
     ".usda": USD,
     ".usdc": USD,
-    ".obj": Format(ONE_FRAME, False, ("surface",), "nearly everything"),
-    ".ply": Format(ONE_FRAME, False, ("surface",), "MeshLab, Blender, trimesh"),
-    ".stl": Format(ONE_FRAME, False, ("surface",), "printers"),
-    ".vtu": Format(ONE_FRAME, False, ("lattice", "surface"), "ParaView, VTK, pyvista, meshio"),
+    ".obj": Format(*ONE_FRAME, ("surface",), "nearly everything"),
+    ".ply": Format(*ONE_FRAME, ("surface",), "MeshLab, Blender, trimesh"),
+    ".stl": Format(*ONE_FRAME, ("surface",), "printers"),
+    ".vtu": Format(*ONE_FRAME, ("lattice", "surface"), "ParaView, VTK, pyvista, meshio"),
 }
 
 
-def export(
-    result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None, every: int = 1
-) -> Path:
+def export(result: str | Path, path: str | Path, mesh: Mesh | None = None, frames: Frames | None = None) -> Path:
     """Write frames of a result in the format that the path's ending names, and return the path.
 
     mesh   : "surface" or "lattice"; what the format holds, and the result has, if None
     frames : their numbers, -1 the last, or slices; all if None, or the last where the format holds one
-    every  : of the frames chosen take every so many
 
     Raises InputError.
     """
@@ -68,9 +60,9 @@ def export(
     chosen = FORMATS.get(path.suffix.lower())
     if chosen is None:
         raise InputError(f"{path}: what is exported is named {', '.join(f'*{ending}' for ending in FORMATS)}")
-    write = chosen.load()
+    write = getattr(import_module(EXPORT + chosen.module), chosen.writer)
     with Result(result) as run:
-        moments = Moments(run, _mesh(run, path, chosen, mesh), _frames(run, path, chosen, frames, every))
+        moments = Moments(run, _mesh(run, path, chosen, mesh), _frames(run, path, chosen, frames))
         with whole_file(path) as part:
             write(moments, part)
     return path
@@ -86,14 +78,14 @@ def _mesh(run: Result, path: Path, chosen: Format, mesh: Mesh | None) -> Mesh:
     return mesh
 
 
-def _frames(run: Result, path: Path, chosen: Format, frames: Frames | None, every: int) -> list[int]:
+def _frames(run: Result, path: Path, chosen: Format, frames: Frames | None) -> list[int]:
     """Return the numbers of the frames meant. Raises InputError for frames that the result does not have."""
     count = len(run.frames.time)
     if not count:
         raise InputError(f"{run.path} has no finished frame")
     if frames is None:
         frames = [slice(None) if chosen.moves else -1]
-    numbers = frames_of(str(run.path), frames, count)[::every]
+    numbers = frames_of(str(run.path), frames, count)
     if not chosen.moves and len(numbers) > 1:
         raise InputError(f"{path}: a *{path.suffix} holds one frame, not {len(numbers)}")
     if np.any(np.diff(numbers) <= 0):

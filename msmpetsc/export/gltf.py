@@ -66,12 +66,13 @@ def write_glb(moments: Moments, path: Path) -> None:
     if others:
         times = (moments.times - moments.times[0]).astype(np.float32)
         _animate(document, chunk, times, len(others))
-    text = json.dumps(document | _contents(chunk)).encode()
+    document |= {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": [{"byteLength": chunk.size}]}
+    text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + chunk.size
     if total > MOST_BYTES:
         raise InputError(
-            f"{path} would have {total / 2**30:.3g} GiB, and glTF ends at 4: choose fewer frames (--every)"
+            f"{path} would have {total / 2**30:.3g} GiB, and glTF ends at 4: choose fewer frames (--frames)"
         )
     with open(path, "wb") as file:
         file.write(struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON") + text)
@@ -136,8 +137,3 @@ def _animate(document: dict[str, Any], chunk: Chunk, times: np.ndarray, targets:
     sampler = {"input": chunk.add(len(times), "SCALAR", bounds), "output": chunk.add(len(times) * targets, "SCALAR")}
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
     document["animations"] = [{"samplers": [sampler | {"interpolation": "LINEAR"}], "channels": [channel]}]
-
-
-def _contents(chunk: Chunk) -> dict[str, Any]:
-    buffers = [{"byteLength": chunk.size}]
-    return {"accessors": chunk.accessors, "bufferViews": chunk.views, "buffers": buffers}

@@ -28,18 +28,11 @@ class Moments:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")
         self.times = run.frames.time[:][self.frames]
         names = ("surface/points", "surface/triangles") if mesh == "surface" else ("lattice/nodes", "lattice/cells")
-        self.rest, cells = run[names[0]][:], run[names[1]][:]
-        self.cells = cells.astype(np.int64)
-        if self.cells.size and not 0 <= self.cells.min() <= self.cells.max() < len(self.rest):
-            raise InputError(f"{run.path} is damaged: {names[1]} names points beyond the {len(self.rest)} there are")
+        self.rest, self.cells = run[names[0]][:], run.indices(names[1])
 
     def points(self, frame: int) -> np.ndarray:
         """Return the points of a frame, (n, 3) [m]."""
-        if self.mesh == "lattice":
-            return self.run.frames.position[frame]
-        if "surface" in self.run.frames:
-            return self.run.frames.surface[frame]
-        return self.run.embedding @ self.run.frames.position[frame]
+        return self.run.frames.position[frame] if self.mesh == "lattice" else self.run.surface_at(frame)
 
     def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
         """Return what is known at the points: of the lattice masses, and which are pinned, too.

@@ -34,7 +34,7 @@ def write_usd(moments: Moments, path: Path) -> None:
         stage.SetStartTimeCode(codes[0])
         stage.SetEndTimeCode(codes[-1])
         of_point = moments.run.body_of("surface")
-        bodies = [Body(stage, root.GetPath(), moments, of_point, number) for number in np.unique(of_point)]
+        bodies = [UsdBody(stage, root.GetPath(), moments, of_point, number) for number in np.unique(of_point)]
         for count, (frame, code) in enumerate(zip(moments.frames, codes, strict=True), 1):
             points = moments.points(frame)
             for body in bodies:
@@ -46,7 +46,7 @@ def write_usd(moments: Moments, path: Path) -> None:
         raise OSError(one_line(error)) from error
 
 
-class Body:
+class UsdBody:
     """The mesh of one body, to which frames are added."""
 
     def __init__(self, stage: Any, root: Any, moments: Moments, of_point: np.ndarray, number: int):

@@ -3,7 +3,7 @@
 It goes by positions and the scene alone, so that it is the same for obstacles that reflect and that press.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +44,8 @@ class SurfaceGaps:
         if len(number):
             from trimesh.triangles import closest_point
 
-            ways = closest_point(points[self.triangles[which]], points[number]) - points[number]
+            nearest: Callable[..., Positions] = closest_point
+            ways = nearest(points[self.triangles[which]], points[number]) - points[number]
             ahead = (ways * normals[number]).sum(axis=1) > -CROSSED * self.reach
             np.minimum.at(gaps, number[ahead], np.linalg.norm(ways[ahead], axis=1))
         gaps[gaps > self.reach] = np.inf
@@ -74,7 +75,8 @@ class SurfaceGaps:
 
 def unit_vectors(vectors: Rows) -> Rows:
     """Return vectors (k, 3) at length 1; those without a length stay 0."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), TINY)[:, None]
+    units: Rows = vectors / np.maximum(np.linalg.norm(vectors, axis=1), TINY)[:, None]
+    return units
 
 
 def gaps_to_obstacles(
@@ -97,15 +99,16 @@ def gaps_to_obstacles(
 
 def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
     """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first; infinite if unknown."""
+    gaps: Floats = np.full(len(points), np.inf)
     if obstacle.center is not None:
-        return np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
-    if obstacle.point is not None:
-        return (points - np.array(obstacle.point)) @ np.array(obstacle.normal)
-    if obstacle.box is None:
-        return np.full(len(points), np.inf)
-    low, high = np.array(obstacle.box)
-    beyond = np.maximum(low - points, points - high)  # (n, 3) along the axes, negative within
-    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+        gaps = np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
+    elif obstacle.point is not None:
+        gaps = (points - np.array(obstacle.point)) @ np.array(obstacle.normal)
+    elif obstacle.box is not None:
+        low, high = np.array(obstacle.box)
+        beyond = np.maximum(low - points, points - high)  # (n, 3) along the axes, negative within
+        gaps = np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    return gaps
 
 
 def _gaps_to(surface: Surface, points: Positions) -> Floats:
@@ -117,4 +120,5 @@ def _gaps_to(surface: Surface, points: Positions) -> Floats:
     squares, number, nearest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)
     a, b, c = (surface.points[surface.triangles[number, corner]] for corner in range(3))
     behind = ((points - nearest) * np.cross(b - a, c - a)).sum(axis=1) < 0
-    return np.where(behind, -1, 1) * np.sqrt(squares)
+    gaps: Floats = np.where(behind, -1, 1) * np.sqrt(squares)
+    return gaps

@@ -55,7 +55,6 @@ class Layout:
     frames: int = 0
     nodes: int = 0
     points: int | None = None
-    surface_dtype: str = FRAME_FIELDS["surface"].dtype
     rows: dict[str, tuple[int, ...]] = field(default_factory=dict)
     numbers: tuple[str, ...] = ()
 
@@ -67,7 +66,7 @@ class Layout:
                 yield Plan(f"frames/{name}", shape, shape, about.dtype)
         yield _rows_plan("frames/position", self.frames, self.nodes, (3,), FRAME_FIELDS["position"].dtype)
         if self.points is not None:
-            yield _rows_plan("frames/surface", self.frames, self.points, (3,), self.surface_dtype)
+            yield _rows_plan("frames/surface", self.frames, self.points, (3,), FRAME_FIELDS["surface"].dtype)
         # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
         # file before noting its new length; killed in between, it could not be opened.)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)

@@ -55,7 +55,8 @@ class LazyArray:
         if not arrays:
             return self._read(keys)
         if not self._by_row:
-            return self[:][keys]
+            whole: Array = self[:][keys]
+            return whole
         return self._read_rows(keys)
 
     def _read_rows(self, keys: tuple[Any, ...]) -> Array:
@@ -63,7 +64,8 @@ class LazyArray:
         first, rest = keys[0], keys[1:]
         rows = np.arange(len(self))[first]
         if not rows.size:
-            return np.broadcast_to(np.zeros((), self.dtype), self.shape)[keys]  # its shape alone
+            empty: Array = np.broadcast_to(np.zeros((), self.dtype), self.shape)[keys]  # its shape alone
+            return empty
         if np.ndim(first):
             values = np.array([self._read((row, *rest)) for row in rows.flat])
         else:
@@ -78,11 +80,11 @@ class LazyArray:
         if not self._dataset:
             raise InputError(f"{self._file} is closed")
         try:
-            values = self._dataset[tuple(map(_forward, parts))]
+            values: Array = self._dataset[tuple(map(_forward, parts))]
         except (OSError, RuntimeError, MemoryError) as error:
             raise InputError(f"{self._file}: {self.name} cannot be read: {one_line(error)}") from error
-        ranges = [part for part in parts if isinstance(part, range)]
-        return values[tuple(slice(None, None, -1 if part.step < 0 else 1) for part in ranges)] if ranges else values
+        turned = [axis for axis, part in enumerate(part for part in parts if isinstance(part, range)) if part.step < 0]
+        return np.flip(values, turned) if turned else values
 
 
 class Arrays(Mapping[str, LazyArray]):

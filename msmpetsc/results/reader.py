@@ -30,6 +30,13 @@ if TYPE_CHECKING:  # who reads frames needs neither
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")
+NAMED = {  # by datasets of numbers, what these are numbers of
+    "lattice/cells": "lattice/nodes",
+    "lattice/springs": "lattice/nodes",
+    "lattice/pinned": "lattice/nodes",
+    "surface/triangles": "surface/points",
+    "obstacle/triangles": "obstacle/points",
+}
 PATIENCE = 10  # [s] to read a file's tables
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
@@ -50,7 +57,7 @@ class Result:
     attributes : who made it and how: msmpetsc_version, petsc_options, ranks, command, ...
     lattice, surface, frames : their arrays as in the file, each read where it is indexed; one that the file does not
         have, because an older version wrote it or the scene did not ask for it, is not among them
-    file : the same as h5py has it, unchecked where the table of fields ends
+    file : the same as h5py has it, unchecked where the table of fields ends; what else is there is not read
     """
 
     def __init__(self, path: str | Path):
@@ -111,6 +118,21 @@ class Result:
         if name not in self._datasets:
             raise InputError(f"{self.path} is damaged: it has no {name}")
         return self._datasets[name]
+
+    def indices(self, name: str) -> Indices:
+        """Return all of a dataset that names nodes or points. Raises InputError where there are no such ones."""
+        rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
+        plural = NAMED[name].partition("/")[2]
+        if rows.size and not 0 <= rows.min() <= rows.max() < count:
+            raise InputError(f"{self.path} is damaged: {name} names what is not among its {count} {plural}")
+        return rows
+
+    def surface_at(self, frame: int) -> Positions:
+        """Return the surface points (v, 3) of a frame [m]: as stored, or W @ positions."""
+        if "surface" in self.frames:
+            return self.frames.surface[frame]
+        points: Positions = self.embedding @ self.frames.position[frame]
+        return points
 
     @cached_property
     def scene(self) -> dict[str, Any]:
@@ -178,11 +200,8 @@ class Result:
 
 
 def _variable(name: str, array: LazyArray) -> Any:
-    """Return the xarray.Variable of a dataset; one that the table does not have gets dimensions of its own."""
-    short, field = name.partition("/")[2], FIELDS.get(name)
-    if field is None:
-        dimensions = ["time", *(f"{short}_{axis}" for axis in range(1, array.ndim))]
-        return xarray_variable(dimensions, array, short.replace("_", " "))
+    """Return the xarray.Variable of a dataset."""
+    field = FIELDS[name]
     return xarray_variable([AXES[size] for size in field.shape], array, field.long_name)
 
 
@@ -270,7 +289,7 @@ def plain_damage(path: Path) -> Iterator[None]:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except KeyError as error:
         raise InputError(f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}") from error
-    except (OSError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError) as error:
+    except (OSError, RuntimeError, ValueError, TypeError, IndexError, OverflowError, MemoryError) as error:
         raise InputError(f"{path} is damaged or cut short: {one_line(error)}") from error
 
 
@@ -288,7 +307,6 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
         if object_at(path, file, name) is None:
             raise InputError(f"{path} is damaged: it has no {name}")
     names = [name for name in FIELDS if object_at(path, file, name) is not None]
-    names += [f"frames/{name}" for name in file["frames"] if name not in FRAME_FIELDS and _is_numbers(file, name)]
     datasets = {name: checked_dataset(path, file, name) for name in names}
     _check_sizes(path, datasets, finished(file))
     return datasets
@@ -298,7 +316,7 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
     """Raise InputError where one letter of the table stands for two numbers, or frames for fewer than `count`."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
-        for axis, (size, symbol) in enumerate(zip(dataset.shape, _expected(name, dataset)[1], strict=True)):
+        for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):
             if symbol == "T":
                 wrong = f"{count} frames are finished" if size < count else ""
             else:
@@ -306,23 +324,6 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
                 wrong = f"{known} are expected" if size != known else ""
             if wrong:
                 raise InputError(f"{path} is damaged: {name} is {size} long along axis {axis}, and {wrong}")
-
-
-def _is_numbers(file: h5py.File, name: str) -> bool:
-    """Tell whether that is a series of numbers; a newer version may keep other things among the frames."""
-    frames = file["frames"]
-    if not name.isprintable() or frames.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
-        return False
-    dataset = frames[name]
-    return isinstance(dataset, h5py.Dataset) and not _is_external(dataset) and dataset.dtype.kind in "iuf"
-
-
-def _expected(name: str, dataset: h5py.Dataset) -> tuple[str, tuple[int | str, ...]]:
-    """Return kinds and shape; of what the table does not have, any numbers will do that are as many as the frames."""
-    if name not in FIELDS:
-        return "iuf", ("T", *dataset.shape[1:])
-    field = FIELDS[name]
-    return "f" if field.dtype.startswith("f") else "iu", field.shape
 
 
 def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
@@ -350,8 +351,10 @@ def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
         raise InputError(f"{path} is damaged: it has no dataset {name}")
     if _is_external(dataset):
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
-    kinds, shape = _expected(name, dataset) if dataset.shape else ("", ())
-    if dataset.dtype.kind not in kinds or len(dataset.shape) != len(shape):
+    field = FIELDS.get(name)
+    kinds = "f" if field is None or field.dtype.startswith("f") else "iu"
+    axes = len(field.shape) if field else dataset.ndim
+    if dataset.dtype.kind not in kinds or not dataset.shape or dataset.ndim != axes:
         kind = printable(str(dataset.dtype), 40)
         raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
     rows = " x ".join(map(str, dataset.shape))

@@ -9,11 +9,12 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
+from msmpetsc.backend.arrays import Array
 from msmpetsc.checkpoint import AT_REST, ROWS, Checkpoint
 from msmpetsc.comm import together
 from msmpetsc.errors import InputError, printable
 from msmpetsc.fields import FRAME_FIELDS
-from msmpetsc.results.compare import rows_agree
+from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.reader import (
     Result,
     as_python,
@@ -76,7 +77,7 @@ def _is_at_rest(result: Result, names: list[str]) -> bool:
 def _refuse_foreign_series(result: Result) -> None:
     """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
     for name, array in result.frames.items():
-        if name in FRAME_FIELDS and name not in ("position", "surface"):
+        if name not in ("position", "surface"):
             field = FRAME_FIELDS[name]
             if array.dtype != field.dtype or array.shape[1:] != field.shape[1:]:
                 raise InputError(f"{result.path} is damaged: frames/{name} has type {array.dtype}")
@@ -116,14 +117,17 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
     owned : nodes of this rank; the ranks' follow each other
     """
     with RootFile(comm, path) as file:
-        steps = file.values("checkpoint/step")
-        slot = None if steps is None else newest_slot(steps)
-        if steps is None or slot is None:
+        slot = file.ask(lambda stored: newest_slot(stored["checkpoint/step"][:]) if "checkpoint" in stored else None)
+        if slot is None:
             return None
-        rows = {name: file.rows(f"checkpoint/{name}", owned, slot) for name in file.checkpoint_rows()}
-        names, numbers = file.checkpoint_numbers(), file.values("checkpoint/numbers")
-        values = numbers[slot].tolist() if names and numbers is not None else []
-        return Checkpoint(int(steps[slot]), rows, dict(zip(names, values, strict=True)))
+        step = file.ask(lambda stored: int(stored["checkpoint/step"][slot]))
+        names = file.ask(lambda stored: _checked_numbers(path, stored)) or []
+        values = file.ask(lambda stored: stored["checkpoint/numbers"][slot].tolist() if names else [])
+        stored_rows = file.ask(
+            lambda stored: [name for name in stored["checkpoint"] if name not in ("step", "numbers")]
+        )
+        rows = {name: file.rows(f"checkpoint/{name}", owned, slot) for name in stored_rows}
+        return Checkpoint(step, rows, dict(zip(names, values, strict=True)))
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
@@ -151,21 +155,22 @@ def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
         )
 
 
-def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, np.ndarray]) -> None:
+def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]) -> None:
     """Raise InputError where a lattice is not the one of the file (collective).
 
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
     with RootFile(comm, path) as file:
         for name, rows in lattice.items():
-            shape, count = file.shape(name), comm.allreduce(len(rows))
-            if shape is None:
+            stored_count = file.length(name)
+            if stored_count is None:
                 continue
-            same = shape[0] == count
+            same = stored_count == comm.allreduce(len(rows))
             if same:
-                rows, stored = np.asarray(rows, float), file.rows(name, len(rows)).astype(float)
+                stored = file.rows(name, len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
-                same = all(comm.allgather(bool(rows_agree(rows, stored, SAME * greatest).all())))
+                agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
+                same = all(comm.allgather(bool(agree)))
             if not same:
                 raise InputError(f"{path}: the mesh has changed: {name} is not what this run makes of it")
 
@@ -188,26 +193,15 @@ class RootFile:
         if self._file is not None:
             self._file.close()
 
-    def values(self, name: str) -> np.ndarray | None:
-        """Return all numbers of a small dataset on every rank; None if the file does not have it."""
-        return self._ask(lambda file: file[name][...] if name in file else None)
+    def length(self, name: str) -> int | None:
+        """Return the rows of a dataset; None if the file does not have it."""
+        count: int | None = self.ask(lambda file: len(file[name]) if name in file else None)
+        return count
 
-    def shape(self, name: str) -> tuple[int, ...] | None:
-        """Return the shape of a dataset; None if the file does not have it."""
-        return self._ask(lambda file: file[name].shape if name in file else None)
-
-    def checkpoint_numbers(self) -> list[str]:
-        """Return the names of the checkpoint's numbers."""
-        return self._ask(lambda file: _checked_numbers(self._path, file)) or []
-
-    def checkpoint_rows(self) -> list[str]:
-        """Return the names of what the checkpoint has of each node."""
-        return self._ask(lambda file: [name for name in file["checkpoint"] if name not in ("step", "numbers")])
-
-    def rows(self, name: str, count: int, index: int | None = None) -> np.ndarray:
+    def rows(self, name: str, count: int, index: int | None = None) -> Array:
         """Return this rank's `count` rows of a dataset, or of its row `index`: (count, ...)."""
         counts: Sequence[int] = self._comm.allgather(count)
-        dtype, shape = self._ask(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
+        dtype, shape = self.ask(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
         own = np.empty((count, *shape), dtype)
         file: Any = self._file
         failure = scatter_rows(
@@ -218,7 +212,7 @@ class RootFile:
                 raise InputError(f"{self._path} cannot be read: {failure}")
         return own
 
-    def _ask(self, question: Callable[[h5py.File], Any]) -> Any:
+    def ask(self, question: Callable[[h5py.File], Any]) -> Any:
         """Return on every rank what rank 0 reads from the file."""
         answer = None
         with together(self._comm):

@@ -11,7 +11,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import InputError
-from msmpetsc.results.compare import (
+from msmpetsc.results.comparison import (
     LEAST_STRAIN,
     SAME_POINT,
     SAME_TIME,
@@ -86,9 +86,7 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
 
 def point_areas(run: Result) -> Array:
     """Return the area around each surface point at rest, (v,) [m^2]: a third of its triangles'."""
-    points, triangles = run["surface/points"][:], run["surface/triangles"][:].astype(np.int64)
-    if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):
-        raise InputError(f"{run.path} is damaged: a triangle has corner {triangles.max()} of {len(points)} points")
+    points, triangles = run["surface/points"][:], run.indices("surface/triangles")
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     around = np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points))

@@ -20,35 +20,42 @@ from msmpetsc.backend.arrays import Array
 PIECE_BYTES = 64 * 2**20  # the most that rank 0 holds of another rank's rows
 
 
-def pieces(count: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[slice]:
-    """Return parts of `count` rows of this type and shape, of at most PIECE_BYTES each."""
-    most = max(1, PIECE_BYTES // max(1, dtype.itemsize * math.prod(shape)))
-    return (slice(start, min(start + most, count)) for start in range(0, count, most))
+def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, slice]]:
+    """Yield parts of the ranks' rows, of at most PIECE_BYTES each: a rank, the part of its rows and of those of all.
+
+    rows   : (counts[rank], ...) this rank's
+    counts : rows of each rank
+    """
+    most = max(1, PIECE_BYTES // max(1, rows.dtype.itemsize * math.prod(rows.shape[1:])))
+    start = 0
+    for rank, count in enumerate(counts):
+        for begin in range(0, count, most):
+            end = min(begin + most, count)
+            yield rank, slice(begin, end), slice(start + begin, start + end)
+        start += count
 
 
-def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[int, Array], None]) -> None:
-    """Hand store(start, piece), on rank 0, the rows of all ranks, one after the other (collective).
+def gather_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[slice, Array], None]) -> None:
+    """Hand store(part, piece), on rank 0, the rows of all ranks, one after the other (collective).
 
     rows   : (counts[rank], ...) this rank's, contiguous
     counts : rows of each rank
     """
-    if comm.rank > 0:
-        for part in pieces(len(rows), rows.dtype, rows.shape[1:]):
-            comm.Send(rows[part], dest=0)
-        return
-    start, failure = 0, None
-    for rank, count in enumerate(counts):
-        for part in pieces(count, rows.dtype, rows.shape[1:]):
-            piece = rows[part]
-            if rank > 0:
-                piece = np.empty((part.stop - part.start, *rows.shape[1:]), rows.dtype)
-                comm.Recv(piece, source=rank)
-            try:
-                if failure is None and len(piece):
-                    store(start + part.start, piece)
-            except OSError as error:
-                failure = error  # the others still send: hear them out
-        start += count
+    failure = None
+    for rank, own, part in pieces(rows, counts):
+        if comm.rank == rank > 0:
+            comm.Send(rows[own], dest=0)
+        if comm.rank > 0:
+            continue
+        piece = rows[own]
+        if rank > 0:
+            piece = np.empty((own.stop - own.start, *rows.shape[1:]), rows.dtype)
+            comm.Recv(piece, source=rank)
+        try:
+            if failure is None:
+                store(part, piece)
+        except OSError as error:
+            failure = error  # the others still send: hear them out
     if failure is not None:
         raise failure
 
@@ -59,23 +66,21 @@ def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Calla
     rows   : (counts[rank], ...) this rank's, to be filled
     counts : rows of each rank
     """
-    if comm.rank > 0:
-        for part in pieces(len(rows), rows.dtype, rows.shape[1:]):
-            comm.Recv(rows[part], source=0)
-        return None
-    start, failure = 0, None
-    for rank, count in enumerate(counts):
-        for part in pieces(count, rows.dtype, rows.shape[1:]):
-            piece = np.zeros((part.stop - part.start, *rows.shape[1:]), rows.dtype)
-            try:
-                piece[...] = load(slice(start + part.start, start + part.stop))
-            except (OSError, ValueError) as error:
-                failure = error  # the others still wait
-            if rank > 0:
-                comm.Send(piece, dest=rank)
-            else:
-                rows[part] = piece
-        start += count
+    failure: Exception | None = None
+    for rank, own, part in pieces(rows, counts):
+        if comm.rank == rank > 0:
+            comm.Recv(rows[own], source=0)
+        if comm.rank > 0:
+            continue
+        piece = np.zeros((own.stop - own.start, *rows.shape[1:]), rows.dtype)
+        try:
+            piece[...] = load(part)
+        except (OSError, ValueError) as error:
+            failure = error  # the others still wait
+        if rank > 0:
+            comm.Send(piece, dest=rank)
+        else:
+            rows[own] = piece
     return failure
 
 

@@ -5,11 +5,8 @@ where it can reach the file (results.transfer). The file is the same.
 
 All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
 its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
-(`finished`). So a process killed at any moment leaves a file that opens and holds every finished frame.
-
-``/checkpoint`` has two slots: ``step (2,)``, ``q (2,n,3)``, ``q_previous (2,n,3)``, and what else the run goes on from,
-``numbers (2,k)`` with their names as an attribute and rows of nodes (2,n,...). The older slot is written, with its
-step at -1 meanwhile, so a whole checkpoint is always left: the slot of the greatest step.
+(`finished`). Of the checkpoint's two slots the older is written, with its step at -1 meanwhile, so a whole checkpoint
+is always left: the slot of the greatest step.
 
 A run that goes on writes into the file as it lies there, if all that it needs is laid out in it: so no metadata change
 then either. Else it writes a new one, takes the frames over, and renames it when it holds them (`Begin`).
@@ -120,10 +117,8 @@ class ResultFile:
         A file that begins in place has it; raises InputError where its shape is another.
         """
         rows = np.asarray(rows)
-        counts, shapes, dtypes = zip(*self._comm.allgather((len(rows), rows.shape[1:], rows.dtype)), strict=True)
-        if len(set(shapes)) > 1:
-            raise ValueError(f"{name}: the ranks' rows differ in shape: {set(shapes)}")
-        dtype, shape = np.result_type(*dtypes), (sum(counts), *shapes[0])
+        counts, dtypes = zip(*self._comm.allgather((len(rows), rows.dtype)), strict=True)
+        dtype, shape = np.result_type(*dtypes), (sum(counts), *rows.shape[1:])
         with self._together():
             if self._file is not None and self._begin is Begin.IN_PLACE:
                 stored = checked_dataset(self.path, self._file, name).shape
@@ -143,7 +138,6 @@ class ResultFile:
         count: int,
         nodes: int,
         surface_points: int | None = None,
-        surface_dtype: str = FRAME_FIELDS["surface"].dtype,
         saved: Checkpoint | None = None,
     ) -> None:
         """Plan the frames and checkpoints, and give the file its name.
@@ -160,7 +154,7 @@ class ResultFile:
             rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
         stored = sum(self._points) if self._points else None
         numbers = tuple(saved.numbers) if saved else ()
-        self._layout = Layout(count, sum(self._nodes), stored, surface_dtype, rows, numbers)
+        self._layout = Layout(count, sum(self._nodes), stored, rows, numbers)
         with self._together():
             if self._file is not None:
                 self._lay_out(self._file)
@@ -178,11 +172,10 @@ class ResultFile:
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
-        self._check(frame)
         index = self.finished
         self._collect(frame.position, np.dtype("f8"), self._nodes, "frames/position", index)
         if frame.surface is not None and self._points:
-            dtype = np.dtype(self._layout.surface_dtype)
+            dtype = np.dtype(FRAME_FIELDS["surface"].dtype)
             self._collect(frame.surface, dtype, self._points, "frames/surface", index)
         with self._together():
             if self._file is not None:
@@ -195,12 +188,7 @@ class ResultFile:
 
     def write_checkpoint(self, saved: Checkpoint) -> None:
         """Store what the run can go on from; rows and numbers named as those that were planned."""
-        rows, numbers = self._layout.rows, self._layout.numbers
-        if set(saved.rows) != set(rows) or tuple(saved.numbers) != numbers:
-            raise ValueError(f"planned were checkpoints of {list(rows)} and {list(numbers)}")
-        for name, values in saved.rows.items():
-            self._check_rows(name, values, self._nodes, rows[name])
-        slot = None
+        slot = 0
         with self._together():
             if self._file is not None:
                 slot = int(np.argmin(self._file["checkpoint/step"]))
@@ -211,7 +199,7 @@ class ResultFile:
             self._collect(values, np.dtype("f8"), self._nodes, f"checkpoint/{name}", slot)
         with self._together():
             if self._file is not None:
-                if numbers:
+                if saved.numbers:
                     self._file["checkpoint/numbers"][slot] = [float(value) for value in saved.numbers.values()]
                 self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
@@ -343,20 +331,6 @@ class ResultFile:
             self._failed = True
             raise
 
-    def _check(self, frame: Frame) -> None:
-        if self.finished >= self._planned:
-            raise ValueError(f"frame {self.finished} was not planned: {self._planned} frames were")
-        if not np.isfinite(frame.time):
-            raise ValueError(f"frame {self.finished} has time {frame.time}")
-        self._check_rows("position", frame.position, self._nodes)
-        if self._points:
-            self._check_rows("surface", frame.surface, self._points)
-
-    def _check_rows(self, name: str, rows: Array | None, counts: Sequence[int], shape: tuple[int, ...] = (3,)) -> None:
-        planned, given = (counts[self._comm.rank], *shape), () if rows is None else np.shape(rows)
-        if given != planned:
-            raise ValueError(f"{name} has shape {given} on rank {self._comm.rank}, planned were {planned}")
-
     def _collect(
         self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
@@ -367,8 +341,7 @@ class ResultFile:
             return
         file: Any = self._file  # on rank 0, which alone stores
 
-        def store(start: int, piece: Array) -> None:
-            part = slice(start, start + len(piece))
+        def store(part: slice, piece: Array) -> None:
             file[name][part if index is None else (index, part)] = piece
 
         with self._together():

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.compare import common_times, refuse_different_lattices
+from msmpetsc.results.comparison import common_times, refuse_different_lattices
 from msmpetsc.results.reader import Result
 from msmpetsc.results.surfaces import surface_distance
 from msmpetsc.study.table import Row

@@ -6,16 +6,15 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
-from msmpetsc.scene.schema import SceneFile
-from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, Colouring, on_scale
+from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
 from msmpetsc.view.mesh import KINDS
-from msmpetsc.view.overlays import Overlays
 
 if TYPE_CHECKING:
-    from PIL.ImageDraw import ImageDraw
-    from PIL.ImageFont import FreeTypeFont
+    from msmpetsc.view.composition import Composition, Still
 
 
 CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
@@ -23,18 +22,13 @@ LABEL = 11  # [px]
 
 
 @cache
-def typeface(size: int) -> "FreeTypeFont":
+def typeface(size: int) -> ImageFont.FreeTypeFont:
     """Return DejaVu Sans, which comes with matplotlib, in a size [px]."""
-    import matplotlib
-    from PIL import ImageFont
-
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size)
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> np.ndarray:
     """Return a caption's two lines (height, width, 3), in the middle; letters: their size, 1 in a sheet."""
-    from PIL import Image, ImageDraw
-
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -45,8 +39,6 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 def labelled(picture: np.ndarray, labels: list[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
     """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the top left], and the
     ways (2,) that lead from there out of what is labelled."""
-    from PIL import Image, ImageDraw
-
     drawn = Image.fromarray(picture)
     for text, at, way in labels:
         half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2
@@ -59,12 +51,8 @@ def rounded(low: float, high: float) -> tuple[str, str]:
     """Return the ends of a span as they are written: to a thousandth of it or finer, 0 in place of -1e-5."""
     span = max(high - low, abs(high) * 1e-12, 1e-300)
     digits = 2 - int(np.floor(np.log10(span)))
-    first, last = (f"{round(end, digits) + 0.0:.{max(digits, 0)}f}" for end in (low, high))
-    return (_bare(first), _bare(last)) if digits > 0 else (first, last)
-
-
-def _bare(number: str) -> str:
-    return number.rstrip("0").rstrip(".")
+    first, last = (np.format_float_positional(round(end, digits) + 0.0, trim="-") for end in (low, high))
+    return first, last
 
 
 # The legend
@@ -92,27 +80,25 @@ class Entry:
     high: str = ""
 
 
-def entries_of(
-    scene: SceneFile | None, fixed: bool, overlays: list[Overlays], colouring: Colouring | None, shown: tuple[str, ...]
-) -> list[Entry]:
-    """Return the entries of what is drawn; fixed: whether any of the surface is pinned or led."""
-    entries: list[Entry] = []
+def entries_of(composition: "Composition", stills: Sequence["Still"]) -> list[Entry]:
+    """Return the entries of the legend of what is drawn."""
+    scene, colouring, entries = composition.subject.scene, composition.colouring, []
     if colouring is not None and colouring.classes:
         pairs = enumerate(colouring.classes)
         entries += [Entry("swatch", name, CLASSES[number % len(CLASSES)]) for number, name in pairs if name]
     elif colouring is not None:
         low, title, high = colouring.ends
         entries.append(Entry("bar", title, width=BAR, low=low, high=high))
-    if "cells" in shown:
-        entries += [Entry("swatch", text, colour) for colour, text in KINDS.values()]
-    if "springs" in shown:
+    kinds = {kind for still in stills if still.cut for kind in still.cut.cells}
+    entries += [Entry("swatch", text, colour) for kind, (colour, text) in KINDS.items() if kind in kinds]
+    if any(still.cut and len(still.cut.springs) for still in stills):
         entries.append(Entry("line", "spring", SPRING))
-    if fixed and scene is not None:
+    if composition.fixed and scene is not None:
         held = [word for kind, word in (("pin", "pinned"), ("anchor", "led")) if any(scene.tables(kind))]
         entries.append(Entry("swatch", " or ".join(held), FIXED))
-    if any(view.arrows for view in overlays):
+    if any(still.overlays.arrows for still in stills):
         entries.append(Entry("arrow", "force", ARROW, 30))
-    if entries and any(view.glass or view.balls or view.shapes for view in overlays):
+    if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
     return entries
 
@@ -133,36 +119,32 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
     letters : their size, 1 in a sheet
     """
-    from PIL import Image, ImageDraw
-
-    room_of_line = round(width / letters)
+    room = round(width / letters)
     font = typeface(FINE * LETTERS)
     lines: list[list[Entry]] = []
-    room = 0.0
     for entry in entries:
-        needed = _length(entry, font) + GAP
-        if not lines or needed > room:
+        if not lines or _length([*lines[-1], entry], font) > room - GAP:
             lines.append([])
-            room = room_of_line - GAP
         lines[-1].append(entry)
-        room -= needed
-    picture = Image.new("RGB", (FINE * room_of_line, FINE * LINE * len(lines)), "white")
-    for number, line in enumerate(lines):
-        left = (room_of_line - sum(_length(entry, font) + GAP for entry in line) + GAP) / 2
-        for entry in line:
-            _draw(ImageDraw.Draw(picture), entry, FINE * left, FINE * LINE * (number + 0.5), font)
-            left += _length(entry, font) + GAP
     if not lines:
         return np.empty((0, width, 3), np.uint8)
+    picture = Image.new("RGB", (FINE * room, FINE * LINE * len(lines)), "white")
+    for number, line in enumerate(lines):
+        left = (room - _length(line, font)) / 2
+        for entry in line:
+            _draw(ImageDraw.Draw(picture), entry, FINE * left, FINE * LINE * (number + 0.5), font)
+            left += _length([entry], font) + GAP
     return np.array(picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS))
 
 
-def _length(entry: Entry, font: "FreeTypeFont") -> float:
-    """Return how long an entry is [px]."""
-    return entry.width + sum(font.getlength(text) / FINE + 8 for text in (entry.text, entry.low, entry.high) if text)
+def _length(entries: Sequence[Entry], font: ImageFont.FreeTypeFont) -> float:
+    """Return how long entries side by side are [px]."""
+    texts = [text for entry in entries for text in (entry.text, entry.low, entry.high) if text]
+    marks = sum(entry.width for entry in entries) + GAP * (len(entries) - 1)
+    return marks + sum(font.getlength(text) / FINE + 8 for text in texts)
 
 
-def _draw(draw: "ImageDraw", entry: Entry, left: float, middle: float, font: "FreeTypeFont") -> None:
+def _draw(draw: ImageDraw.ImageDraw, entry: Entry, left: float, middle: float, font: ImageFont.FreeTypeFont) -> None:
     """Draw an entry from `left` on, around `middle`, in fine pixels."""
     gap, half = 8 * FINE, 8 * FINE
     if entry.low:

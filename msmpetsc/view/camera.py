@@ -44,9 +44,7 @@ def camera_facing(points: np.ndarray, gravity: Sequence[float] | None, eye: Sequ
     """
     up = unit(-np.array(gravity)) if gravity and any(gravity) else np.array([0.0, 0.0, 1.0])
     if eye is None:
-        right, away = _across(points, up)
-        right, away = np.cos(YAW) * right + np.sin(YAW) * away, np.cos(YAW) * away - np.sin(YAW) * right
-        return Camera(right, away, up, ELEVATION)
+        return turned(Camera(*_across(points, up), up, ELEVATION), YAW)
     height = unit(eye) @ up
     level = unit(eye) - height * up
     if np.linalg.norm(level) < 1e-6:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.results.compare import common_times
+from msmpetsc.results.comparison import common_times
 from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.results.reader import Result
 from msmpetsc.results.surfaces import refuse_different_meshes
@@ -136,7 +136,7 @@ def _speed(subject: Drawable, _: Result | None) -> Colouring:
 
 def _strain(subject: Drawable, _: Result | None) -> Colouring:
     """Colour by the springs' change of length over their rest length, its root mean square around a node."""
-    springs, rest_length = subject.springs, subject.array("lattice/rest_length")
+    springs, rest_length = subject.array("lattice/springs"), subject.array("lattice/rest_length")
     count = np.maximum(1, np.bincount(springs.ravel(), minlength=len(subject.rest.nodes)))
 
     def values(index: int) -> np.ndarray:

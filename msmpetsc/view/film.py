@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
@@ -15,15 +14,14 @@ from PIL import Image
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.results.disk import whole_file
-from msmpetsc.results.progress import counted
+from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
 from msmpetsc.view.annotations import CAPTION, Entry, caption_picture, entries_of, legend_picture, scale_bar
+from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
-from msmpetsc.view.mesh import LatticeMesh, cut_open, drawn
-from msmpetsc.view.overlays import MARGIN
-from msmpetsc.view.playback import Extent, Playback, Style, View, extent_of, room_of, views_of
-from msmpetsc.view.renderer import Panel, Renderer
-from msmpetsc.view.sheet import LABELS
+from msmpetsc.view.mesh import drawn
+from msmpetsc.view.playback import Playback
+from msmpetsc.view.renderer import Renderer
 
 LONGEST, SHORTEST = 960, np.array([480, 320])  # [px]: sides of a film, where nothing is said
 USUAL, SMALLEST = 720, 0.5  # [px]: height where captions and legend have their usual size; the least share of that
@@ -32,79 +30,53 @@ QUALITY = 10  # as ffmpeg's -crf counts: 0 without loss, 51 the worst
 
 
 def write_film(
-    subject: Drawable, path: Path, frames: Sequence[int], style: Style, playback: Playback, turns: float = 0.0,
+    subject: Drawable,
+    path: Path,
+    frames: Sequence[int],
+    style: Style,
+    playback: Playback,
     reference: Result | None = None,
-) -> None:  # fmt: skip
-    """Write a film of these frames at a playback; from start to end the eye goes so many times around the body.
-
-    Raises InputError where it cannot be drawn or written.
-    """
-    subject = drawn(subject)
+) -> None:
+    """Write a film of these frames at a playback. Raises InputError where it cannot be drawn or written."""
     played = [frames[number] for number in playback.numbers]
-    seen = extent_of(subject, played, style, reference)
-    views = views_of(subject, played, seen, turns)
+    composition = composition_of(drawn(subject), played, style, reference)
+    stills = composition.stills(played, playback.turns, playback.words)
     if playback.speed:
-        log.info("the film lasts %.2g s, %s", playback.seconds, playback.words or "in real time")
-    size = style.size or _fitting(views, seen, style)
+        seconds = len(played) / playback.fps
+        log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
+    size = style.size or _fitting(composition, stills)
     with written(path, size, playback.fps) as add:
-        for picture in _pictures(subject, views, seen, replace(style, size=size), playback.words):
+        for picture in _pictures(composition, stills, size):
             add(picture)
 
 
-def _fitting(views: list[View], seen: Extent, style: Style) -> tuple[int, int]:
+def _fitting(composition: Composition, stills: list[Still]) -> tuple[int, int]:
     """Return width and height [px], both even, of a film that what is seen fills."""
-    low, high, _ = room_of(views, seen, LABELS if style.axes else MARGIN)
+    low, high, _ = composition.room(stills)
     width, height = np.clip((high - low) * LONGEST / (high - low).max(), SHORTEST, LONGEST)
     return 2 * round(width / 2), 2 * round((height + CAPTION) / 2)
 
 
-def _pictures(subject: Drawable, views: list[View], seen: Extent, style: Style, words: str) -> Iterator[np.ndarray]:
-    """Yield the picture (height, width, 3) of each view; of equal ones in a row the first is drawn only."""
-    assert style.size
-    width, height = style.size
-    low, high, depth = room_of(views, seen, LABELS if style.axes else MARGIN)
-    entries = entries_of(subject.scene, seen.fixed, [view.overlays for view in views], seen.colouring, style.shown)
+def _pictures(composition: Composition, stills: list[Still], size: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Yield the picture (height, width, 3) of each still; of equal ones in a row the first is drawn only."""
+    width, height = size
     letters = min(1.0, max(height / USUAL, SMALLEST))
-    bar = [Entry("length", "")] if style.scale_bar else []
+    entries = entries_of(composition, stills)
+    bar = [Entry("length", "")] if composition.style.scale_bar else []
     room = height - round(letters * CAPTION) - len(legend_picture([*entries, *bar], width, letters))
-    scale = min(width / (high - low)[0], room / (high - low)[1])  # [px/m]
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
-    bar = [scale_bar(scale / letters, width / letters / 5)] if style.scale_bar else []
-    legend = legend_picture([*entries, *bar], width, letters)
-    across, upward = (low + high) / 2
-    middle = seen.box.mean(axis=0)
-    cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
-    before: View | None = None
-    picture = np.empty(0)
-    with Renderer(width, room, subject.triangles) as renderer:
-        for view in counted(views, "pictures"):
-            if before is None or view.index != before.index or view.camera is not before.camera:
-                camera = view.camera
-                centre = across * camera.right + upward * camera.upward + middle @ camera.to_eye * camera.to_eye
-                renderer.face(camera, centre, room / scale, depth)
-                lattice = cut.meshes(subject.nodes(view.index)) if cut else ()
-                panel = _panel(subject, view, seen, style, lattice, words)
-                picture = np.concatenate(
-                    [renderer.picture(panel), caption_picture(panel.caption, width, letters), legend]
-                )
-            before = view
+    before, picture = None, np.empty(0)
+    with Renderer(composition, stills, (width, room)) as renderer:
+        if bar:
+            bar = [scale_bar(renderer.scale / letters, width / letters / 5)]
+        legend = legend_picture([*entries, *bar], width, letters)
+        for still in counted(stills, "pictures"):
+            if still is not before:
+                caption = caption_picture(still.caption, width, letters)
+                picture = np.concatenate([renderer.picture(still), caption, legend])
+            before = still
             yield picture
-
-
-def _panel(
-    subject: Drawable, view: View, seen: Extent, style: Style, lattice: tuple[LatticeMesh, ...], words: str
-) -> Panel:
-    """Return the panel of a view, with its time and how much slower or faster than real it goes, in words."""
-    return Panel(
-        points=subject.surface(view.index),
-        fixed=subject.fixed(view.index),
-        overlays=view.overlays,
-        caption=(f"t = {subject.times[view.index]:.3f} s", words),
-        colours=seen.colouring.rgb(view.index) if seen.colouring else None,
-        lattice=lattice,
-        axes=seen.box if style.axes else None,
-    )
 
 
 @contextmanager

@@ -5,23 +5,22 @@ points are those of the file, in their order, then those put into long edges, th
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.gaps import unit_vectors
 from msmpetsc.view.camera import Camera
-from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL, SPRING
-from msmpetsc.view.drawable import Drawable
-from msmpetsc.view.overlays import Rest
+from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
+from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 # The surface
 
 
-SHARP = np.cos(np.radians(30))  # of the angle between the normals of two triangles: beyond it their edge is sharp
+SHARP = 30.0  # [degrees] between the normals of two triangles: beyond it their edge is sharp
 HELD = 0.5  # share of a point that is fixed: a triangle is whose corners all have more
 MOST = 30_000  # triangles, roughly: however small the cells, edges are not divided into more
 CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])  # of a cell, VTK's order
@@ -40,40 +39,31 @@ def _refined(subject: Drawable) -> Drawable:
         return subject
     a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    finer = subdivided(rest.points, subject.triangles, max(cell, float(np.sqrt(2 * area / MOST))))
-    old, new = len(rest.points), len(finer.points)
-    if new == old:
+    points, triangles, carry = subdivided(rest.points, subject.triangles, max(cell, float(np.sqrt(2 * area / MOST))))
+    if len(points) == len(rest.points):
         return subject
-    body = rest.body_of_point[np.asarray(finer.carry.argmax(axis=1)).ravel()]
-    T = trilinear(rest, finer.points[old:], body[old:])
+    body = rest.body_of_point[carry.indices[carry.indptr[:-1]]]
+    T = trilinear(rest, points[len(rest.points) :], body[len(rest.points) :])
     return replace(
         subject,
-        rest=replace(rest, points=finer.points, body_of_point=body),
-        triangles=finer.triangles,
+        rest=replace(rest, points=points, body_of_point=body),
+        triangles=triangles,
         surface=lambda index: np.concatenate([subject.surface(index), T @ subject.nodes(index)]),
         embedding=csr_array(vstack([W, T])),
-        carry=finer.carry,
+        carry=carry,
     )
 
 
-@dataclass(frozen=True)
-class Subdivided:
-    """Points (p, 3) and triangles (f, 3), and carry (p, v): numbers at the v points before -> numbers at these."""
-
-    points: np.ndarray
-    triangles: np.ndarray
-    carry: csr_array
-
-
-def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> Subdivided:
-    """Return a surface whose edges longer than `longest` [m] are halved, again and again, the first points kept."""
+def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, csr_array]:
+    """Return a surface whose edges longer than `longest` [m] are halved, again and again: points (p, 3), of which the
+    first are those given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
     carry = csr_array(eye_array(len(points)))
     while True:
         half_edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         edges, number = np.unique(half_edges, axis=0, return_inverse=True)
         long = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) > longest
         if not long.any():
-            return Subdivided(points, triangles, carry)
+            return points, triangles, carry
         middle = np.where(long, len(points) + np.cumsum(long) - 1, -1)[number].reshape(-1, 3)
         ends = edges[long]
         points = np.concatenate([points, points[ends].mean(axis=1)])
@@ -102,7 +92,7 @@ def _divided(triangles: np.ndarray, middle: np.ndarray) -> np.ndarray:
     return np.concatenate(pieces)
 
 
-def trilinear(rest: Rest, points: np.ndarray, body: np.ndarray) -> csr_array:
+def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_array:
     """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
     of_cell = rest.body_of_node[rest.cells[:, 0]]
     around = np.empty(len(points), int)
@@ -124,16 +114,11 @@ def _split(subject: Drawable) -> Drawable:
         np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True
     )
     origin, triangles = split_at_edges(rest.points, first[equal.ravel()][subject.triangles])
-    if len(origin) == len(rest.points):
-        return replace(subject, triangles=triangles)
-    of_point = rest.body_of_point[origin]
-    rest = replace(rest, points=rest.points[origin], body_of_point=of_point)
-    same_nodes = subject.rest.nodes is subject.rest.points  # of a surface alone
+    rest = replace(rest, points=rest.points[origin], body_of_point=rest.body_of_point[origin])
     return replace(
         subject,
-        rest=replace(rest, nodes=rest.points, body_of_node=of_point) if same_nodes else rest,
+        rest=rest,
         triangles=triangles,
-        nodes=(lambda index: subject.nodes(index)[origin]) if same_nodes else subject.nodes,
         surface=lambda index: subject.surface(index)[origin],
         embedding=None if W is None else W[origin],
         carry=(csr_array(eye_array(len(subject.rest.points))) if subject.carry is None else subject.carry)[origin],
@@ -145,29 +130,10 @@ def split_at_edges(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarra
 
     Two corners of triangles at one point stay one drawn point where no sharp edge parts them.
     """
-    a, b, c = points[triangles].swapaxes(0, 1)
-    normals = unit_vectors(np.cross(b - a, c - a))
-    half_edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)  # of corner 3 t + k
-    order = np.lexsort(np.sort(half_edges, axis=1).T)
-    ours, theirs = order[:-1], order[1:]
-    same = (np.sort(half_edges[ours], axis=1) == np.sort(half_edges[theirs], axis=1)).all(axis=1)
-    across = np.einsum("ij,ij->i", normals[ours // 3], normals[theirs // 3])
-    flat = ~(normals[ours // 3].any(axis=1) & normals[theirs // 3].any(axis=1))  # a triangle without area parts nothing
-    joined = same & ((across >= SHARP) | flat)
-    ours, theirs = ours[joined], theirs[joined]
-    ends = lambda edge: (edge, edge - edge % 3 + (edge + 1) % 3)  # noqa: E731  corners at its start and its end
-    (a, b), (c, d) = ends(ours), ends(theirs)
-    opposite = triangles.ravel()[a] == triangles.ravel()[d]  # as neighbours that are wound alike run along an edge
-    pairs = np.concatenate([a, b]), np.concatenate([np.where(opposite, d, c), np.where(opposite, c, d)])
-    corners = triangles.size
-    pieces, piece = connected_components(csr_array((np.ones(len(pairs[0]), bool), pairs), (corners, corners)), False)
-    of_piece = np.empty(pieces, int)
-    of_piece[piece] = triangles.ravel()
-    kept, first = np.unique(of_piece, return_index=True)
-    others = np.setdiff1d(np.arange(pieces), first)
-    number = np.empty(pieces, int)
-    number[first], number[others] = kept, len(points) + np.arange(len(others))
-    return np.concatenate([np.arange(len(points)), of_piece[others]]), number[piece].reshape(-1, 3)
+    surface = pv.PolyData.from_regular_faces(points, triangles)
+    options: dict[str, Any] = dict(consistent_normals=False, non_manifold_traversal=False, cell_normals=False)
+    split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
+    return split["pyvistaOriginalPointIds"], split.regular_faces
 
 
 # The lattice
@@ -177,17 +143,7 @@ SHOWN = ("cells", "springs")
 BOUNDARY, INTERIOR = 1, 2  # lattice/cell_kind
 SHRUNK = 0.86  # of a cell's size, so that neighbours are told apart
 THROUGH = 0.3  # opacity of a body whose lattice is shown
-FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])  # VTK's order
 KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
-
-
-@dataclass(frozen=True)
-class LatticeMesh:
-    """Faces (f, 4) or lines (s, 2) between points (p, 3) [m], of one colour."""
-
-    points: np.ndarray
-    joined: np.ndarray
-    colour: str
 
 
 @dataclass(frozen=True)
@@ -201,32 +157,22 @@ class Cut:
     cells: dict[int, np.ndarray]
     springs: np.ndarray
 
-    def meshes(self, nodes: np.ndarray) -> tuple[LatticeMesh, ...]:
-        """Return cells and springs at positions (n, 3) of the nodes."""
-        parts = [_cells(nodes, cells, KINDS[kind][0]) for kind, cells in self.cells.items()]
-        return (*parts, LatticeMesh(nodes, self.springs, SPRING)) if len(self.springs) else tuple(parts)
+    @property
+    def used(self) -> np.ndarray:
+        """Numbers of the nodes of cells and springs, each once."""
+        return np.unique(np.concatenate([part.ravel() for part in (*self.cells.values(), self.springs)]))
 
 
 def cut_open(subject: Drawable, camera: Camera, shown: tuple[str, ...]) -> Cut:
     """Return the half of the lattice behind the middle of the body at rest. Raises InputError where there is none."""
     if not len(subject.rest.cells):
         raise InputError(f"--show: {subject.name} is a mesh without cells")
-    nodes, cells = subject.rest.nodes, subject.rest.cells
-    depth = nodes @ camera.to_eye
+    cells, depth = subject.rest.cells, subject.rest.nodes @ camera.to_eye
     middle = (depth.min() + depth.max()) / 2
-    behind = depth[cells].mean(axis=1) <= middle
-    kind = subject.array("lattice/cell_kind")
-    parts = {number: cells[behind & (kind == number)] for number in KINDS} if "cells" in shown else {}
-    springs = np.empty((0, 2), int)
-    if "springs" in shown:
-        springs = subject.springs
-        springs = springs[(depth[springs] <= middle).all(axis=1)]
+    parts: dict[int, np.ndarray] = {}
+    if "cells" in shown:
+        behind, kind = depth[cells].mean(axis=1) <= middle, subject.array("lattice/cell_kind")
+        parts = {number: cells[behind & (kind == number)] for number in KINDS}
+    springs = subject.array("lattice/springs") if "springs" in shown else np.empty((0, 2), int)
+    springs = springs[(depth[springs] <= middle).all(axis=1)]
     return Cut({number: part for number, part in parts.items() if len(part)}, springs)
-
-
-def _cells(nodes: np.ndarray, cells: np.ndarray, colour: str) -> LatticeMesh:
-    corners = nodes[cells]
-    middles = corners.mean(axis=1, keepdims=True)
-    points = (middles + SHRUNK * (corners - middles)).reshape(-1, 3)
-    faces = (8 * np.arange(len(cells))[:, None, None] + FACES).reshape(-1, 4)
-    return LatticeMesh(points, faces, colour)

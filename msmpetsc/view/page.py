@@ -10,6 +10,7 @@ import html
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,16 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.gaps import TINY, unit_vectors
-from msmpetsc.results.progress import counted
+from msmpetsc.results.progress_bar import counted
 from msmpetsc.results.reader import Result
 from msmpetsc.view import colours
 from msmpetsc.view.annotations import entries_of
 from msmpetsc.view.colours import Colouring
+from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import FARTHEST, Drawable
-from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, cut_open, drawn
+from msmpetsc.view.mesh import HELD, KINDS, SHRUNK, THROUGH, Cut, drawn
 from msmpetsc.view.overlays import Overlays
-from msmpetsc.view.playback import Extent, Style, View, extent_of, usual_speed, views_of
+from msmpetsc.view.playback import usual_speed
 
 MOST = 20e6  # [byte]: a page of more frames takes fewer of them
 LEVELS = 65535  # of a coordinate
@@ -44,15 +46,10 @@ def write_page(
 
     Raises InputError where they cannot be drawn or the page not be written.
     """
-    subject = drawn(subject)
-    seen = extent_of(subject, frames, style, reference)
-    cut = cut_open(subject, seen.camera, style.shown) if style.shown else None
-    chosen, about_lattice = list(frames), None
+    composition = composition_of(drawn(subject), frames, style, reference)
+    chosen = list(frames)
     while True:
-        streams = packed_frames(subject, chosen, seen)
-        if cut is not None:
-            of_lattice, about_lattice = packed_lattice(subject, chosen, cut)
-            streams |= of_lattice
+        streams = packed_frames(composition, chosen)
         size = sum(map(len, streams.values())) * 4 / 3
         if size <= MOST or len(chosen) < 3:
             break
@@ -60,46 +57,51 @@ def write_page(
         chosen = [*chosen[:-1:step], chosen[-1]]
     if len(chosen) < len(frames):
         log.info("%s has %d of the %d frames: all would be above %.0f MB", path, len(chosen), len(frames), MOST / 1e6)
-    views = views_of(subject, chosen, seen)
-    streams["fixed"], numbers = fixed_states(subject, chosen)
-    facts = page_facts(subject, views, seen, style) | {"fixed": numbers, "lattice": about_lattice}
-    write_whole(path, page_text(subject.title, facts, streams))
+    streams["fixed"], numbers = fixed_states(composition.subject, chosen)
+    facts = page_facts(composition, composition.stills(chosen)) | {"fixed": numbers}
+    write_whole(path, page_text(composition.subject.title, facts, streams))
 
 
-def packed_frames(subject: Drawable, frames: Sequence[int], seen: Extent) -> dict[str, bytes]:
-    """Return positions, colours and triangles as deflated bytes, for the script to read."""
+def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
+    """Return positions, colours and triangles, and the lattice's nodes, cells and springs as far as they are shown, as
+    deflated bytes for the script to read. Raises InputError where they cannot be drawn."""
+    subject, cut = composition.subject, composition.cut(composition.style.shown)
     streams = {
-        "positions": deflated(residuals(quantised(subject.surface, frames, seen.box))),
+        "positions": deflated(residuals(quantised(subject.surface, frames, composition.box))),
         "triangles": packed_numbers(subject.triangles, len(subject.rest.points)),
     }
-    if seen.colouring is not None:
-        streams["colours"] = deflated(changes(levels(seen.colouring, frames)))
+    if composition.colouring is not None:
+        streams["colours"] = deflated(changes(levels(composition.colouring, frames)))
+    if cut is not None:
+        used, cells = cut.used, np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
+        box = lattice_box(subject, cut, frames)
+        streams |= {
+            "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
+            "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
+            "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
+        }
     return streams
 
 
-def packed_lattice(subject: Drawable, frames: Sequence[int], cut: Cut) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Return the nodes of what is left of a lattice, its cells and springs as deflated bytes, and what the script must
-    know beside them. Raises InputError where they cannot be drawn."""
-    cells = np.concatenate([np.empty((0, 8), int), *cut.cells.values()])
-    used = np.unique(np.concatenate([cells.ravel(), cut.springs.ravel()]))
-    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[used] for index in frames)]
+def lattice_box(subject: Drawable, cut: Cut, frames: Iterable[int]) -> np.ndarray:
+    """Return the box (2, 3) around what is shown of a lattice [m]. Raises InputError where it cannot be drawn."""
+    ends = [(nodes.min(axis=0), nodes.max(axis=0)) for nodes in (subject.nodes(index)[cut.used] for index in frames)]
     box = np.array([np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)])
     if not (np.abs(box) < FARTHEST).all():
         raise InputError(f"--show: {subject.name} has nodes that cannot be drawn")
-    streams = {
-        "nodes": deflated(residuals(quantised(lambda index: subject.nodes(index)[used], frames, box))),
-        "cells": packed_numbers(np.searchsorted(used, cells), len(used)),
-        "springs": packed_numbers(np.searchsorted(used, cut.springs), len(used)),
-    }
-    about = {
-        "box": box.tolist(),
-        "nodes": len(used),
+    return box
+
+
+def lattice_facts(subject: Drawable, cut: Cut, frames: Iterable[int]) -> dict[str, Any]:
+    """Return what the script must know of a lattice beside its streams."""
+    return {
+        "box": lattice_box(subject, cut, frames).tolist(),
+        "nodes": len(cut.used),
         "kinds": [{"cells": len(part), "colour": KINDS[kind][0]} for kind, part in cut.cells.items()],
         "springColour": colours.SPRING,
         "shrunk": SHRUNK,
         "opacity": THROUGH,
     }
-    return streams, about
 
 
 def packed_numbers(numbers: np.ndarray, count: int) -> bytes:
@@ -157,30 +159,29 @@ def deflated(parts: Iterable[bytes]) -> bytes:
     return b"".join([*map(packer.compress, parts), packer.flush()])
 
 
-def page_facts(subject: Drawable, views: Sequence[View], seen: Extent, style: Style) -> dict[str, Any]:
+def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:
     """Return what the script must know beside the streams, in types of JSON."""
-    camera, colouring = seen.camera, seen.colouring
-    overlays = [view.overlays for view in views]
-    bar = entries_of(subject.scene, seen.fixed, overlays, colouring, style.shown)
+    subject, frames, cut = composition.subject, [still.index for still in stills], stills[0].cut
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
-        "box": seen.box.tolist(),
-        "times": [float(subject.times[view.index]) for view in views],
-        "frames": [view.index for view in views],
-        "speed": usual_speed(float(np.ptp(subject.times[[views[0].index, views[-1].index]]))),
-        "camera": {
-            "right": camera.right.tolist(),
-            "away": camera.away.tolist(),
-            "up": camera.up.tolist(),
-            "elevation": float(camera.elevation),
-        },
-        "scale": scale_colours(colouring),
-        "legend": [vars(entry) for entry in bar],
-        "overlays": distinct(overlays),
+        "box": composition.box.tolist(),
+        "times": subject.times[frames].tolist(),
+        "frames": frames,
+        "speed": usual_speed(float(np.ptp(subject.times[[frames[0], frames[-1]]]))),
+        "camera": plain(composition.camera),
+        "scale": scale_colours(composition.colouring),
+        "legend": [vars(entry) for entry in entries_of(composition, stills)],
+        "overlays": distinct([still.overlays for still in stills]),
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
-        "axes": style.axes,
+        "axes": composition.style.axes,
+        "lattice": lattice_facts(subject, cut, frames) if cut else None,
     }
+
+
+def plain(facts: Any) -> Any:
+    """Return a dataclass in types of JSON."""
+    return json.loads(json.dumps(asdict(facts), default=np.ndarray.tolist))
 
 
 def scale_colours(colouring: Colouring | None) -> list[list[int]]:
@@ -196,16 +197,7 @@ def scale_colours(colouring: Colouring | None) -> list[list[int]]:
 def distinct(overlays: Sequence[Overlays]) -> dict[str, list]:
     """Return what stands beside the body, each different state once, and the number of its state for each frame."""
     states: dict[str, int] = {}
-    numbers = []
-    for shown in overlays:
-        state = {
-            "grounds": [{"corners": g.corners.tolist(), "normal": g.normal.tolist()} for g in shown.grounds],
-            "glass": [corners.tolist() for corners in shown.glass],
-            "arrows": [arrow.tolist() for arrow in shown.arrows],
-            "shapes": [{"number": s.number, "by": s.by.tolist(), "seen": s.seen.tolist()} for s in shown.shapes],
-            "balls": [{"center": b.center.tolist(), "radius": b.radius, "seen": b.seen.tolist()} for b in shown.balls],
-        }
-        numbers.append(states.setdefault(json.dumps(state), len(states)))
+    numbers = [states.setdefault(json.dumps(plain(shown)), len(states)) for shown in overlays]
     return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 

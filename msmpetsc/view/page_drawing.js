@@ -120,8 +120,8 @@ function axesOfEye() {
 }
 
 function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
-  const beside = data.overlays.states.flatMap(({ grounds, glass, balls, shapes }) => [
-    ...grounds.map((ground) => CORNERS.map((corner) => below(ground, corner))), ...glass, ...[...balls, ...shapes].map((round) => round.seen)]);
+  const beside = data.overlays.states.flatMap(({ grounds, glass, balls, meshes }) => [
+    ...grounds.map((ground) => CORNERS.map((corner) => below(ground, corner))), ...glass, ...[...balls, ...meshes].map((round) => round.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
 }
@@ -230,7 +230,7 @@ function drawBall(camera, { center, radius }, eye) { // without perspective a sp
   drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
 }
 
-function drawShape(camera, eye, { number, by }) { // a mesh, in the colour of obstacles
+function drawMesh(camera, eye, { number, by }) { // a mesh, in the colour of obstacles
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
@@ -287,7 +287,7 @@ function draw() {
   const eye = axesOfEye(), { matrix, rows, shift } = cameraMatrix(eye);
   const state = data.overlays.states[data.overlays.numbers[view.frame]];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
-  for (const shape of state.shapes) drawShape(matrix, eye, shape);
+  for (const mesh of state.meshes) drawMesh(matrix, eye, mesh);
   if (shown.size) drawLattice(matrix, eye);
   drawBody(matrix, eye); // after what is seen through it
   drawAxes(matrix, rows, shift);

@@ -16,20 +16,18 @@ from msmpetsc.results.disk import whole_file
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.view.annotations import CAPTION, Entry, caption_picture, entries_of, legend_picture, scale_bar
-from msmpetsc.view.camera import Camera, camera_facing
-from msmpetsc.view.colours import colouring_of, opened_reference, plain_colouring, scaled
-from msmpetsc.view.drawable import FARTHEST, Drawable, drawable_of_result
-from msmpetsc.view.mesh import cut_open, drawn
-from msmpetsc.view.overlays import MARGIN
-from msmpetsc.view.playback import Style
-from msmpetsc.view.renderer import Panel, Renderer
+from msmpetsc.view.annotations import CAPTION, caption_picture, entries_of, legend_picture, scale_bar
+from msmpetsc.view.colours import opened_reference
+from msmpetsc.view.composition import Style, composition_of
+from msmpetsc.view.drawable import Drawable, drawable_of_result
+from msmpetsc.view.mesh import drawn
+from msmpetsc.view.renderer import Renderer
 
-PANEL, NARROWEST = (400, 870), 240  # [px]: at most, and the least that a caption needs
+PANEL, NARROWEST = np.array([400, 870]), 240  # [px]: at most, and the least that a caption needs
 ROW = 2000  # [px]: wider ones are broken into several
 HIGHEST = 32767  # [px]: where 16 bits end, and with them what many programs show
 LONGEST_BAR = 0.4  # of a panel's width: a scale bar
-LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
+COUNT = 5  # moments, where nothing is said
 
 
 @dataclass(frozen=True)
@@ -46,18 +44,15 @@ def contact_sheet(
     png_path: str | Path,
     frames: Frames | None = None,
     count: int | None = None,
-    eye: Sequence[float] | None = None,
     style: Style | None = None,
     reference: Path | None = None,
 ) -> Path:
     """Draw the surface at some moments of a result; return png_path.
 
     frames    : these, or (count) as many as `choose_moments` finds, or those at the scene's picture.times
-    eye       : direction from the body to the eye (3,); the scene's picture.eye if None
     reference : result that the colour "error" is counted from
     """
     style = style or Style()
-    style = style if eye is None else replace(style, eye=eye)
     with plain_damage(Path(h5_path)), Result(h5_path) as run, opened_reference(reference, run) as compared:
         subject = drawable_of_result(run)
         chosen = _moments(run, subject, frames, count)
@@ -70,80 +65,43 @@ def contact_sheet(
 def draw_moments(
     subject: Drawable, path: Path, moments: Sequence[Moment], style: Style, reference: Result | None = None
 ) -> None:
-    """Draw a subject at some moments, side by side."""
-    subject = drawn(subject)
-    bodies = {moment.index: subject.surface(moment.index) for moment in moments}
-    everywhere = np.concatenate(list(bodies.values()))
-    if not (np.abs(everywhere) < FARTHEST).all() or np.ptp(everywhere, axis=0).max() == 0:
-        raise InputError(f"{subject.name}: the surface at these moments has no extent, or none that can be drawn")
-    camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
-    colouring = plain_colouring(subject)
-    if style.colour:
-        colouring = scaled(colouring_of(subject, style.colour, reference), bodies)
-    axes = np.array([everywhere.min(axis=0), everywhere.max(axis=0)]) if style.axes else None
-    panels = []
-    for moment in moments:
-        index, shown = moment.index, moment.shown
-        overlays = subject.overlays(index, everywhere, camera)
-        colours = colouring.rgb(index) if colouring else None
-        lattice = cut_open(subject, camera, shown).meshes(subject.nodes(index)) if shown else ()
-        panels.append(Panel(bodies[index], subject.fixed(index), overlays, moment.caption, colours, lattice, axes))
-    fixed = any(panel.fixed.any() for panel in panels)
-    every = tuple({name: None for moment in moments for name in moment.shown})
-    entries = entries_of(subject.scene, fixed, [panel.overlays for panel in panels], colouring, every)
-    draw(panels, subject.triangles, camera, path, style, entries)
+    """Draw a subject at some moments, in rows of panels with the legend below them.
+
+    The panels are drawn one by one: a graphics library's own pictures end at some width, and beyond it they are black.
+    """
+    composition = composition_of(drawn(subject), [moment.index for moment in moments], style, reference)
+    stills = [
+        replace(still, caption=moment.caption, cut=composition.cut(moment.shown))
+        for still, moment in zip(composition.stills([moment.index for moment in moments]), moments, strict=True)
+    ]
+    low, high, _ = composition.room(stills)
+    scale = ((style.size or PANEL) / (high - low)).min()  # [px/m]
+    width, height = (int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low))))  # [px]
+    rows = _rows_of(len(stills), (width, height + CAPTION))
+    columns = -(-len(stills) // rows)
+    sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
+    with Renderer(composition, stills, (width, height)) as renderer:
+        for number, still in enumerate(stills):
+            captioned = [renderer.picture(still), caption_picture(still.caption, width)]
+            sheet[number // columns, :, number % columns] = np.concatenate(captioned)
+    sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
+    entries = entries_of(composition, stills)
+    if style.scale_bar:
+        entries.append(scale_bar(renderer.scale, LONGEST_BAR * width))
+    _save(np.concatenate([sheet, legend_picture(entries, columns * width)]), path)
 
 
 def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int | None) -> dict[int, str]:
     """Return the frames to draw, each with its reason or ""."""
-    total = len(subject.times)
-    assert isinstance(subject.scene, SceneFile)
     if frames:
-        moments = dict.fromkeys(frames_of(subject.name, frames, total), "")
-        refuse_high(len(moments))  # before the surfaces of all are read
-        return moments
+        return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
+    assert isinstance(subject.scene, SceneFile)
     if count is None and subject.scene.picture.times:
         return moments_at(run, subject.scene.picture.times)
-    refuse_high(min(count or 0, total))
     return choose_moments(run, count or COUNT)
 
 
-def draw(
-    panels: list[Panel],
-    triangles: np.ndarray,
-    camera: Camera,
-    path: Path,
-    style: Style | None = None,
-    entries: Sequence[Entry] = (),
-) -> None:
-    """Render the panels one by one, each with its caption, paste them in rows, and put the legend below.
-
-    A graphics library's own pictures end at some width, and beyond it they are black.
-    """
-    style = style or Style()
-    low, high = _frame(panels, camera)
-    most = style.size or PANEL
-    scale = min(most[0] / (high - low)[0], most[1] / (high - low)[1])  # [px/m]
-    width, height = np.maximum([NARROWEST, 1], np.round(scale * (high - low))).astype(int)  # [px]
-    rows = refuse_high(len(panels), (int(width), int(height) + CAPTION))
-    columns = -(-len(panels) // rows)
-    across, upward = (low + high) / 2
-    shown = np.concatenate([points for panel in panels for points in (panel.points, panel.overlays.corners)])
-    depth = float(np.linalg.norm(np.ptp(shown, axis=0)))  # nothing reaches farther towards the eye
-    middle = across * camera.right + upward * camera.upward + shown[0] @ camera.to_eye * camera.to_eye
-    sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
-    with Renderer(int(width), int(height), triangles) as renderer:
-        renderer.face(camera, middle, height / scale, depth)
-        for number, panel in enumerate(panels):
-            captioned = [renderer.picture(panel), caption_picture(panel.caption, int(width))]
-            sheet[number // columns, :, number % columns] = np.concatenate(captioned)
-    sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
-    if style.scale_bar:
-        entries = (*entries, scale_bar(scale, LONGEST_BAR * width))
-    _save(np.concatenate([sheet, legend_picture(entries, sheet.shape[1])]), path)
-
-
-def refuse_high(panels: int, size: tuple[int, int] = (NARROWEST, CAPTION)) -> int:
+def _rows_of(panels: int, size: tuple[int, int]) -> int:
     """Return the rows in which panels of this size [px] stand. Raises InputError for more than programs would show."""
     width, height = size
     in_row = max(1, ROW // width)
@@ -164,20 +122,7 @@ def _save(picture: np.ndarray, path: Path) -> None:
         raise InputError(f"{path} cannot be written: {error}") from error
 
 
-def _frame(panels: list[Panel], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower left and upper right (2,), (2,) [m] of what every panel shows, in the picture's plane."""
-    bodies = np.concatenate([panel.points for panel in panels])
-    margin = (LABELS if panels[0].axes is not None else MARGIN) * np.ptp(bodies, axis=0).max()
-    sharp = [points for panel in panels for points in panel.overlays.sharp]
-    below = [ground.below(panel.points) for panel in panels for ground in panel.overlays.grounds]
-    inner = camera.flat(np.concatenate([bodies, *below, *sharp]))
-    return inner.min(axis=0) - margin, inner.max(axis=0) + margin
-
-
 # The moments, where none are asked for
-
-
-COUNT = 5  # moments, where nothing is said
 
 
 def moments_at(run: Result, times: Sequence[float]) -> dict[int, str]:

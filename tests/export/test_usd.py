@@ -1,7 +1,5 @@
 """USD files, read back by USD's own library: the frames of the result, in time, one mesh a body."""
 
-import resource
-import signal
 from pathlib import Path
 
 import h5py
@@ -10,8 +8,6 @@ import pytest
 import small_result
 from small_result import DT, FRAMES, POINTS
 
-from msmpetsc.cli.main import main
-from msmpetsc.errors import InputError
 from msmpetsc.export.formats import export
 
 pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
@@ -106,22 +102,3 @@ def test_a_name_that_usd_would_not_take(result: Path, tmp_path: Path):
     result = result.rename(tmp_path / "2 bars-é.h5")
     stage, found = opened(export(result, tmp_path / "2 bars-é.usda"))
     assert stage.GetDefaultPrim().IsValid() and len(found) == 1
-
-
-def test_what_the_library_cannot_save_ends_in_one_line(result: Path, tmp_path: Path):
-    """As on a full disk: no more than some bytes may be written to a file."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (512, limits[1]))
-    try:
-        with pytest.raises(InputError, match=r"y\.usdc cannot be written") as caught:
-            export(result, tmp_path / "y.usdc")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
-    assert "\n" not in str(caught.value) and not list(tmp_path.glob("*.usdc"))
-
-
-def test_what_cannot_be_written_ends_in_one_line(result: Path, capfd: pytest.CaptureFixture[str]):
-    assert main(["export", str(result), "-o", "/proc/y.usdc"]) == 2
-    assert "/proc/y.usdc cannot be written" in capfd.readouterr().err

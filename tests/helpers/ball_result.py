@@ -16,6 +16,10 @@ cages.count = 1
 material = { stiffness = 1.0, density = 1.0 }
 time = { step = 0.1, duration = 1.0 }
 """
+EAST_HELD = """
+[[pin]]
+region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
 SCENE = f"""
 {BARE}
 [[obstacle]]
@@ -32,7 +36,10 @@ ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]
 
 
 def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
-    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it."""
+    """The points of the ball are the nodes, too. Without surface: twice the ball, and an embedding that halves it.
+
+    Nodes are pinned where the scene has EAST_HELD.
+    """
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     rows = len(ball.vertices)
     factor = 1 if surface else 2
@@ -42,6 +49,8 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
         file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         file.write("lattice/cells", np.zeros((1, 8), int))
         file.write("lattice/nodes", factor * (ball.vertices + np.array([0, 0, HEIGHTS[0]])))
+        if EAST_HELD in scene:
+            file.write("lattice/pinned", np.flatnonzero(ball.vertices[:, 0] >= 0.02))
         for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
         file.start_frames(len(HEIGHTS), rows, rows if surface else None)

@@ -2,15 +2,12 @@
 
 import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from bad_input import TRIALS, damage, damaged, limits
-from conftest import ENVIRONMENT, WORKERS
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from stopped_runs import hanging, signal_after
@@ -147,19 +144,3 @@ def test_a_damaged_part_is_named_in_one_line(stopped, tmp_path, capsys, how, nam
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     assert len(told) == 1 and name.rpartition("/")[2] in told[0]
     assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize("integrator", ["implicit-euler", pytest.param("verlet", marks=pytest.mark.slow)])
-def test_whatever_is_damaged_ends_in_a_line(stopped, tmp_path, monkeypatch, integrator):
-    """In forks of a worker: more of it by a larger number."""
-    source = stopped
-    if integrator == "verlet":
-        with monkeypatch.context() as patch:
-            patch.setattr(simulate, "REMEMBERED", 4)
-            signal_after(patch, 4, signal.SIGUSR1)
-            scene, source = hanging(tmp_path, steps=6), tmp_path / "source.h5"
-            assert main(["run", str(scene), "-o", str(source), "--set", "time.integrator=verlet"]) == 0
-    worker = WORKERS / "resume_worker.py"
-    command = [sys.executable, str(worker), str(source), str(tmp_path / "x.h5"), "25", "1"]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 0 and done.stdout.endswith(" faults: 0\n"), done.stdout + done.stderr

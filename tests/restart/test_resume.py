@@ -21,12 +21,11 @@ from stopped_runs import STEPS, assert_same, every_step_forgets, hanging, signal
 from msmpetsc.app.resume import Resumed
 from msmpetsc.build import build_model
 from msmpetsc.cli.main import main
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import InputError
 from msmpetsc.results.reader import finished
 from msmpetsc.results.restart import Earlier
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
-from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import Simulation
 
@@ -78,16 +77,13 @@ CASES = {
         solver={"preset": "newton", "error": 0.3}, obstacle=PRESSING, time={"step": 0.01, "duration": 0.24}
     ),
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
-    "anchor, verlet": by("verlet", swing(anchor=LED)),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
     "static": by("static", swing(solver=LOOSE, anchor=[LED[0] | {"stop": 0.05}, *PUSHED])),
-    "bdf2, reflected": by("bdf2", fall(solver=LOOSE, obstacle=[GROUND])),
     "bdf2, pressed": by("bdf2", fall(solver=LOOSE, obstacle=PRESSING)),
     "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
     "bdf2, a thin plate": by("bdf2", fall(solver=LOOSE, obstacle=[THIN | {"restitution": 0.5}])),
     "verlet, a thin plate": by("verlet", fall(obstacle=[THIN | {"response": "penalty"}])),
     "verlet": by("verlet", swing(output={"surface": False, "every": 3})),
-    "verlet, pressed": by("verlet", fall(obstacle=PRESSING)),
     "substep, scattered": swing(
         solver=solver("anderson"),
         start={"scatter": 0.9},
@@ -99,17 +95,6 @@ CASES = {
     "by error": by_error(0.1, by("bdf2", swing(solver=LOOSE, anchor=LED))),
     "by error, long steps": by_error(0.5, swing(solver=LOOSE, gravity={"acceleration": [0.0, 1e-3, -1e-2]})),
     "by error, reflected": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=[GROUND]))),
-    "substep, by error": by_error(
-        0.3,
-        swing(
-            solver=solver("anderson"),
-            start={"scatter": 0.9},
-            safety={"on_failure": "substep"},
-            material=SOFT | {"young_modulus": 1e6},
-            time={"step": 0.02, "duration": 0.16, "shortest": 0.02},
-        ),
-    ),
-    "by error, pressed": by_error(0.3, fall(solver=LOOSE, obstacle=PRESSING)),
     "by error, bdf2, pressed": by_error(0.1, by("bdf2", fall(solver=LOOSE, obstacle=PRESSING))),
 }
 
@@ -353,7 +338,7 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
-@pytest.mark.parametrize(("step", "value"), [(9, 1e160), (9, -1.0), (10, 1e160), (10, 1e8)])
+@pytest.mark.parametrize(("step", "value"), [(9, 1e160), (10, 1e8)])
 @pytest.mark.parametrize("name", ["q", "q_previous"])
 def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkeypatch, capsys, name, step, value):
     """After step 9, of which there is a frame, and step 10, of which there is none."""
@@ -447,7 +432,7 @@ def take_and_free(path: Path, times: int, twice) -> None:
 def test_no_two_hold_a_lock(tmp_path):
     context = multiprocessing.get_context("fork")
     twice = context.Value("i", 0)
-    four = [context.Process(target=take_and_free, args=(tmp_path / "x", 5000, twice)) for _ in range(4)]
+    four = [context.Process(target=take_and_free, args=(tmp_path / "x", 2000, twice)) for _ in range(4)]
     for process in four:
         process.start()
     for process in four:
@@ -492,22 +477,6 @@ def test_what_cannot_be_resumed_is_told(given, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert main(["run", *given]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_run_that_failed_goes_on_from_there(whole: Path, tmp_path, monkeypatch):
-    path = tmp_path / "x.h5"
-    with monkeypatch.context() as patch:
-        advance = ImplicitEuler.advance
-
-        def failing(integrator, state, time):
-            if np.isclose(time, 20 * integrator.time_step):
-                raise StepFailed("did not converge")
-            return advance(integrator, state, time)
-
-        patch.setattr(ImplicitEuler, "advance", failing)
-        assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--true-error", "3"]) == 3
-    assert main(["run", "--resume", str(path)]) == 0
-    assert_same(path, whole)
 
 
 def test_on_two_ranks_exactly_and_on_another_number_closely(msmpetsc, tmp_path):

@@ -225,12 +225,6 @@ def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: py
     assert 1e-6 * moved < np.abs(frames[-1].position - usual[-1].position).max() < 0.1 * moved
 
 
-def test_off_makes_no_solver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recovery.Recovery, "_new", lambda *_: pytest.fail("a spare solver was made"))
-    for way in ("stop", "substep", "fallback"):
-        play(beam(tmp_path), f"safety.on_failure={way}")
-
-
 def test_two_ranks_rescue_as_one(tmp_path: Path, msmpetsc):
     """As a user starts it; the file says what was done. One iteration is not enough for the usual solver."""
     scene, found = beam(tmp_path, time={"step": 0.1, "duration": 0.3}), []

@@ -1,21 +1,17 @@
 """msmpetsc compare: errors are those of the formulas it states; it names the first frame and node that differ."""
 
-import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import small_result
-from conftest import ENVIRONMENT
 from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.results.compare import DEFAULT, compare, difference
+from msmpetsc.results.comparison import DEFAULT, compare, difference
 from msmpetsc.results.reader import Result
 from msmpetsc.results.surfaces import point_areas, surface_distance
 from msmpetsc.study.metrics import surface_error
@@ -156,7 +152,7 @@ OTHER_SPRINGS[4] = [0, 11]
         ),
         (dict(springs=OTHER_SPRINGS), "their springs join other nodes"),
         (dict(springs=OTHER_SPRINGS[:-1], rest_length=np.ones(19), stiffness=np.ones(19)), "20 and 19 springs"),
-        (dict(cells=np.full((2, 8), 99)), "first cell has corner 99 of 12 nodes"),
+        (dict(cells=np.full((2, 8), 99)), "lattice/cells names what is not among its 12 nodes"),
     ],
 )
 def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, capsys, lattice: dict, reason: str):
@@ -228,28 +224,3 @@ def test_what_is_no_result_is_refused(a: Path, tmp_path: Path, capsys):
     with h5py.File(tmp_path / "b.h5", "w"):
         pass
     assert told(capsys, a, tmp_path / "b.h5")[0] == 2 and told(capsys, tmp_path / "c.h5", a)[0] == 2
-
-
-def test_frames_are_read_one_at_a_time(a: Path, monkeypatch):
-    sizes, getitem = [], h5py.Dataset.__getitem__
-
-    def seen(dataset, key):
-        found = getitem(dataset, key)
-        if dataset.name in ("/frames/position", "/frames/surface"):
-            sizes.append(np.size(found))
-        return found
-
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", seen)
-    with Result(a) as one, Result(a) as other:
-        compare(one, other)
-    assert len(sizes) == 4 * FRAMES and max(sizes) == NODES.size
-
-
-def test_petsc_is_not_imported(a: Path):
-    code = (
-        "import json, sys\nfrom msmpetsc.cli.main import main\n"
-        "status = main(['compare', sys.argv[1], sys.argv[1]])\nprint(json.dumps([status, *sys.modules]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code, a], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-    status, *loaded = json.loads(done.stdout.splitlines()[-1])
-    assert status == 0 and "h5py" in loaded and "petsc4py.PETSc" not in loaded

@@ -134,15 +134,6 @@ def test_no_other_file_is_followed(whole, tmp_path, name, how):
         assert "not followed" in said or "not opened" in said
 
 
-def test_a_packed_chunk_is_no_larger_than_the_file_can_hold(whole, tmp_path):
-    path = tmp_path / "x.h5"
-    path.write_bytes(whole.read_bytes())
-    with h5py.File(path, "r+") as file:
-        del file["frames/kinetic"]
-        file.create_dataset("frames/kinetic", (5,), "f8", maxshape=(None,), chunks=(10**8,), compression="gzip")
-    assert "more than the file holds" in refusal(lambda: msmpetsc.open(path))
-
-
 def test_names_and_versions_act_on_no_terminal(whole, tmp_path):
     path = tmp_path / "x.h5"
     path.write_bytes(whole.read_bytes())

@@ -2,12 +2,8 @@
 
 import io
 import os
-import random
-import signal
 import subprocess
 import sys
-import time
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +20,6 @@ from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results import writer
 from msmpetsc.results.reader import finished, newest_slot, open_result
 from msmpetsc.results.writer import Begin, ResultFile
-from msmpetsc.results.xdmf import write_xdmf
 
 WORKER = WORKERS / "frames_worker.py"
 pytestmark = pytest.mark.timeout(60)
@@ -39,7 +34,7 @@ def run_on_ranks(ranks: int, action: str, path: Path) -> str:
 
 def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
     with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(planned, NODES, POINTS, "f8")
+        file.start_frames(planned, NODES, POINTS)
         for index in range(count):
             file.append(frame(index))
 
@@ -209,49 +204,11 @@ class Disk(io.BytesIO):
                 yield number, bytes(image)
 
 
-def test_killed_at_any_moment(tmp_path):
-    chance = random.Random(1)
-    for batch in range(2):  # tests/test_kills.py has more
-        writers = [start_writer(tmp_path / f"{batch}-{number}.h5") for number in range(4)]
-        for process in writers:
-            process.stdout.readline()  # frame 0 is stored
-        for process in writers:
-            time.sleep(chance.uniform(0, 0.05))
-            process.send_signal(signal.SIGKILL)
-        for process in writers:
-            with process:
-                assert_nothing_lost(Path(process.args[-1]), told=1 + process.stdout.read().count("\n"))
-
-
-def start_writer(path: Path) -> subprocess.Popen:
-    command = [sys.executable, str(WORKER), "forever", str(path)]
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
-
-
-def assert_nothing_lost(path: Path, told: int) -> None:
-    """`told`: how many frames the writer said were stored."""
-    with h5py.File(path, "r") as file:
-        assert told <= finished(file) <= told + 1
-        assert_holds(file, finished(file))
-        if told > 1:
-            step, q, _ = newest_checkpoint(file)
-            assert step >= told - 2 and np.array_equal(q, positions(step, NODES))
-
-
-def test_a_running_result_can_be_read(tmp_path):
-    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-        file.start_frames(5, NODES, POINTS)
-        file.append(frame(0))
-        look = "import h5py, sys; f = h5py.File(sys.argv[1], 'r'); print(f['frames/time'][:2])"
-        seen = subprocess.run([sys.executable, "-c", look, file.path], capture_output=True, text=True, timeout=20)
-    assert seen.stdout.strip() == "[ 0. nan]", seen.stderr
-
-
 @pytest.mark.parametrize("failure", [None, RuntimeError])
 def test_ended_early_it_is_trimmed(tmp_path, failure):
     try:
         with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-            file.start_frames(STEPS + 1, NODES, POINTS, "f8")
+            file.start_frames(STEPS + 1, NODES, POINTS)
             for index in range(4):
                 file.append(frame(index))
             if failure:
@@ -261,7 +218,7 @@ def test_ended_early_it_is_trimmed(tmp_path, failure):
     with open_result(tmp_path / "x.h5") as file:
         assert {len(dataset) for dataset in file["frames"].values()} == {4}
         assert finished(file) == 4
-        assert_holds(file, 4, "f8")
+        assert_holds(file, 4)
 
 
 def test_planned_frames_take_no_disk_until_written(tmp_path):
@@ -308,82 +265,3 @@ def test_too_small_a_disk_is_told_before_the_first_frame(tmp_path):
     with small, ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
         file.start_frames(10**6, 10**7)
     assert os.listdir(tmp_path) == []
-
-
-def test_wrong_frames_are_refused(tmp_path):
-    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-        file.start_frames(1, NODES, POINTS)
-        with pytest.raises(ValueError, match="surface has shape"):
-            file.append(frame(0, points=slice(3)))
-        file.append(frame(0))
-        with pytest.raises(ValueError, match="was not planned"):
-            file.append(frame(1))
-
-
-@pytest.mark.parametrize("content", [None, b"not HDF5"])
-def test_what_is_no_result_is_told(tmp_path, content):
-    path = tmp_path / "x.h5"
-    if content:
-        path.write_bytes(content)
-    with pytest.raises(InputError, match=r"no such file|not an HDF5 file"):
-        open_result(path)
-    with h5py.File(tmp_path / "y.h5", "w"):
-        pass
-    with pytest.raises(InputError, match="is not a result"):
-        open_result(tmp_path / "y.h5")
-
-
-def test_xdmf_refers_to_what_is_there(tmp_path):
-    cells = np.arange(16).reshape(2, 8)
-    with ResultFile(tmp_path / "a b.h5", MPI.COMM_SELF, {}) as file:
-        file.write("lattice/nodes", positions(0, NODES))
-        file.write("lattice/cells", cells)
-        file.write("lattice/cell_kind", np.array([1, 2], "u1"))
-        file.write("surface/triangles", np.array([[0, 1, 2], [3, 4, 5]], "i4"))
-        file.start_frames(7, NODES, POINTS)
-        for index in range(3):
-            file.append(frame(index))
-    path = write_xdmf(tmp_path / "a b.h5")
-    assert sorted(os.listdir(tmp_path)) == ["a b.h5", "a b.xdmf"] and path.name == "a b.xdmf"
-    collections = ET.parse(path).getroot().findall("Domain/Grid")
-    assert [grid.get("Name") for grid in collections] == ["surface", "lattice"]
-    with h5py.File(tmp_path / "a b.h5") as file:
-        for collection, points in zip(collections, ("surface", "position"), strict=True):
-            grids = collection.findall("Grid")
-            assert [float(grid.find("Time").get("Value")) for grid in grids] == [0, 1 / 60, 2 / 60]
-            for index, grid in enumerate(grids):
-                slab = grid.find("Geometry/DataItem")
-                assert np.array_equal(read_item(slab, file), file["frames"][points][index])
-        assert np.array_equal(read_item(grid.find("Topology/DataItem"), file), cells)
-        assert np.array_equal(read_item(grid.find("Attribute/DataItem"), file), [1, 2])
-
-
-def read_item(item: ET.Element, file: h5py.File) -> np.ndarray:
-    """What a reader of XDMF would take from the file, its declared shape and type checked."""
-    if item.get("ItemType") == "HyperSlab":
-        start, stride, count = np.array(item[0].text.split(), int).reshape(3, 3)
-        part = tuple(slice(a, a + s * c, s) for a, s, c in zip(start, stride, count, strict=True))
-        return read_item(item[1], file)[part].reshape([int(n) for n in item.get("Dimensions").split()])
-    name, dataset = item.text.split(":")
-    assert name == Path(file.filename).name
-    assert tuple(map(int, item.get("Dimensions").split())) == file[dataset].shape
-    kind = {"Float": "f", "Int": "i", "UInt": "u"}[item.get("NumberType")]
-    assert file[dataset].dtype == np.dtype(f"{kind}{item.get('Precision')}")
-    return file[dataset][...]
-
-
-def test_xdmf_opens_in_vtk(tmp_path):
-    pv = pytest.importorskip("pyvista")
-    cube = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
-    with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-        file.write("lattice/nodes", cube)
-        file.write("lattice/cells", np.arange(8)[None])
-        file.write("lattice/cell_kind", np.array([1], "u1"))
-        file.start_frames(2, 8)
-        for index in range(2):
-            numbers = frame(index).__dict__ | {"position": cube * (1 + index), "surface": None}
-            file.append(type(frame(0))(**numbers))
-    reader = pv.XdmfReader(write_xdmf(tmp_path / "x.h5"))
-    reader.set_active_time_value(1 / 60)
-    body = reader.read()
-    assert body.n_cells == 1 and body.volume == pytest.approx(8)

@@ -31,10 +31,10 @@ from msmpetsc.study.runner import StudyResults
 from msmpetsc.study.sizing.answer import put_into, tables
 from msmpetsc.study.sizing.choice import Candidate
 from msmpetsc.study.table import write_table
+from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import drawable_of_result
 from msmpetsc.view.film import written
 from msmpetsc.view.page import write_page
-from msmpetsc.view.playback import Style
 from msmpetsc.view.sheet import contact_sheet
 
 pytestmark = pytest.mark.timeout(100)

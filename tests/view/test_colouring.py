@@ -1,6 +1,8 @@
 """Fields on a surface: each on a motion of which it is known."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,13 +23,17 @@ from msmpetsc.view.colours import (
     rgb,
     scaled,
 )
-from msmpetsc.view.drawable import drawable_of_result, drawable_of_surface
-from msmpetsc.view.overlays import Rest
+from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result, drawable_of_surface
 
 
-@pytest.fixture
-def subject(tmp_path):
-    with Result(write_ball(tmp_path / "ball.h5", surface=True)) as run:
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory) -> Path:
+    return write_ball(tmp_path_factory.mktemp("ball") / "ball.h5", surface=True)
+
+
+@pytest.fixture(scope="module")
+def subject(ball: Path) -> Iterator[Drawable]:
+    with Result(ball) as run:
         yield drawable_of_result(run)
 
 
@@ -57,9 +63,8 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
     assert values == pytest.approx([0.1, np.sqrt((0.1**2 + 0.2**2) / 2), 0.2])
 
 
-def test_error_is_the_distance_from_the_reference(subject, tmp_path):
-    path = write_ball(tmp_path / "other.h5", surface=True)
-    with Result(tmp_path / "ball.h5") as run, opened_reference(path, run) as reference:
+def test_error_is_the_distance_from_the_reference(subject, ball):
+    with Result(ball) as run, opened_reference(ball, run) as reference:
         assert colouring_of(subject, "error", reference).values(4) == pytest.approx(0.0, abs=1e-12)
         raised = replace(subject, surface=lambda index: subject.surface(index) + np.array([0.003, 0, 0.004]))
         error = scaled(colouring_of(raised, "error", reference), [0, 4])
@@ -72,7 +77,7 @@ def test_parts_are_those_of_the_nearest_cell(subject):
     x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
     nodes, points = np.stack([x, y, z], axis=1).astype(float), np.array([[0.2, 0.5, 0.5], [1.9, 0.1, 0.1]])
-    rest = Rest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(2, int))
+    rest = BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(2, int))
     east = "region = { half_space = { point = [1, 0, 0], normal = [1, 0, 0] } }\n"
     tables = f"[[part]]\n{east}density = 2.0\n[[part]]\n{east}density = 3.0\n"
     parted = replace(subject, rest=rest, scene=SceneFile.model_validate(toml_of(BARE + tables)))
@@ -105,7 +110,7 @@ def test_contact_counts_bodies_that_face_each_other_and_is_dark_wherever_it_touc
     points, triangles, count = subject.rest.points, subject.triangles, len(subject.rest.points)
     body = np.repeat([0, 1], count)
     far = points + np.array([1.0, 0, 0])
-    rest = Rest(np.concatenate([points, far]), subject.rest.cells, np.concatenate([points, far]), body, body)
+    rest = BodiesAtRest(np.concatenate([points, far]), subject.rest.cells, np.concatenate([points, far]), body, body)
     lowest = subject.surface(3)
     beside = lowest + np.array([np.ptp(lowest[:, 0]) + 5e-4, 0, 0])
     plane = {"shape": "plane", "point": [0, 0, 0.001], "normal": [0, 0, 1], "response": "penalty"}

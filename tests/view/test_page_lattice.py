@@ -1,9 +1,5 @@
 """Cells and springs on a page: what is packed comes out again, and a browser shows it, moves it and hides it."""
 
-import base64
-import json
-import re
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,17 +8,14 @@ import pytest
 import trimesh
 from block_scene import CELL, block_scene
 from browser import CHROMIUM, Browser
-from test_page import restored
+from test_page import data_of, restored, stream
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.cli.commands.render import drawable_of_file
-from msmpetsc.errors import InputError
 from msmpetsc.view.camera import camera_facing
+from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import BOUNDARY, INTERIOR, cut_open
 from msmpetsc.view.page import write_page
-from msmpetsc.view.playback import Style
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 FALL, EYE = 0.2, (0.0, -1.0, 0.0)  # [m] a frame
@@ -48,15 +41,6 @@ def falling(tmp_path: Path) -> Drawable:
     )  # fmt: skip
 
 
-def data_of(path: Path) -> dict:
-    text = path.read_text(encoding="utf-8")
-    return json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)[1])
-
-
-def stream(data: dict, name: str) -> bytes:
-    return zlib.decompress(base64.b64decode(data["streams"][name]))
-
-
 def written(folder: Path, subject: Drawable, *shown: str) -> Path:
     write_page(subject, folder / "x.html", [0, 1, 2], Style(eye=EYE, shown=shown))
     return folder / "x.html"
@@ -66,9 +50,9 @@ def test_the_page_holds_the_half_of_the_lattice_behind_the_middle(tmp_path: Path
     data = data_of(written(tmp_path, falling, "cells", "springs"))
     about = data["lattice"]
     low, high = np.array(about["box"])
-    numbers = restored(np.frombuffer(stream(data, "nodes"), np.uint8), 3).reshape(3, -1, 3)
-    cells = np.frombuffer(stream(data, "cells"), "<u2").reshape(-1, 8)
-    springs = np.frombuffer(stream(data, "springs"), "<u2").reshape(-1, 2)
+    numbers = restored(stream(data, "nodes"), 3).reshape(3, -1, 3)
+    cells = stream(data, "cells").view("<u2").reshape(-1, 8)
+    springs = stream(data, "springs").view("<u2").reshape(-1, 2)
     cut = cut_open(falling, camera_facing(falling.surface(0), None, EYE), ("cells", "springs"))
     assert [kind["cells"] for kind in about["kinds"]] == [len(cut.cells[BOUNDARY]), len(cut.cells[INTERIOR])]
     assert about["kinds"][1]["cells"] >= 4 and len(cells) == 32  # of 64, of which 2 x 2 x 2 are within
@@ -85,23 +69,7 @@ def test_what_is_not_asked_for_is_not_there(tmp_path: Path, falling: Drawable):
     data = data_of(written(tmp_path, falling))
     assert data["lattice"] is None and "nodes" not in data["streams"]
     data = data_of(written(tmp_path, falling, "springs"))
-    assert not stream(data, "cells") and data["lattice"]["kinds"] == [] and len(stream(data, "springs")) > 100
-
-
-def test_a_scene_that_was_not_run_has_its_cells_on_a_page(tmp_path: Path):
-    path = tmp_path / "y.html"
-    scene = block_scene(tmp_path, np.array([0.5, 0.5, 0.5]), **TABLES)
-    assert command.run(parsed(["render", str(scene), "-o", str(path), "--show", "cells"])) == 0
-    assert sum(kind["cells"] for kind in data_of(path)["lattice"]["kinds"]) == 32
-
-
-@pytest.mark.parametrize("wrong", [-1, 10**6])
-def test_springs_of_no_nodes_are_damage(tmp_path: Path, falling: Drawable, wrong: int):
-    springs = falling.springs.copy()
-    springs[3, 1] = wrong
-    damaged = replace(falling, array=lambda name: springs if name == "lattice/springs" else falling.array(name))
-    with pytest.raises(InputError, match="is damaged: lattice/springs names what is not among its 125 nodes"):
-        written(tmp_path, damaged, "springs")
+    assert not len(stream(data, "cells")) and data["lattice"]["kinds"] == [] and len(stream(data, "springs")) > 100
 
 
 def red_rows(browser: Browser) -> np.ndarray:
@@ -121,7 +89,7 @@ def test_cells_and_springs_are_switched_and_move_with_the_frames(tmp_path: Path,
         browser.value("goTo(2)")
         assert red_rows(browser).mean() - first.mean() == pytest.approx(2 * FALL * metre, abs=2)
         both = browser.picture()
-        assert browser.value("gl.getError()") == 0 and browser.value("data.overlays.states[0].shapes.length") == 1
+        assert browser.value("gl.getError()") == 0 and browser.value("data.overlays.states[0].meshes.length") == 1
         browser.click("#show-cells")
         assert browser.value("[...shown]") == ["springs"] and not len(red_rows(browser))
         lines = browser.picture()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_result import BARE, write_ball
+from ball_result import BARE, EAST_HELD, write_ball
 from browser import CHROMIUM, Browser
 
 from msmpetsc.cli.arguments import parsed
@@ -15,10 +15,6 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
     pytest.mark.timeout(120),
 ]
-EAST_HELD = """
-[[pin]]
-region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
-"""
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from ball_result import BARE, HEIGHTS, write_ball
+from ball_result import BARE, write_ball
 from PIL import Image
 from test_page import data_of, in_browser, seen
 
@@ -14,8 +14,9 @@ from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
-from msmpetsc.view import sheet
-from msmpetsc.view.drawable import solids_of
+from msmpetsc.view.composition import Style, composition_of
+from msmpetsc.view.drawable import drawable_of_result, solids_of
+from msmpetsc.view.sheet import contact_sheet
 
 STATUE = """
 picture.eye = [0, -1, 0]
@@ -53,15 +54,14 @@ def right_of_the_ball(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, floa
     return rows[cube], columns[cube], metre
 
 
-def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path, monkeypatch):
-    panels: list[sheet.Panel] = []
-    draw = sheet.draw
-    monkeypatch.setattr(sheet, "draw", lambda given, *rest: (panels.extend(given), draw(given, *rest))[1])
-    sheet.contact_sheet(result, result.with_suffix(".png"), frames=[0, 5, 10])
-    first, middle, last = (panel.overlays.shapes for panel in panels)
-    assert [shape[0].number for shape in (first, middle)] == [1, 1] and last == []
+def test_a_sheet_has_it_where_it_is_and_none_when_it_is_gone(result: Path):
+    with Result(result) as run:
+        stills = composition_of(drawable_of_result(run), [0, 5, 10], Style()).stills([0, 5, 10])
+    first, middle, last = (still.overlays.meshes for still in stills)
+    assert [meshes[0].number for meshes in (first, middle)] == [1, 1] and last == []
     np.testing.assert_allclose(middle[0].by, [0, 0, -0.2])
     np.testing.assert_allclose(middle[0].seen[[0, 7]], np.array([LOW, HIGH]) - [0, 0, 0.2])
+    contact_sheet(result, result.with_suffix(".png"), frames=[0, 5, 10])
     picture = np.array(Image.open(result.with_suffix(".png")).convert("RGB")).astype(int)
     bodies = np.array_split(picture[: picture.shape[0] * 3 // 4], 3, axis=1)  # without the captions
     wide = [np.ptp(np.nonzero(body.min(axis=2) < 230)[1]) for body in bodies]
@@ -75,7 +75,7 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
     assert command.run(parsed(["render", str(result), "-o", str(path), "--eye", "0,-1,0"])) == 0
     data = data_of(path)
     assert len(data["solids"]["1"]["corners"]) == 9 * 12
-    assert [len(state["shapes"]) for state in data["overlays"]["states"]] == [1] * 10 + [0]
+    assert [len(state["meshes"]) for state in data["overlays"]["states"]] == [1] * 10 + [0]
     rows, columns, metre = right_of_the_ball(seen(path, "frame=0"))
     assert np.ptp(rows) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(columns) == pytest.approx(
         0.1 * metre, rel=0.1
@@ -98,8 +98,3 @@ def test_a_damaged_one_is_refused(result: Path, said: str):
     with Result(result) as run, pytest.raises(InputError, match="is damaged") as refused:
         solids_of(run)
     assert said in str(refused.value)
-
-
-def test_a_body_is_drawn_without_any(tmp_path: Path):
-    with Result(write_ball(tmp_path / "x.h5", surface=True)) as run:
-        assert solids_of(run) == {} and len(HEIGHTS) == len(run.frames.time)

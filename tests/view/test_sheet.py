@@ -8,7 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from ball_result import BARE, HEIGHTS, write_ball
+import trimesh
+from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
 from conftest import ROOT
 from PIL import Image, ImageDraw
 
@@ -19,17 +20,18 @@ from msmpetsc.results.reader import Result
 from msmpetsc.scene.bodies import OfBody
 from msmpetsc.scene.body import Region
 from msmpetsc.scene.motion import Pin
-from msmpetsc.view import annotations, drawable, overlays, renderer, sheet
+from msmpetsc.view import renderer, sheet
 from msmpetsc.view.camera import YAW, camera_facing
-from msmpetsc.view.playback import Style
+from msmpetsc.view.composition import Still, Style, composition_of
+from msmpetsc.view.drawable import BodiesAtRest, drawable_of_result
 
 pytestmark = pytest.mark.timeout(60)
 
 
-@pytest.fixture
-def result(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def result(tmp_path_factory) -> Path:
     """The ball with its surface stored."""
-    return write_ball(tmp_path / "ball.h5", surface=True)
+    return write_ball(tmp_path_factory.mktemp("ball") / "ball.h5", surface=True)
 
 
 def test_moments_tell_the_story(result):
@@ -42,33 +44,24 @@ def test_moments_tell_the_story(result):
         assert list(sheet.choose_moments(run, 99)) == list(range(11))
 
 
-def test_surface_that_was_not_stored_is_computed(result, tmp_path):
-    bare = write_ball(tmp_path / "bare.h5", surface=False)
-    with Result(result) as stored, Result(bare) as run:
-        assert drawable.surface_points(run, 4) == pytest.approx(drawable.surface_points(stored, 4), abs=1e-7)
-
-
 @pytest.fixture
-def panels(tmp_path, monkeypatch):
-    """panels(scene tables, options) of a sheet that is not drawn."""
+def stills(tmp_path):
+    """stills(scene tables, frames, eye) of a sheet that is not drawn."""
 
-    def panels_of(tables: str, **options) -> list[sheet.Panel]:
-        drawn = []
-        monkeypatch.setattr(sheet, "draw", lambda panels, *_: drawn.extend(panels))
+    def stills_of(tables: str, frames: list[int], eye: tuple[float, ...] | None = None) -> list[Still]:
         path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + tables)
-        sheet.contact_sheet(path, tmp_path / "x.png", **options)
-        return drawn
+        with Result(path) as run:
+            return composition_of(drawable_of_result(run), frames, Style(eye=eye)).stills(frames)
 
-    return panels_of
+    return stills_of
 
 
-def test_moments_of_the_scene(panels):
-    tables = "picture.times = [0.72, 99.0, 0.26, 0.3]"
-    assert [p.caption for p in panels(tables)] == [
-        ("t = 0.000 s", "start"), ("t = 0.300 s", ""), ("t = 0.700 s", ""), ("t = 1.000 s", "")
-    ]  # fmt: skip
-    assert [p.caption[0] for p in panels(tables, frames=[4, 2])] == ["t = 0.400 s", "t = 0.200 s"]
-    assert [p.caption[1] for p in panels(tables, count=2)] == ["start", "end"]
+def test_moments_of_the_scene(tmp_path):
+    path = write_ball(tmp_path / "x.h5", surface=True, scene=f"{BARE}picture.times = [0.72, 99.0, 0.26, 0.3]")
+    sheet.contact_sheet(path, tmp_path / "x.png")
+    sheet.contact_sheet(path, tmp_path / "y.png", frames=[0, 3, 7, 10])
+    one, other = (np.array(Image.open(tmp_path / name))[: -sheet.CAPTION] for name in ("x.png", "y.png"))
+    np.testing.assert_array_equal(one, other)
 
 
 POINTS = np.random.default_rng(0).normal(size=(50, 3)) * [1, 9, 2]
@@ -93,21 +86,6 @@ def test_the_longer_side_lies_across():
     assert abs(camera_facing(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)
 
 
-def test_the_eye_chooses_the_side(tmp_path):
-    """Each side of the ball is held once: dark pixels are seen from there only."""
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + EAST_HELD)
-    dark = []
-    for eye in [(1, 0, 0.2), (-1, 0, 0.2)]:
-        picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[0], eye=eye)))
-        ball = picture[: -sheet.CAPTION - annotations.LINE].astype(int)
-        dark.append((ball[..., 0] < 75).sum() / (ball[..., 2] - ball[..., 0] > 15).sum())
-    assert dark[0] > 0.5 and dark[1] < 0.1
-
-
-EAST_HELD = """
-[[pin]]
-region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
-"""
 LED = """
 [[anchor]]
 region = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }
@@ -118,12 +96,16 @@ region.painted = "spots.txt"
 """
 
 
-def test_held_parts(panels):
-    east, prescribed = panels(EAST_HELD, frames=[0])[0], panels(LED, frames=[0, 4, 5])
-    assert ((east.fixed == 1) == (east.points[:, 0] >= 0.02)).all() and 0 < east.fixed.mean() < 0.5
-    assert ((prescribed[0].fixed == 1) == (prescribed[0].points[:, 2] <= 0.48)).all()
-    assert (prescribed[1].fixed == prescribed[0].fixed).all()
-    assert not prescribed[2].fixed.any()
+def test_held_parts(tmp_path):
+    fixed = {}
+    for name, tables in {"east": EAST_HELD, "led": LED}.items():
+        with Result(write_ball(tmp_path / f"{name}.h5", surface=True, scene=BARE + tables)) as run:
+            subject = drawable_of_result(run)
+            fixed[name] = [subject.fixed(index) for index in (0, 4, 5)]
+            points = subject.surface(0)
+    assert ((fixed["east"][0] == 1) == (points[:, 0] >= 0.02)).all() and 0 < fixed["east"][0].mean() < 0.5
+    assert ((fixed["led"][0] == 1) == (points[:, 2] <= 0.48)).all()
+    assert (fixed["led"][1] == fixed["led"][0]).all() and not fixed["led"][2].any()
 
 
 def test_painted_points_mean_the_corners_of_their_cells():
@@ -131,7 +113,7 @@ def test_painted_points_mean_the_corners_of_their_cells():
     nodes = np.stack([x, y, z], axis=1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(3)])
     points = np.array([(0.9, 0.1, 0.1), (2.9, 0.9, 0.9), (1.1, 0.1, 0.9)])
-    rest = overlays.Rest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(3, int))
+    rest = BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(3, int))
 
     def find(painted: tuple[int, ...] | str) -> np.ndarray:
         return rest.find(OfBody(("pin", 0), None, Pin(region=Region(painted=painted))))
@@ -153,13 +135,14 @@ total = [1, 0, 0]
 """
 
 
-def test_an_arrow_for_each_force_while_it_acts(panels):
-    before, first, last, after = panels(FORCE, frames=[1, 2, 7, 8])
+def test_an_arrow_for_each_force_while_it_acts(stills):
+    before, first, last, after = stills(FORCE, frames=[1, 2, 7, 8])
     assert before.overlays.arrows == after.overlays.arrows == []
-    pulled = (first.points[:, 0] >= 0) & (first.points[:, 2] >= HEIGHTS[2])
-    for panel in (first, last):
-        ((tail, tip),) = panel.overlays.arrows
-        assert tail == pytest.approx(panel.points[pulled].mean(axis=0), abs=1e-6)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1).vertices
+    pulled = ball[(ball[:, 0] >= 0) & (ball[:, 2] >= 0)].mean(axis=0)
+    for still in (first, last):
+        ((tail, tip),) = still.overlays.arrows
+        assert tail == pytest.approx(pulled + np.array([0, 0, HEIGHTS[still.index]]), abs=1e-6)
         assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
 
 
@@ -179,9 +162,9 @@ stop = 0.8
 """
 
 
-def test_obstacles_stand_where_they_are_at_the_time(panels):
+def test_obstacles_stand_where_they_are_at_the_time(stills):
     rest = np.array([(x, y, z) for x in (-0.125, 0.125) for y in (-0.1, 0.1) for z in (0.62, 0.64)])
-    start, down, aside, gone = panels(PLATE, frames=[0, 1, 3, 8])
+    start, down, aside, gone = stills(PLATE, frames=[0, 1, 3, 8])
     for panel, by in (start, (0, 0, 0)), (down, (0, 0, -0.1)), (aside, (0.05, 0, -0.2)):
         assert panel.overlays.glass == [pytest.approx(rest + by)]
     assert gone.overlays.glass == []
@@ -191,39 +174,39 @@ def plane(height: float, normal: str) -> str:
     return f'[[obstacle]]\nshape = "plane"\npoint = [0, 0, {height}]\nnormal = {normal}\n'
 
 
-def test_what_would_hide_the_body_is_glass(panels):
-    above = panels(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
+def test_what_would_hide_the_body_is_glass(stills):
+    above = stills(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
     assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
     assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
     assert (
-        panels(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
+        stills(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
     )  # nothing lies on it
     ground = plane(0.4, "[0, 0, 1]")
-    below = panels(ground, frames=[0])[0].overlays
+    below = stills(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
-    turned = panels(ground, frames=[0], eye=(3, -1, 2))[0].overlays
+    turned = stills(ground, frames=[0], eye=(3, -1, 2))[0].overlays
     assert turned.grounds[0].corners == pytest.approx(below.grounds[0].corners), "it is of the scene, not of the view"
     assert np.ptp(below.grounds[0].corners, axis=0)[:2] == pytest.approx([0.64, 0.64])  # of a ball of 0.2 m
-    assert panels(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
-    assert len(panels(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.corners) == 0  # over half a ball away
+    assert stills(ground, frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
+    assert len(stills(plane(0.28, "[0, 0, 1]"), frames=[0])[0].overlays.grounds) == 0  # over half a ball away
 
 
-def test_an_enormous_box_is_cut_and_a_far_one_left_out(panels):
+def test_an_enormous_box_is_cut_and_a_far_one_left_out(stills):
     box = '[[obstacle]]\nshape = "box"\nbox = [[-50, -50, {}], [50, 50, {}]]\n'
-    (glass,) = panels(box.format(-50, 0.39), frames=[0])[0].overlays.glass
+    (glass,) = stills(box.format(-50, 0.39), frames=[0])[0].overlays.glass
     assert np.ptp(glass, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
     assert glass[:, 2].max() == 0.39 and glass[:, 2].min() == pytest.approx(0.4 - 0.15 * 0.2)
-    assert panels(box.format(1.0, 1.01), frames=[0])[0].overlays.glass == []
+    assert stills(box.format(1.0, 1.01), frames=[0])[0].overlays.glass == []
 
 
-def test_spheres_are_shown_where_they_are_and_large_ones_cut(panels):
+def test_spheres_are_shown_where_they_are_and_large_ones_cut(stills):
     ball = '[[obstacle]]\nshape = "sphere"\ncenter = [0, 0, {}]\nradius = {}\n'
     path = "path = [{ time = 1.0, by = [0, 0, -0.1] }]\n"
-    start, end = (panel.overlays.balls for panel in panels(ball.format(0.8, 0.05) + path, frames=[0, 10]))
+    start, end = (still.overlays.balls for still in stills(ball.format(0.8, 0.05) + path, frames=[0, 10]))
     assert start[0].center == pytest.approx([0, 0, 0.8]) and end[0].center[2] < 0.8 and start[0].radius == 0.05
-    (large,) = panels(ball.format(-49.61, 50), frames=[0])[0].overlays.balls
+    (large,) = stills(ball.format(-49.61, 50), frames=[0])[0].overlays.balls
     assert large.radius == 50 and np.ptp(large.seen, axis=0)[:2] == pytest.approx(1.3 * np.array([0.2, 0.2]))
-    assert panels(ball.format(3, 0.1), frames=[0])[0].overlays.balls == []
+    assert stills(ball.format(3, 0.1), frames=[0])[0].overlays.balls == []
 
 
 def test_glass_is_seen_at_its_place_and_through(tmp_path):
@@ -271,19 +254,6 @@ def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
     assert fallen[1] < last_ground < ink.min()  # whole ball, ground, then captions (below the ball, dark itself)
 
 
-def test_no_ground_where_the_scene_has_none(tmp_path):
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE)
-    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[3])))
-    assert not (abs(picture[..., :3].astype(int) - [239, 236, 230]).max(axis=2) < 3).any()
-
-
-def test_command_draws_beside_the_result(result, capsys):
-    args = parsed(["render", str(result), "--frames", "2,0,4", "--eye=-1,2,0"])
-    assert command.run(args) == 0
-    assert capsys.readouterr().out.strip() == str(result.with_suffix(".png"))
-    assert Image.open(result.with_suffix(".png")).size[0] % 3 == 0
-
-
 @pytest.mark.parametrize(
     "options, told",
     [
@@ -322,27 +292,14 @@ def test_without_opengl_one_line_names_the_package(result, tmp_path):
     assert "WARN" not in done.stderr
 
 
-@pytest.fixture
-def drawing(result, tmp_path, monkeypatch):
-    """What a sheet of frames 0 and 8 is drawn from: panels, triangles, camera."""
-    with monkeypatch.context() as patch:
-        patch.setattr(sheet, "draw", lambda *given: calls.append(given))
-        calls = []
-        sheet.contact_sheet(result, tmp_path / "x.png", frames=[0, 8])
-    return calls[0][:3]
-
-
-def test_many_panels_stand_in_rows_and_each_is_shown(drawing, tmp_path):
-    """Nineteen of them, in four rows of five, in a sheet that a screen shows."""
-    panels, triangles, camera = drawing
-    sheet.draw([*9 * panels, panels[0]], triangles, camera, tmp_path / "x.png")
+def test_many_panels_stand_in_rows_and_each_is_shown(result, tmp_path):
+    """Eleven of them in three rows of four, in a sheet that a screen shows."""
+    sheet.contact_sheet(result, tmp_path / "x.png", frames=range(11))
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert 1000 < drawn.shape[1] <= 2000
-    each = [part for row in np.split(drawn, 4) for part in np.split(row, 5, axis=1)]
-    for first, other in zip((each[:2] * 10)[2:19], each[2:19], strict=True):
-        np.testing.assert_array_equal(other, first)
-    assert (each[19] == 255).all()
-    assert body_rows(each[1])[0] > body_rows(each[0])[0] > 0
+    each = [part for row in np.split(drawn, 3) for part in np.split(row, 4, axis=1)]
+    assert all(is_body(panel).any() for panel in each[:11]) and (each[11] == 255).all()
+    assert body_rows(each[3])[0] > body_rows(each[2])[0] > body_rows(each[0])[0] > 0
 
 
 def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
@@ -359,25 +316,15 @@ def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
     assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
-def test_a_picture_too_high_is_refused_before_surfaces_are_read(drawing, result, tmp_path, monkeypatch):
-    panels, triangles, camera = drawing
-    with pytest.raises(
-        InputError, match=r"2000 moments are too many for one picture: of panels of \d+ by \d+ pixels at most \d+ fit"
-    ):
-        sheet.draw(1000 * panels, triangles, camera, tmp_path / "y.png")
-    monkeypatch.setattr(sheet, "HIGHEST", 100)
-    monkeypatch.setattr(drawable, "surface_points", lambda *_: pytest.fail("a surface was read"))
-    for options in ({"count": 10**9}, {"frames": list(range(11))}):
-        with pytest.raises(
-            InputError,
-            match="11 moments are too many for one picture: of panels of 240 by 68 pixels at most 8 fit",
-        ):
-            sheet.contact_sheet(result, tmp_path / "y.png", **options)
+def test_a_picture_too_high_is_refused(result, tmp_path, monkeypatch):
+    monkeypatch.setattr(sheet, "HIGHEST", 1000)
+    with pytest.raises(InputError, match="11 moments are too many for one picture: of panels of"):
+        sheet.contact_sheet(result, tmp_path / "y.png", frames=range(11))
     assert not (tmp_path / "y.png").exists()
 
 
-def test_a_black_picture_is_no_picture(drawing, tmp_path, monkeypatch):
+def test_a_black_picture_is_no_picture(result, tmp_path, monkeypatch):
     monkeypatch.setattr(renderer.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(InputError, match=r"the graphics library gives a black picture"):
-        sheet.draw(*drawing, tmp_path / "y.png")
+        sheet.contact_sheet(result, tmp_path / "y.png", frames=[0])
     assert not (tmp_path / "y.png").exists()

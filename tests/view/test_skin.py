@@ -5,16 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from ball_result import BARE
 from scipy.sparse import csr_array
 
 from msmpetsc.geometry.surface import Surface
+from msmpetsc.scene.schema import SceneFile
+from msmpetsc.scene.toml import toml_of
 from msmpetsc.view.annotations import rounded
-from msmpetsc.view.camera import camera_facing
 from msmpetsc.view.colours import plain_colouring
-from msmpetsc.view.drawable import Drawable, drawable_of_surface
+from msmpetsc.view.composition import Style, composition_of
+from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_surface
 from msmpetsc.view.mesh import CORNERS, drawn, split_at_edges, subdivided
-from msmpetsc.view.overlays import Overlays, Rest
-from msmpetsc.view.renderer import Panel, Renderer
+from msmpetsc.view.renderer import Renderer
 
 CELLS, H = np.array([16, 2, 2]), 1 / 16  # of a block of 1 x 1/8 x 1/8 m
 
@@ -36,7 +38,7 @@ def block() -> Drawable:
     zeros = np.zeros(len(points), int)
     return replace(
         drawable_of_surface("block.ply", Surface(points, triangles)),
-        rest=Rest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
+        rest=BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), zeros),
         times=np.arange(2.0),
         nodes=lambda index: bent(nodes) if index else nodes,
         surface=lambda index: bent(points) if index else points,
@@ -58,10 +60,10 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
 
 def test_long_edges_are_divided_without_holes():
     box = trimesh.creation.box([1, 0.3, 0.1])
-    finer = subdivided(np.array(box.vertices), np.array(box.faces), 0.07)
-    mesh = trimesh.Trimesh(finer.points, finer.triangles, process=False)
+    points, triangles, _ = subdivided(np.array(box.vertices), np.array(box.faces), 0.07)
+    mesh = trimesh.Trimesh(points, triangles, process=False)
     assert mesh.is_watertight and mesh.volume == pytest.approx(0.03)
-    assert mesh.edges_unique_length.max() <= 0.07 and (finer.points[:8] == box.vertices).all()
+    assert mesh.edges_unique_length.max() <= 0.07 and (points[:8] == box.vertices).all()
 
 
 def test_normals_are_split_at_sharp_edges_alone():
@@ -97,10 +99,15 @@ def test_pins_are_coloured_by_face():
     x = np.arange(6.0)
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
     triangles = np.array([t for k in range(0, 10, 2) for t in ((k, k + 2, k + 1), (k + 1, k + 2, k + 3))])
-    panel = Panel(points, np.where(points[:, 0] < 1.5, 1.0, 0.3), Overlays([], [], [], [], []), ("", ""))
-    with Renderer(300, 100, triangles) as renderer:
-        renderer.face(camera_facing(points, None, (0, 0, 1)), np.array([2.5, 0.5, 0]), 3, 6)
-        row = renderer.picture(panel)[50].astype(int)
+    share = np.where(points[:, 0] < 1.5, 1.0, 0.3)
+    subject = replace(
+        drawable_of_surface("strip.ply", Surface(points, triangles)),
+        scene=SceneFile.model_validate(toml_of(BARE)), pinned=np.ones(12, bool), embedding=csr_array(np.diag(share)),
+    )  # fmt: skip
+    composition = composition_of(subject, [0], Style(eye=(0, 0, 1)))
+    stills = composition.stills([0])
+    with Renderer(composition, stills, (300, 60)) as renderer:
+        row = renderer.picture(stills[0])[30].astype(int)
     colours = row[(row < 250).any(axis=1)][3:-3]  # without the rim
     steps = np.flatnonzero(np.abs(np.diff(colours, axis=0)).max(axis=1) > 2)
     assert len(steps) and np.ptp(steps) <= 1, "one edge, which antialiasing may widen by a pixel"

@@ -54,12 +54,6 @@ def test_a_mesh_alone_shows_its_box_and_a_length(tmp_path, ball):
     assert np.ptp(columns[columns < columns[0] + 400]) > 50
 
 
-def test_a_page_of_a_scene_has_one_frame(tmp_path):
-    page = tmp_path / "x.html"
-    assert command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), "-o", str(page)])) == 0
-    assert '"times":[0.0]' in page.read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("words", "line"),
     [

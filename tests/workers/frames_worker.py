@@ -56,18 +56,6 @@ def write_all(path: str, gathers: bool = False) -> None:
             )
 
 
-def write_forever(path: str) -> None:
-    """Prints each frame's index once it is stored, until killed."""
-    with ResultFile(path, MPI.COMM_WORLD, {}) as file:
-        file.start_frames(100_000, NODES, POINTS)
-        for index in range(100_000):
-            file.append(frame(index))
-            print(index, flush=True)
-            file.write_checkpoint(
-                Checkpoint(index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)})
-            )
-
-
 def refuse(path: str) -> None:
     """Prints the InputError that each rank gets."""
     try:
@@ -113,7 +101,6 @@ if __name__ == "__main__":
     {
         "all": write_all,
         "gathered": lambda path: write_all(path, gathers=True),
-        "forever": write_forever,
         "refuse": refuse,
         "full": fill_disk,
         "full for one": lambda path: fill_disk(path, gathers=False),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.results.compare import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
+from msmpetsc.results.comparison import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.results.reader import Result, refuse_deadly
 from msmpetsc.results.surfaces import MEAN, compare_surfaces
 

@@ -22,10 +22,13 @@ from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.colours import opened_reference
+from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result, drawable_of_surface
+from msmpetsc.view.film import TURN, write_film
 from msmpetsc.view.mesh import SHOWN
 from msmpetsc.view.page import write_page
-from msmpetsc.view.playback import Style
+from msmpetsc.view.playback import Playback, playback_of
+from msmpetsc.view.sheet import Moment, contact_sheet, draw_moments
 
 SIZES = 64, 8192  # [px]: the least that shows anything, and where Mesa's pictures end
 STILL = (760, 900)  # [px]: a panel of a scene or a mesh
@@ -75,9 +78,7 @@ def style_of(args: argparse.Namespace) -> Style:
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a result: moments of it, a film, or a page."""
     if path.suffix.lower() in PICTURE_NAMES:
-        from msmpetsc.view.sheet import contact_sheet  # loads VTK, which a page does not need
-
-        contact_sheet(args.subject, path, args.frames, args.count, None, style, args.reference)
+        contact_sheet(args.subject, path, args.frames, args.count, style, args.reference)
         return
     with plain_damage(args.subject), Result(args.subject) as run, opened_reference(args.reference, run) as reference:
         subject = drawable_of_result(run)
@@ -97,8 +98,6 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
     if path.suffix.lower() not in PICTURE_NAMES:
         _draw_motion(args, subject, path, [0], style, None)
         return
-    from msmpetsc.view.sheet import Moment, draw_moments
-
     moments = [Moment(0, (subject.title, about[0]), style.shown)]
     if len(subject.rest.cells) and not style.shown:
         moments.append(Moment(0, ("cut open", about[1]), ("cells",)))
@@ -112,9 +111,6 @@ def _draw_motion(
     if path.suffix.lower() in PAGE_NAMES:
         write_page(subject, path, frames, style, reference)
         return
-    from msmpetsc.view.film import TURN, write_film
-    from msmpetsc.view.playback import Playback, playback_of
-
     if args.turntable and len(frames) == 1:
         if args.speed is not None:
             raise InputError("--speed needs --frames, two or more: time stands still on this turntable")
@@ -122,7 +118,8 @@ def _draw_motion(
         playback = Playback(np.zeros(round(TURN * fps), int), fps, 0.0)
     else:
         playback = playback_of(subject.times[frames], args.fps, args.speed)
-    write_film(subject, path, frames, style, playback, float(args.turntable), reference)
+    playback = replace(playback, turns=float(args.turntable))
+    write_film(subject, path, frames, style, playback, reference)
 
 
 def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:

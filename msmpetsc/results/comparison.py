@@ -13,7 +13,7 @@ is equal, and so are two NaN, or two infinities of one sign.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -45,9 +45,9 @@ class FieldError:
 
     name: str
     unit: str
-    scale: float = 0.0
-    errors: Floats = field(default_factory=lambda: np.empty(0))
-    worst: Indices = field(default_factory=lambda: np.empty(0, int))
+    scale: float
+    errors: Floats
+    worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
         """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
@@ -158,7 +158,7 @@ def _row_lengths(rows: Array) -> Floats:
     if rows.ndim == 0:
         return np.abs(rows)[None]
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.atleast_1d(np.linalg.norm(rows, axis=-1)).ravel()
+        return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
@@ -202,7 +202,9 @@ def _least_energy(run: Result) -> float:
 
 def rows_agree(a: Array, b: Array, slack: float) -> Mask:
     """Tell which rows (n,) of a and b, (n, 3) or (n,) each, are apart by no more than `slack`."""
-    return (np.abs(a - b) if a.ndim == 1 else np.linalg.norm(a - b, axis=1)) <= slack
+    rows: Array = (a - b).reshape(len(a), -1)
+    agree: Mask = np.linalg.norm(rows, axis=1) <= slack
+    return agree
 
 
 def refuse_different_lattices(a: Result, b: Result) -> None:
@@ -234,9 +236,7 @@ def cell_size(run: Result, nodes: Positions) -> float:
     """Return the edge of a cell [m], from the first; 0 where the file has none."""
     if "cells" not in run.lattice or not len(run.lattice.cells):
         return 0.0
-    corners = run.lattice.cells[0].astype(np.int64)
-    if corners.min() < 0 or corners.max() >= len(nodes):
-        raise InputError(f"{run.path} is damaged: its first cell has corner {corners.max()} of {len(nodes)} nodes")
+    corners = run.indices("lattice/cells")[0]
     return float(np.ptp(nodes[corners], axis=0).max())
 
 
@@ -247,8 +247,8 @@ def point_text(point: Floats) -> str:
 
 def _sorted(springs: Indices) -> Indices:
     """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
-    springs = np.sort(springs, axis=1)
-    return springs[np.lexsort(springs.T)]
+    ordered: Indices = np.unique(np.sort(springs, axis=1), axis=0)
+    return ordered
 
 
 def common_times(a: Floats, b: Floats) -> Indices:

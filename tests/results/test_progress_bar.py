@@ -8,8 +8,8 @@ import pytest
 
 from msmpetsc.comm import log
 from msmpetsc.fields import Frame
-from msmpetsc.results import progress
-from msmpetsc.results.progress import Progress
+from msmpetsc.results import progress_bar
+from msmpetsc.results.progress_bar import Progress
 
 
 def frame(index: int) -> Frame:
@@ -28,7 +28,7 @@ class Terminal(io.StringIO):
 def clock(monkeypatch):
     """Sets the time that progress sees [s]."""
     now = [1000.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress_bar.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -103,11 +103,3 @@ def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch):
     assert screen[0].split("\r")[-1] == "a cell is inside out"  # the bar before it was wiped out
     assert "0/10" in screen[1] and screen[-2] == "afterwards"
     assert log.handlers is handlers
-
-
-def test_in_a_batch_log_there_is_nothing_to_keep_whole(monkeypatch):
-    handlers = [logging.StreamHandler(io.StringIO())]
-    monkeypatch.setattr(log, "handlers", handlers)
-    shown = Progress(10, stream=io.StringIO())
-    assert log.handlers is handlers
-    shown.close()

@@ -1,0 +1,142 @@
+"""The composition of pictures, films and pages: the camera that sees all frames drawn, their colours, their extent."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msmpetsc.errors import InputError
+from msmpetsc.results.progress_bar import counted
+from msmpetsc.results.reader import Result
+from msmpetsc.view.camera import Camera, camera_facing, turned
+from msmpetsc.view.colours import Colouring, colouring_of, plain_colouring, scaled
+from msmpetsc.view.drawable import FARTHEST, Drawable
+from msmpetsc.view.mesh import Cut, cut_open
+from msmpetsc.view.overlays import MARGIN, Overlays, overlays_at
+
+DIRECTIONS = 40  # in which the points farthest out of a frame stand for all of it
+LABELS = np.array([0.55, 0.15])  # of the bodies' longest extent: beside and above them, where axes are labelled
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a picture, a film or a page is to look: what ``msmpetsc render`` is asked for, beside frames and files.
+
+    eye       : direction (3,) from the body to the eye; the scene's picture.eye if None
+    colour    : name of a field
+    size      : width and height [px] of a film, a still, or a panel
+    axes      : whether a box with lengths is drawn around the body
+    scale_bar : whether the legend has a length
+    shown     : "cells", "springs"
+    """
+
+    eye: Sequence[float] | None = None
+    colour: str | None = None
+    size: tuple[int, int] | None = None
+    axes: bool = False
+    scale_bar: bool = False
+    shown: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Still:
+    """One picture: the number of its frame, its camera, what stands beside the body, two lines below it, and what is
+    shown of the lattice."""
+
+    index: int
+    camera: Camera
+    overlays: Overlays
+    caption: tuple[str, str] = ("", "")
+    cut: Cut | None = None
+
+
+@dataclass(frozen=True)
+class Composition:
+    """All frames that are drawn of a subject, as far as must be known before the first.
+
+    extremes  : (e, 3) points that reach farthest in some direction at some frame [m]
+    camera    : the first, before it turns
+    colouring : with its scale; None for a plain body
+    fixed     : whether any of the surface is ever pinned or led
+    """
+
+    subject: Drawable
+    style: Style
+    extremes: np.ndarray
+    camera: Camera
+    colouring: Colouring | None
+    fixed: bool
+
+    @property
+    def box(self) -> np.ndarray:
+        """Corners (2, 3) of the box around all frames [m]."""
+        return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
+
+    def cut(self, shown: tuple[str, ...]) -> Cut | None:
+        """Return what is shown of the lattice, as the first camera sees it."""
+        return cut_open(self.subject, self.camera, shown) if shown else None
+
+    def stills(self, frames: Sequence[int], turns: float = 0.0, words: str = "") -> list[Still]:
+        """Return the still of each frame, with its time and words below; equal ones in a row are one.
+
+        From the first to the last the eye goes so many times around the body.
+        """
+        cut = self.cut(self.style.shown)
+        made: list[Still] = []
+        for number, index in enumerate(frames):
+            if made and made[-1].index == index and not turns:
+                made.append(made[-1])
+                continue
+            camera = turned(self.camera, 2 * np.pi * turns * number / len(frames))
+            overlays = overlays_at(self.subject, index, self.extremes, camera)
+            made.append(Still(index, camera, overlays, (f"t = {self.subject.times[index]:.3f} s", words), cut))
+        return made
+
+    def room(self, stills: Sequence[Still]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return lower left (2,) and upper right (2,) of all stills in their pictures' planes, with a margin, and how
+        deep they reach [m]. Of a ground it is what lies below the bodies, their shadows."""
+        margin = (LABELS if self.style.axes else MARGIN) * np.ptp(self.box, axis=0).max()
+        ends, corners = [], [self.extremes]
+        for still in stills:
+            shown = still.overlays
+            below = [ground.below(self.extremes) for ground in shown.grounds]
+            flat = still.camera.flat(np.concatenate([self.extremes, *below, *shown.arrows, shown.obstacles]))
+            ends += [flat.min(axis=0) - margin, flat.max(axis=0) + margin]
+            corners += [shown.obstacles, *(ground.corners for ground in shown.grounds)]
+        depth = float(np.linalg.norm(np.ptp(np.concatenate(corners), axis=0)))
+        return np.min(ends, axis=0), np.max(ends, axis=0), depth
+
+
+def composition_of(
+    subject: Drawable, frames: Sequence[int], style: Style, reference: Result | None = None
+) -> Composition:
+    """Read the surfaces of the frames, one at a time. Raises InputError where they cannot be drawn.
+
+    reference : result that the colour "error" is counted from
+    """
+    colouring = colouring_of(subject, style.colour, reference) if style.colour else plain_colouring(subject)
+    directions = _directions()
+    extremes = []
+    distinct = sorted(set(frames))
+    for index in counted(distinct, "frames read"):
+        points = subject.surface(index)
+        if not (np.abs(points) < FARTHEST).all():
+            raise InputError(f"{subject.name}: frame {index} has points that cannot be drawn")
+        extremes.append(points[np.unique((points @ directions.T).argmax(axis=0))])
+    everywhere = np.concatenate(extremes)
+    if np.ptp(everywhere, axis=0).max() == 0:
+        raise InputError(f"{subject.name}: the surface at these frames has no extent")
+    if colouring is not None and style.colour:
+        colouring = scaled(colouring, distinct)
+    camera = camera_facing(everywhere, subject.gravity, subject.eye if style.eye is None else style.eye)
+    fixed = any(subject.fixed(index).any() for index in (distinct[0], distinct[-1]))
+    return Composition(subject, style, everywhere, camera, colouring, fixed)
+
+
+def _directions() -> np.ndarray:
+    """Return unit vectors (d, 3) spread over the sphere, those of the axes first (Fibonacci's spiral)."""
+    number = np.arange(DIRECTIONS) + 0.5
+    height, angle = 1 - 2 * number / DIRECTIONS, np.pi * (1 + 5**0.5) * number
+    flat = np.sqrt(1 - height**2)
+    spiral = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
+    return np.concatenate([np.eye(3), -np.eye(3), spiral])

@@ -184,7 +184,7 @@ class Environment:
         return Contact(states, owned, surface) if states or surface else None
 
     def forget(self) -> None:
-        """Know nothing of the steps before (collective)."""
+        """Forget what earlier steps showed (collective)."""
         if self.self_contact:
             self.self_contact.forget()
             self._contacts = Contacts(self.self_contact)

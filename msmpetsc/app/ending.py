@@ -65,7 +65,7 @@ def _failing_ranks(meeting: "MPI.Comm") -> set[int]:
 
 
 def _end_all(comm: "MPI.Comm", line: str, status: int) -> None:
-    """Say the line and end all ranks, for none can be asked any more. One rank alone is left to its own end."""
+    """Print the line and end all ranks by MPI_Abort; a run of one rank ends by itself."""
     if comm.size > 1:
         print(f"msmpetsc: {line}", file=sys.stderr, flush=True)
         comm.Abort(status)

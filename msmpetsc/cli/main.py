@@ -67,7 +67,7 @@ def start_alone(comm: "MPI.Comm", command: str) -> None:
 
 
 def entry_point() -> None:
-    """Be the installed ``msmpetsc``; where only results can be read, one line says what a run needs."""
+    """Entry point of the installed ``msmpetsc``; where only results can be read, one line says what a run needs."""
     try:
         status = main()
     except ModuleNotFoundError as error:

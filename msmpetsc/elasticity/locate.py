@@ -1,4 +1,4 @@
-"""Where it is worst, for messages of trouble: a node or a cell, by its point in the body at rest."""
+"""Location of the worst node or cell, for messages: its point in the body at rest."""
 
 import numpy as np
 from mpi4py import MPI

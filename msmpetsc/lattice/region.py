@@ -1,4 +1,4 @@
-"""Which nodes or cells a scene means by a region, and the materials of the parts that regions make.
+"""Selection of nodes or cells a scene means by a region, and the materials of the parts that regions make.
 
 A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is.
 """

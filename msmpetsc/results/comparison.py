@@ -31,7 +31,7 @@ SAME_TIME = 1e-6  # of the spacing of frames
 
 
 class DifferentLattices(InputError):
-    """Two runs are not of one lattice."""
+    """Raised for two runs that are not of one lattice."""
 
 
 @dataclass

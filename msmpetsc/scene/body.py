@@ -89,7 +89,7 @@ class CagesTable(Table):
 
 
 class Material(Table):
-    """What the lattice is made of."""
+    """Material of the lattice."""
 
     one_of = ("young_modulus", "stiffness")
     young_modulus: Positive | None = Field(None, description="Young's modulus; Poisson's ratio is 1/4 [Pa]")
@@ -151,7 +151,7 @@ class Region(Table):
 
 
 class OwnMaterial(Table):
-    """What is not of the scene's material; a key that is absent is the material's."""
+    """Material of a part; a key that is absent is that of the scene's material."""
 
     density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
     young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")

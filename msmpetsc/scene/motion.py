@@ -146,7 +146,7 @@ class Force(Table):
 
     @property
     def pulls(self) -> bool:
-        """Whether it is ever anything but nothing."""
+        """Whether the force is not zero at some time."""
         if self.total is None:
             return True  # a function, which may
         values = self.total.values if isinstance(self.total, ForceTable) else (self.total,)

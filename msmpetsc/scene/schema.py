@@ -17,7 +17,7 @@ from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positiv
 
 
 class Solver(Table):
-    """How a step is solved."""
+    """Solver of a step."""
 
     preset: PresetName = Field("newton", min_length=1, description="named set of PETSc options")
     error: float | None = Field(None, gt=0, lt=1, description="relative error of a step to aim at [-]")
@@ -25,7 +25,7 @@ class Solver(Table):
 
 
 class Safety(Table):
-    """What is done about a step that fails, and what is watched."""
+    """Checks of a run, and recovery of steps that fail."""
 
     on_failure: Literal["stop", "substep", "fallback"] = Field(
         "stop", description="stop the run; take that step in shorter ones; or solve it with a slower, robust method"
@@ -34,7 +34,7 @@ class Safety(Table):
 
 
 class Output(Table):
-    """What is stored beside the lattice."""
+    """Choice of what the result file stores beside the lattice."""
 
     surface: bool = Field(True, description="store the surface of every frame")
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
@@ -52,7 +52,7 @@ class BudgetTable(Table):
 
 
 class Picture(Table):
-    """How the result is drawn."""
+    """View of the result in pictures."""
 
     eye: Direction | None = Field(
         None, description="direction from the body to the eye, of any length; across its longer side if absent [-]"
@@ -114,7 +114,7 @@ class SceneFile(Table):
 
     @property
     def starts(self) -> list[Start | None]:
-        """How each body is at time 0."""
+        """Starts of all bodies at time 0."""
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, kind: str) -> Iterator[OfBody]:

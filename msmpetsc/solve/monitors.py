@@ -82,7 +82,7 @@ class Monitors:
             self.worst_gain = max(self.worst_gain, ledger.share)
 
     def sum_up(self) -> None:
-        """Say at the end of a run how often it was."""
+        """Log at the end of a run how often each warning was due."""
         if self.frames:
             left = f"{self.now} still are" if self.now else "none is at the end"
             log.warning("cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left)

@@ -43,7 +43,7 @@ class Recovery:
 
     @property
     def is_on(self) -> bool:
-        """Whether steps are under its care before they have failed."""
+        """Whether the next step is recovered from its start, since the one before failed."""
         return self.level > 0 and self.on_failure == "substep"  # else it was another scene that asked for it
 
     @property

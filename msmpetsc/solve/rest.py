@@ -33,7 +33,7 @@ LEAST = 1e-10  # of a cell: what a body moves less than that is rounding
 
 
 class Rest:
-    """Looks after each step whether the body has come to rest. All methods are collective.
+    """Check after each step whether the body has come to rest. All methods are collective.
 
     has_come : whether it has
     """

@@ -224,3 +224,13 @@ def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(tmp_path: Pa
     assert done.returncode == 0, done.stdout + done.stderr
     rows = json.loads(told.read_text())
     assert len(rows) == 12 and sum(len(row["steps"]) for row in rows) > 15
+
+
+def test_a_mode_that_stiffens_hides_no_lower_one():
+    """A step said 0.13 of its error while the search for curvature followed the mode of the step before (1.57, when the
+    lowest was 0.29): on the way to its solution the Hessian had negative curvatures."""
+    script = ROOT / "scripts" / "error_study.py"
+    command = [sys.executable, "-W", "ignore", script, "--seed", "28", "--only", "11"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [error / true > 0.9 for error, true in json.loads(done.stdout)["steps"]] == 3 * [True]

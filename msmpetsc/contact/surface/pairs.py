@@ -147,7 +147,7 @@ class NearPairs:
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
-        """Know nothing of the steps before."""
+        """Forget what earlier steps showed."""
         self._newest = None
 
 

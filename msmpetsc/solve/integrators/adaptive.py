@@ -73,7 +73,7 @@ class NeighbourMean:
         self.weights = csr_array(joined.multiply(1 / joined.sum(axis=1)[:, None]))
 
     def __call__(self, vectors: Rows) -> Rows:
-        """Of (owned, 3)."""
+        """Return the means of vectors (owned, 3)."""
         for _ in range(SWEEPS):
             self.field.values[: self.owned] = vectors
             self.field.update()
@@ -166,7 +166,7 @@ class Adaptive(Integrator):
         return self.kept[level]
 
     def _length(self, level: int) -> float:
-        """Of a step [s]."""
+        """Length of a step [s]."""
         return self.time_step * 2.0**level
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:

@@ -47,7 +47,7 @@ class Integrator(Protocol):
         """Go on after a step that ended at ``time`` [s]."""
 
     def forget(self) -> None:
-        """Let the steps so far leave no trace in the next."""
+        """Forget what earlier steps showed, so that the next step does not depend on it."""
 
     def refuse_unused_options(self, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:
         """Raise InputError for PETSc options of the user that nothing has used.

@@ -69,11 +69,11 @@ class LoadSteps:
         return self.size > SMALL
 
     def take(self) -> None:
-        """Know that the share has its equilibrium: the next step is twice as large."""
+        """Accept the share, which has its equilibrium: the next step is twice as large."""
         self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
 
     def halve(self, failure: StepFailed) -> None:
-        """Know that the share failed. Raises StepFailed where it was of the smallest, or one of very many."""
+        """Shorten the next step after a share that failed. Raises StepFailed where it was of the smallest, or one of very many."""
         self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
         if self.size < SMALLEST or self.failures > MOST_FAILURES:
             raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None

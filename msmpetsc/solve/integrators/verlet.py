@@ -259,7 +259,7 @@ class Verlet(Integrator):
             self.q[struck] = after[struck]
 
     def _hold(self, time: float) -> None:
-        """Know the free nodes anew where an anchor's time has come."""
+        """Update the free nodes where an anchor begins or ends."""
         anchors = len(self.environment.anchors_at(time))
         if anchors != self.anchors:
             self.anchors = anchors
@@ -310,7 +310,7 @@ class HighestMode:
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
     def hold(self, fixed: Mask) -> None:
-        """Know the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
+        """Set the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
         ranks."""
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])

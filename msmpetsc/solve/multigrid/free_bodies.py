@@ -77,7 +77,7 @@ def _names(unknowns: Unknowns, part: Indices) -> Indices:
 
 
 class Translations:
-    """Those of the free bodies. All methods are collective.
+    """Translations of the free bodies. All methods are collective.
 
     body : (m,) which of the free ones a free node belongs to; their number where its body is held
     mass : (m,) of each free node [kg]

@@ -27,7 +27,7 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 MOST = 100  # iterations of a long search
 SETTLED = 0.95  # of the curvature when half as many iterations were done: there is no lower one to come
 SHARPENED = 1.1  # times a negative curvature two iterations ago: further ones lead down no steeper
-MORE = 1.25  # times the compression of the last long search: modes may have come
+MORE = 1.25  # times the compression of the last long search, or its mode's curvature: another mode may be lowest
 ALIKE = 0.9  # of the lowest curvature: directions that lead down as well
 TINY = np.finfo(float).tiny
 DEPENDENT = 1e-10  # eigenvalue of the Gram matrix of unit directions: one of them is none
@@ -93,7 +93,7 @@ class LowestCurvature:
     preconditioner : of the step's linear solves, or multigrid for a long search
     """
 
-    state: ClassVar[dict[str, Range]] = {"searched": ANY, "knows_mode": (0, 1)}
+    state: ClassVar[dict[str, Range]] = {"searched": ANY, "value": ANY, "knows_mode": (0, 1)}
 
     def __init__(self, functional: StepFunctional, hessian: TrueHessian, preconditioner: StepPreconditioner):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
@@ -102,6 +102,7 @@ class LowestCurvature:
         self.known: tuple[StepProblem | None, Positions, Compression] = (None, np.empty(0), NONE)  # the last asked for
         self.searched = NONE  # the compression that the last long search was at
         self.mode: Floats | None = None  # the lowest known (n,), of unit length in the norm of M
+        self.value = 0.0  # its curvature when it was found
         self.knows_mode = False  # in the last checkpoint
         self.vectors: list[PETSc.Vec] | None = None
         self.rigid: Rows | None = None  # motions (6, n) that are left out
@@ -139,20 +140,30 @@ class LowestCurvature:
         q       : positions (l, 3) [m] that H was linearised at last
         hint    : a direction that may have part in it
         """
-        if alarm or compression.resists or self.mode is None or compression.exceeds(self.searched):
+        found = None
+        if not (alarm or compression.resists or compression.exceeds(self.searched)):
+            found = self._followed()
+        if found is None:
             self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
             with self.preconditioner.searching(q, self.functional.problem.contact):
-                values, modes = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
-        else:
-            its = self.effort.followed
-            values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
+                found = self._search_at_length(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
+        values, modes = found
         if not np.isfinite(values[0]):  # springs of no length: from a cusp any way leads down
             self.mode = None
             return -np.inf, self._random(1)[0]
-        self.mode = modes[0].copy()
+        self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
             return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
         return values[0], self.mode
+
+    def _followed(self) -> tuple[Floats, Rows] | None:
+        """Lowest curvatures, and their modes, near the mode found last. None where none is known, or where it has
+        stiffened so much that another may be the lowest now: one of 0.29 hid behind one that went from 0.87 to 1.57."""
+        if self.mode is None:
+            return None
+        its = self.effort.followed
+        values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
+        return None if values[0] > MORE * self.value else (values, modes)
 
     def _way_down(self, modes: Rows) -> Floats:
         """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter

@@ -72,7 +72,7 @@ class FirstGuess:
         self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
     def forget(self) -> None:
-        """Know nothing of the steps before."""
+        """Forget what earlier steps showed."""
         self.corrections = []
 
     def _held(self, guess: Positions) -> Positions:

@@ -119,7 +119,7 @@ class StepFunctional:
 
     @property
     def meets_itself(self) -> bool:
-        """Whether the surface does."""
+        """Whether the surface meets itself in this step."""
         return self.problem.contact is not None and self.problem.contact.surface is not None
 
     @property

@@ -130,7 +130,7 @@ class LatticePreconditioner:
         self.multigrid.pc.view(viewer)
 
     def forget(self) -> None:
-        """Know nothing of the steps before: a new hierarchy is due."""
+        """Forget the hierarchy: the next step builds a new one."""
         self.is_stale = self.is_first = True
 
     def destroy(self) -> None:
@@ -199,7 +199,7 @@ class StepPreconditioner:
 
     @contextmanager
     def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
-        """Be multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
+        """Switch to multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
         smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
         if self.is_chosen or not self.chooses or self.nodes < LARGE:
             yield
@@ -254,7 +254,7 @@ class StepPreconditioner:
         self.in_use.view(pc, viewer)
 
     def forget(self) -> None:
-        """Know nothing of the steps before: what was chosen for its iterations is to be chosen anew."""
+        """Forget what earlier steps showed: a preconditioner that was chosen by its iterations is chosen anew."""
         self.is_chosen = self.of_matrix is None
         if self.multigrid:
             self.multigrid.forget()

@@ -198,7 +198,7 @@ class Stepper:
             self.unknowns.from_nodes(iterate.q + share * (balanced - iterate.q), self.x)
 
     def forget(self, modes: bool = True) -> None:
-        """Let the steps so far leave no trace in the next; modes: of the lowest mode neither."""
+        """Forget what earlier steps showed, so that the next step does not depend on it; modes: the lowest mode too."""
         for part in (self.first_guess, self.control, self.jacobian.preconditioner):
             part.forget()
         if modes:

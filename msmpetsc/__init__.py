@@ -61,8 +61,8 @@ def __dir__() -> list[str]:
 def _kernel_folder() -> Path:
     """A folder for the compiled kernels of just these sources.
 
-    numba looks for changes in a kernel's own file alone, not in those of the kernels it calls: after an update it
-    would go on with parts of the old version.
+    numba looks for changes in a kernel's own file alone, not in those of the kernels it calls:
+    after an update it would go on with parts of the old version.
     """
     package = Path(__file__).parent
     sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]

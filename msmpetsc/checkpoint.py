@@ -28,8 +28,8 @@ LENGTH: Range = (0.0, sys.float_info.max)
 
 
 class Counting(Protocol):
-    """A part of a run that counts: its ``state`` names the attributes, numbers or dataclasses of numbers, that a
-    checkpoint holds, and the range of each."""
+    """A part of a run that counts: its ``state`` names the attributes, numbers or dataclasses of
+    numbers, that a checkpoint holds, and the range of each."""
 
     @property
     def state(self) -> dict[str, Range]: ...

@@ -21,9 +21,9 @@ from msmpetsc.contact.surface.term import SurfaceContact
 class Environment:
     """Loads, anchors and obstacles of a model. An implicit step asks once for its end, an explicit one in each substep.
 
-    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and ``time_step`` [s]
-    its length; ``sides`` (o, l) tell of each obstacle by which face each node is in contact (faces.side_of): the
-    penalties' first, then the exchanges'.
+    Positions are local, (l, 3) [m], ghosts included; ``time`` [s] is that of a step's end and
+    ``time_step`` [s] its length; ``sides`` (o, l) tell of each obstacle by which face each node is
+    in contact (faces.side_of): the penalties' first, then the exchanges'.
     """
 
     def __init__(self, model: Model):

@@ -1,7 +1,7 @@
 """Every dataset of a result file in one table: its type, shape, unit and meaning.
 
-`Frame`, the writer's datasets, the reader's checks, xarray's names, a study's columns and the table of the
-documentation (`markdown_table`) come from it.
+`Frame`, the writer's datasets, the reader's checks, xarray's names, a study's columns and the table
+of the documentation (`markdown_table`) come from it.
 """
 
 import math

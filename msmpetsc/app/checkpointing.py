@@ -86,8 +86,8 @@ class Checkpoints:
 class Signals:
     """Note SIGUSR1, SIGTERM and SIGINT, which ask a run to stop after its step; a second SIGINT ends it at once.
 
-    Used as a context, after PETSc has set its own handlers. Python lets the main thread alone have handlers: a run in
-    another thread hears no signals.
+    Used as a context, after PETSc has set its own handlers. Python lets the main thread alone have
+    handlers: a run in another thread hears no signals.
     """
 
     def __init__(self, comm: MPI.Comm):

@@ -20,8 +20,8 @@ PATIENCE = 10.0  # [s] that ranks may come to the same failure one after the oth
 def ending_together(comm: "MPI.Comm", extra: str = "run") -> Iterator[None]:
     """Let a failure of all ranks in the block pass, and end all ranks at a failure of some (collective to enter).
 
-    The others would wait for ever. It stands within whatever does collective work on leaving. A package that is missing
-    is named with this extra, if that brings it.
+    The others would wait for ever. It stands within whatever does collective work on leaving. A
+    package that is missing is named with this extra, if that brings it.
     """
     meeting = comm.Dup() if comm.size > 1 else None  # its messages meet no others
     try:

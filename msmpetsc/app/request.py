@@ -1,7 +1,7 @@
 """What a run can be asked for: the one table of it.
 
-Of its rows are made the keywords of ``msmpetsc.run`` with their types and their help, the options of ``msmpetsc run``,
-and the table of options in README.
+Of its rows are made the keywords of ``msmpetsc.run`` with their types and their help, the options
+of ``msmpetsc run``, and the table of options in README.
 """
 
 import inspect

@@ -49,8 +49,8 @@ def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
 def as_before(request: RunRequest, earlier: Earlier | None) -> RunRequest:
     """Return the request with what the earlier run was asked for and this one is not.
 
-    Of PETSc's options that are those with an effect on results. Raises InputError for an option that could do more
-    than choose a solver, and is not given again: the file may be from anywhere.
+    Of PETSc's options that are those with an effect on results. Raises InputError for an option
+    that could do more than choose a solver, and is not given again: the file may be from anywhere.
     """
     if earlier is None:
         return request
@@ -87,8 +87,8 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
 
 
 def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes: list[str]) -> None:
-    """Raise InputError for a file named by a result's scene that neither lies beside it nor is named by that
-    scene's file or by the user.
+    """Raise InputError for a file named by a result's scene that neither lies beside it nor is
+    named by that scene's file or by the user.
 
     The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
     """

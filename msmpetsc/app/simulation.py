@@ -56,8 +56,8 @@ class Simulation:
     for modulus in (1e5, 2e5, 4e5):
         *_, last = simulation.frames(set={"material.young_modulus": modulus})
 
-    Cages, embedding and the springs' network are kept while mesh and cages stay as they are; material, loads, starts
-    and times may change from run to run.
+    Cages, embedding and the springs' network are kept while mesh and cages stay as they are;
+    material, loads, starts and times may change from run to run.
 
     scene : as it was given
     model : of the run begun last: its lattice, embedding, and on rank 0 its surface; None before the first

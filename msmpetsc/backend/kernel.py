@@ -13,9 +13,9 @@ def kernel(body: Callable[..., None]) -> Callable[..., None]:
 
     ``kernel(body)(count, *arguments)`` does the same for all i below a count, in any order.
 
-    The first argument is an array, whose type tells where. What the body calls is compiled by numba.njit and takes
-    its roots from ``math``; no two indices write to the same place. The loop stands in the body, and not here, so
-    that numba finds what it has compiled before.
+    The first argument is an array, whose type tells where. What the body calls is compiled by
+    numba.njit and takes its roots from ``math``; no two indices write to the same place. The loop
+    stands in the body, and not here, so that numba finds what it has compiled before.
     """
     compiled = numba.njit(cache=True)(body)
 

@@ -55,8 +55,8 @@ def as_argument(value: np.ndarray | float) -> tuple[str, Words]:
 
 @lru_cache(maxsize=KEPT)
 def described(pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str) -> tuple[str, Words]:
-    """Return the kind of an array, "f8 2 C", and what numba's kernels take for it: no owner, no parent, its size, where
-    it lies."""
+    """Return the kind of an array, "f8 2 C", and what numba's kernels take for it: no owner, no
+    parent, its size, where it lies."""
     size = np.dtype(dtype).itemsize
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
     by_column = tuple(np.cumprod((size, *shape[:-1])))

@@ -81,8 +81,8 @@ def lack_of(volume: float, least: float) -> float:
 def corner_change(q: Positions, base: Positions, cell: Indices, frame: int, resistance: float, least: float) -> float:
     """Return the energy of a corner at q less that at base [J].
 
-    It comes from how the nodes moved, so that a small change keeps its digits: with d_k = e_k - e'_k,
-    J - J' = d_1 . e_2 x e_3 + d_2 . e_3 x e'_1 + d_3 . e'_1 x e'_2.
+    It comes from how the nodes moved, so that a small change keeps its digits: with d_k = e_k -
+    e'_k, J - J' = d_1 . e_2 x e_3 + d_2 . e_3 x e'_1 + d_3 . e'_1 x e'_2.
     """
     e, before = edges(q, cell, frame), edges(base, cell, frame)
     lack = lack_of(_volume(e[0], e[1], e[2]), least)
@@ -261,8 +261,8 @@ def add_resistance_hessian(q: Positions, law: Resistance, projected: bool, v: Ro
 
 @numba.njit(cache=True)
 def corner_curvature(e: Frame, n: Vector, resistance: float, least: float) -> float:
-    """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors [N/m^5]: not
-    negative, and 0 where it does not resist."""
+    """Return d^2 energy / d volume^2 of a corner with the edges e, n the first of its cofactors
+    [N/m^5]: not negative, and 0 where it does not resist."""
     return 6.0 * resistance * max(lack_of(_dot(e[0], n), least), 0.0) / least**2
 
 

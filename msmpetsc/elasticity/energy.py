@@ -56,11 +56,11 @@ class Flops:
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening ones and of cells that
-    resist being turned inside out (elasticity.cell_volume).
+    It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening
+    ones and of cells that resist being turned inside out (elasticity.cell_volume).
 
-    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the
-    owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
+    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are
+    right at the owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
@@ -112,11 +112,11 @@ class Elasticity:
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
 
     def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the owned rows of
-        ``blocks`` (l, 9) [N/m].
+        """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the
+        owned rows of ``blocks`` (l, 9) [N/m].
 
-        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, and four of a
-        cell's corner, whose D is twice that.
+        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its
+        diagonal, and four of a cell's corner, whose D is twice that.
         """
         for part in self.parts:
             part.add_half_bound(q, blocks)

@@ -77,8 +77,8 @@ def spring_block(
 ) -> tuple[float, float, float, float]:
     """Return c, e of the spring's Hessian c I + e e^T [N/m], [sqrt(N/m)].
 
-    It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length; ``projected``
-    leaves out the negative part that a compressed spring has across.
+    It is k (1 + 3 b s^2) along the spring and k (1 - r/l) (1 + b s^2) across it, l its length;
+    ``projected`` leaves out the negative part that a compressed spring has across.
     """
     length, tangent = math.sqrt(max(x * x + y * y + z * z, TINY)), 1.0
     across = 1.0 - r / length

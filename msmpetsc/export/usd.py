@@ -83,8 +83,8 @@ def up_axis(scene: dict[str, Any]) -> str:
 
 
 def frames_a_second(times: np.ndarray) -> float:
-    """Return how many frames there are in a second of times (t,) [s], so that a frame is one time code if all are
-    spaced alike."""
+    """Return how many frames there are in a second of times (t,) [s], so that a frame is one time
+    code if all are spaced alike."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 

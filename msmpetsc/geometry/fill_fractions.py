@@ -12,8 +12,8 @@ the ray, within the body and a cell, is a sum over the places z where it crosses
 Over all rays that is an integral over pieces of triangles as seen along the ray: the divergence theorem for the body
 within the cell. Of an open surface it is counted in samples by the generalized winding number (Jacobson et al. 2013).
 
-All is in cell units, axes cycled as in geometry.cages. Rays run along the last axis, so a slab of the first has its
-columns whole.
+All is in cell units, axes cycled as in geometry.cages. Rays run along the last axis, so a slab of
+the first has its columns whole.
 """
 
 from dataclasses import dataclass

@@ -88,8 +88,8 @@ def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) 
 def _flood(cells: Indices, slab: Slab) -> tuple[Indices, Indices]:
     """Return gaps (g, 4) and their labels (g,): EXTERIOR, or the number of a component.
 
-    Planes first..last-1 are owned, plane ``last`` may be given as a halo: its own neighbours beyond it are its
-    owner's business.
+    Planes first..last-1 are owned, plane ``last`` may be given as a halo: its own neighbours beyond
+    it are its owner's business.
     """
     gaps = _gaps(cells)
     plane, owned = gaps[:, 0], gaps[:, 0] < slab.last

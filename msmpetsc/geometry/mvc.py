@@ -1,15 +1,15 @@
 """Mean value coordinates of a cage made of grid cells (paper 3.1, Eq. 1-5).
 
-A cage is a union of unit cells. Its surface is made of unit squares, each cut in two triangles from its low to its
-high corner: a rule of the square alone, so that neighbours cut a shared face alike. These are the coordinates of Ju
-et al. 2005, not their formulas: on a grid the triangles' planes are known exactly, and what divides 0 by 0 as p
-nears such a plane can be taken out by hand, which leaves full precision at any distance from faces, edges and
-corners.
+A cage is a union of unit cells. Its surface is made of unit squares, each cut in two triangles from
+its low to its high corner: a rule of the square alone, so that neighbours cut a shared face alike.
+These are the coordinates of Ju et al. 2005, not their formulas: on a grid the triangles' planes are
+known exactly, and what divides 0 by 0 as p nears such a plane can be taken out by hand, which
+leaves full precision at any distance from faces, edges and corners.
 
-With e_i = v_i - p, a triangle sees from p the mean vector m = sum w_i e_i = 1/2 sum beta_jk n_jk (Eq. 4-5 before
-they are solved for w_i). In the frame of its plane, at signed height d, m = 1/2 sum g_jk (e_j x e_k) with
-g_jk = beta_jk / |e_j x e_k|, and the weights follow from m_a = sum w_i a_i, m_b = sum w_i b_i, m_n / d = sum w_i:
-a system that stays well conditioned as d goes to 0.
+With e_i = v_i - p, a triangle sees from p the mean vector m = sum w_i e_i = 1/2 sum beta_jk n_jk
+(Eq. 4-5 before they are solved for w_i). In the frame of its plane, at signed height d, m = 1/2 sum
+g_jk (e_j x e_k) with g_jk = beta_jk / |e_j x e_k|, and the weights follow from m_a = sum w_i a_i,
+m_b = sum w_i b_i, m_n / d = sum w_i: a system that stays well conditioned as d goes to 0.
 """
 
 from math import atan2, sqrt

@@ -4,9 +4,9 @@
 ------------------
 What is guaranteed, for any set of valid cells:
 - The position is continuous. On a face, edge or corner that a cell shares with a valid neighbour that neighbour's
-  factor of Eq. 9 is 0, so b = 0 and s = J; there only the shared corners weigh in J, they belong to B_c of every
-  cell that has them, and their L_v are common. Corners outside B_c weigh nothing there: normalising without them
-  changes nothing, whatever else B_c holds.
+  factor of Eq. 9 is 0, so b = 0 and s = J; there only the shared corners weigh in J, they belong to
+  B_c of every cell that has them, and their L_v are common. Corners outside B_c weigh nothing
+  there: normalising without them changes nothing, whatever else B_c holds.
 - The slope is continuous across the inside of shared faces: neither b (f_h' (0) = 0) nor W changes along the normal,
   and L_v is smooth inside its cage. At the rim of such a face on the body's surface, L_v itself has no slope.
 Where the corners in B_c weigh nothing, b = 1 and s = x, so 0/0 of the normalisation is never met.

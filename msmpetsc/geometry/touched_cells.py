@@ -1,7 +1,7 @@
 """Boundary cells: the grid cells that a triangle touches (paper section 4.1).
 
-Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns its
-low faces, so a face of the body that lies in a grid plane marks one layer of cells, not two.
+Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns
+its low faces, so a face of the body that lies in a grid plane marks one layer of cells, not two.
 """
 
 import numba

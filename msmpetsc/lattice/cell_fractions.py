@@ -1,7 +1,7 @@
 """Mass and stiffness of a cell that the surface cuts.
 
-Each corner has its share (geometry.fill_fractions), 8 times the integral of its trilinear function over what is
-inside. Of a whole cell's spring there is then
+Each corner has its share (geometry.fill_fractions), 8 times the integral of its trilinear function
+over what is inside. Of a whole cell's spring there is then
 
     an edge:            the integral of its bilinear function, which is the mean share of its two ends;
     a face diagonal:    the integral of its face's linear function, the mean share of the face's four corners;

@@ -57,9 +57,9 @@ def moved(start: Start, nodes: Positions, numbers: Indices, bounds: Rows) -> Pos
 def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Positions:
     """Return q (n, 3) [m] turned about the axis through the middle of the bounds.
 
-    The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin, all degrees where
-    they end.
-    Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 - cos(angle))
+    The angle grows along the axis with the ``nodes`` (n, 3) at rest: none where the bounds begin,
+    all degrees where they end. Rodrigues: p cos(angle) + (a x p) sin(angle) + a (a . p) (1 -
+    cos(angle))
     """
     a, middle = np.array(twist.axis) / np.linalg.norm(twist.axis), bounds.mean(axis=0)
     extent = np.abs(a) @ (bounds[1] - bounds[0])

@@ -223,8 +223,8 @@ def _kept_cells(local_cells: Indices, owned: int, stiffening: float) -> tuple[In
 def _local_cells(cages: Cages, table: SortedKeys) -> tuple[Indices, Indices, Mask]:
     """Return the cells around the owned nodes.
 
-    They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells, and
-    which of the 8 cells around each owned node are valid, (owned, 8) bool.
+    They are: grid index (l, 3) of owned and ghost nodes, local corner nodes (c, 8) of the cells,
+    and which of the 8 cells around each owned node are valid, (owned, 8) bool.
     """
     ijk = decode_morton(table.keys)
     around = encode_morton(ijk[:, None, :] - CORNERS)

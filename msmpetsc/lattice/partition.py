@@ -61,8 +61,8 @@ class Partition:
     def scaled(self, cells: float) -> "Partition":
         """Return the partition of the same body with more cells on as many ranks.
 
-        What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs as they do around
-        a cube of as many nodes as a rank has.
+        What fills it grows with the cells, the surface with their power 2/3; ghosts and cut springs
+        as they do around a cube of as many nodes as a rank has.
         """
         f = cells / self.cells.sum()
         nodes = cells + (self.nodes.sum() - self.cells.sum()) * f ** (2 / 3)

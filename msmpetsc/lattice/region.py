@@ -76,8 +76,8 @@ class Finder:
     def find_cells(self, table: OfBody, ijk: Indices) -> Mask:
         """Return which cells (c,) bool have their middles in a region, or hold a painted point (collective).
 
-        The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises InputError on all ranks if
-        the region means none.
+        The middle is that of what is inside. ijk : (c, 3) grid index of the cells. Raises
+        InputError on all ranks if the region means none.
         """
         region, grids = table.table.region, self.cages.grids
         if region.painted is None:

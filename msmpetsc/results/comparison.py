@@ -8,8 +8,8 @@ An error is the greatest difference at a frame over the scale of its field, whic
     momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
     anything else                           its own largest |value|
 
-each over both runs and all frames compared. What the digits of the coarser of the two stored types cannot tell apart
-is equal, and so are two NaN, or two infinities of one sign.
+each over both runs and all frames compared. What the digits of the coarser of the two stored types
+cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
 """
 
 from collections.abc import Sequence
@@ -87,8 +87,8 @@ class Distances(NamedTuple):
 def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
     """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
 
-    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or not these fields in
-    common.
+    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or
+    not these fields in common.
     """
     refuse_different_lattices(a, b)
     chosen, left_out = _chosen(a, b, names)

@@ -22,9 +22,9 @@ LONGEST_STEM = 50  # letters of a name that its part keeps: with more it could b
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a name to write a file under; it gets its own when it is whole, and of one that fails nothing is left.
 
-    That name ends alike, for many writers go by the ending. Links are followed; a file that is replaced keeps its
-    rights, and one that may not be written stays. Every file that a command leaves is written so, but for results,
-    which grow (results.writer).
+    That name ends alike, for many writers go by the ending. Links are followed; a file that is
+    replaced keeps its rights, and one that may not be written stays. Every file that a command
+    leaves is written so, but for results, which grow (results.writer).
 
     Raises InputError, with the path and the system's reason in one line.
     """

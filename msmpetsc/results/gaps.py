@@ -52,11 +52,11 @@ class SurfaceGaps:
         return gaps
 
     def _facing(self, points: Positions) -> tuple[Indices, Indices, Rows]:
-        """Return pairs (k,), (k,) of a point and a triangle that face each other and may be within reach, and the
-        points' normals (v, 3).
+        """Return pairs (k,), (k,) of a point and a triangle that face each other and may be within
+        reach, and the points' normals (v, 3).
 
-        Two faces do where their normals m, n have |m + n|^2 < 2. So that trees find few but such pairs, they have six
-        axes, of place and normal, which are scaled to make that the radius.
+        Two faces do where their normals m, n have |m + n|^2 < 2. So that trees find few but such
+        pairs, they have six axes, of place and normal, which are scaled to make that the radius.
         """
         corners = points[self.triangles]
         middles = corners.mean(axis=1)

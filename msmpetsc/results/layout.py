@@ -1,7 +1,7 @@
 """How a result file is laid out, so that a kill at any moment leaves it whole: all metadata before the first frame.
 
-Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks allocated, nothing
-buffered. While frames are written, no metadata changes.
+Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the start, its chunks
+allocated, nothing buffered. While frames are written, no metadata changes.
 """
 
 import math
@@ -21,8 +21,8 @@ CHUNK_BYTES = 64 * 2**20
 def open_new(storage: Storage) -> h5py.File:
     """Begin an empty file, of a kind that a kill cannot spoil.
 
-    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's file. No chunk
-    cache: nothing waits to be written. No lock: a running result may be looked at.
+    libver earliest: its superblock has no flag "open for writing", which would shut a killed run's
+    file. No chunk cache: nothing waits to be written. No lock: a running result may be looked at.
     """
     return h5py.File(storage, "w", libver="earliest", rdcc_nbytes=0, locking=False)
 

@@ -1,7 +1,7 @@
 """Two runs of one mesh, on lattices of any cells, held against each other by their surfaces, point by point.
 
-Both runs carry the same points of the same mesh, so that nothing is projected or interpolated. A point counts by the
-area around it, a third of its triangles'.
+Both runs carry the same points of the same mesh, so that nothing is projected or interpolated. A
+point counts by the area around it, a third of its triangles'.
 """
 
 import math

@@ -1,7 +1,7 @@
 """The result file (HDF5, format_version 1): one file of all ranks, safe against a kill.
 
-Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank writes its own
-where it can reach the file (results.transfer). The file is the same.
+Rank 0 has it open. It writes the rows of all ranks, in pieces; of frames and checkpoints each rank
+writes its own where it can reach the file (results.transfer). The file is the same.
 
 All metadata is on disk before the first frame and does not change while frames are written (results.layout). A frame is
 its data and, after them, its time. ``/frames/time`` starts as NaN: a frame is there when its time is finite
@@ -209,8 +209,8 @@ class ResultFile:
     def close(self, trim: bool = True) -> None:
         """Close the file; a second call does nothing.
 
-        Before, trim the frames to the finished ones, but where the run is to go on: as it lies there the file has room
-        for the rest.
+        Before, trim the frames to the finished ones, but where the run is to go on: as it lies
+        there the file has room for the rest.
         """
         with self._together():
             self._finish(trim)

@@ -77,8 +77,8 @@ def load_scene(
 
     overrides: "key.path=value" each, as of --set: value in TOML (a bare word is a string), list items by
         number; they replace or insert before anything is checked.
-    presets: the known names of solver presets; any name will do if None.
-    by_user: whether the overrides are a user's own words, which may name files outside the folder; a file's may not.
+    presets: the known names of solver presets; any name will do if None. by_user: whether the
+    overrides are a user's own words, which may name files outside the folder; a file's may not.
 
     Raises InputError naming every problem of the file, one a line.
     """

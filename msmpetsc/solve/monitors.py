@@ -1,5 +1,5 @@
-"""Monitors of a run, which warn once: of cells inside out, steps that ended far from their solution, energy that came
-from nowhere, and nodes inside an obstacle that comes to be there."""
+"""Monitors of a run, which warn once: of cells inside out, steps that ended far from their
+solution, energy that came from nowhere, and nodes inside an obstacle that comes to be there."""
 
 from typing import ClassVar
 
@@ -59,8 +59,8 @@ class Monitors:
             self.worst_error = max(self.worst_error, error)
 
     def overlaps(self, index: int, environment: Environment, q: Positions, time: float, time_step: float) -> None:
-        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3) [m] before it
-        (collective)."""
+        """Warn where the obstacles that are new after step ``index`` have nodes inside, q (l, 3)
+        [m] before it (collective)."""
         new = [o for o in environment.obstacles if o.acts_at(time) and not (index and o.acts_at(time - time_step))]
         for obstacle in new:
             overlapping = describe_overlap(self.comm, self.lattice, obstacle, q, environment.fixed_at(time), time)

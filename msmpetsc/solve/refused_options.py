@@ -141,7 +141,7 @@ def _left() -> list[str]:
 
 
 def silence_options_left() -> None:
-    """Keep PETSc from telling at its end which options were not used, where none was meant to be: newer ones do so by
-    themselves."""
+    """Keep PETSc from telling at its end which options were not used, where none was meant to be:
+    newer ones do so by themselves."""
     if "options_left" not in PETSc.Options().getAll():
         PETSc.Options().setValue("options_left", "false")

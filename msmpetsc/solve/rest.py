@@ -92,8 +92,8 @@ class Rest:
 
 
 def distance(stepper: Stepper, q: Positions, enough: float) -> float:
-    """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there is no minimum
-    (collective)."""
+    """|e|_M of the problem that the functional has begun, at its q (l, 3) [m]; infinite where there
+    is no minimum (collective)."""
     functional = stepper.functional
     stepper.unknowns.from_nodes(q, stepper.x)
     iterate = functional.evaluate(stepper.x, stepper.work)
@@ -101,8 +101,8 @@ def distance(stepper: Stepper, q: Positions, enough: float) -> float:
 
 
 def amplitude(stepper: Stepper, q: Positions, v: Rows) -> float:
-    """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in the norm of M;
-    infinite where there is none (collective)."""
+    """How far velocities v (l, 3) [m/s] would carry a body from its equilibrium at q (l, 3) [m], in
+    the norm of M; infinite where there is none (collective)."""
     functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
     stepper.unknowns.from_nodes(v, f)
     functional.memory.write(f)[:] *= functional.t2 * functional.mass

@@ -1,7 +1,7 @@
 """Numbers of a scene that are stored, and held against those of a later run.
 
-Each step is solved to 1e-9, so that neither the number of ranks nor the way in which a step is solved shows. Counts
-must be equal, the numbers of the last frame within the tolerance.
+Each step is solved to 1e-9, so that neither the number of ranks nor the way in which a step is
+solved shows. Counts must be equal, the numbers of the last frame within the tolerance.
 
 Tolerance. A step solved to the relative error e leaves e |x* - y| in x, |x* - y| being at most about the largest
 displacement D. What goes on from there carries it along in y = 2 q_n - q_(n-1): after N steps it is e D N (N + 1) / 2.

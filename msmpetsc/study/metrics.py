@@ -122,8 +122,8 @@ def _rms(values: np.ndarray) -> float | None:
 def together(runs: Sequence[Row]) -> Row:
     """Return one row of the repeats' figures: medians of times, and the range of a step's.
 
-    What was measured once comes from the run that measured it. Memory is that of the leanest: the first run may have
-    measured errors beside its work.
+    What was measured once comes from the run that measured it. Memory is that of the leanest: the
+    first run may have measured errors beside its work.
     """
     row = dict(runs[0])
     for name in row:

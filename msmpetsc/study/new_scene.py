@@ -94,8 +94,8 @@ def uprightness(surface: Surface, axis: int) -> float:
 
 
 def stands(surface: Surface, axis: int, way: int) -> float:
-    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of its ground plan
-    that it stands on, less where it stands on a face rather than on feet.
+    """Return how well a body stands with this axis upwards (way 1) or downwards (-1): the share of
+    its ground plan that it stands on, less where it stands on a face rather than on feet.
 
     That is the convex hull of its lowest points; nothing where its centre is not above it.
     """

@@ -37,8 +37,8 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 
 
 def labelled(picture: np.ndarray, labels: list[tuple[str, np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the top left], and the
-    ways (2,) that lead from there out of what is labelled."""
+    """Return a picture (height, width, 3) with labels: texts, where they begin (2,) [px from the
+    top left], and the ways (2,) that lead from there out of what is labelled."""
     drawn = Image.fromarray(picture)
     for text, at, way in labels:
         half = np.array([typeface(LABEL).getlength(text), LABEL]) / 2

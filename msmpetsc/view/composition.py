@@ -40,8 +40,8 @@ class Style:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture: the number of its frame, its camera, what stands beside the body, two lines below it, and what is
-    shown of the lattice."""
+    """One picture: the number of its frame, its camera, what stands beside the body, two lines
+    below it, and what is shown of the lattice."""
 
     index: int
     camera: Camera

@@ -34,8 +34,8 @@ class DistanceSolid(Solid):
     def deeper(self, q: Positions, moved: Rows, face: Indices) -> Floats:
         """Return how much deeper positions within lie than ``moved`` (n, 3) [m] before, (n,) [m].
 
-        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the surface bends by
-        1 / r.
+        Over a short way it comes by the trapezoidal rule, wrong by |moved|^3 / (12 r^2) where the
+        surface bends by 1 / r.
         """
         face, way = to_host(face), to_host(moved)
         (depth, normal), (depth_before, normal_before) = (self._behind(to_host(x), face) for x in (q, q - moved))

@@ -1,9 +1,9 @@
 """Coulomb's friction of nodes on obstacles.
 
-It opposes the slip u, the way along the surface during the step, with mu N once |u| passes a small e; N is the push on
-the node at the step's start, so that friction has a potential, mu N f(|u|), with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3
-for u < e and u beyond (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15). It is convex. Explicit substeps
-take it as a change of velocity.
+It opposes the slip u, the way along the surface during the step, with mu N once |u| passes a small
+e; N is the push on the node at the step's start, so that friction has a potential, mu N f(|u|),
+with f(u) = u^2 / e - u^3 / (3 e^2) + e / 3 for u < e and u beyond (Li et al. 2020, Incremental
+Potential Contact, Eq. 12 to 15). It is convex. Explicit substeps take it as a change of velocity.
 """
 
 from dataclasses import dataclass
@@ -96,8 +96,8 @@ def squares(vectors: Rows) -> Rows:
 
 
 class Movers(NamedTuple):
-    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those that move as rows or
-    (n,) bool, and 1 / mass (n,) [1/kg]."""
+    """Nodes whose velocities change: positions q and velocities v (n, 3) [m], [m/s] of all, those
+    that move as rows or (n,) bool, and 1 / mass (n,) [1/kg]."""
 
     q: Positions
     v: Rows
@@ -108,9 +108,9 @@ class Movers(NamedTuple):
 def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:
     """Apply Coulomb friction as a change of velocity to the nodes that are inside.
 
-    v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s], falls by no more than
-    the friction's impulse a mass, mu N dt / m, and not below nothing: so what holds does not creep, however long the
-    substep.
+    v (n, 3) [m/s] along the face, as seen from an obstacle that moves at ``carried`` (3,) [m/s],
+    falls by no more than the friction's impulse a mass, mu N dt / m, and not below nothing: so what
+    holds does not creep, however long the substep.
 
     pressed : of the nodes, the rows (a,) inside, how deep (a,) [m] and the normals (a, 3) there
     impulse : mu k dt [kg/s], times the depth the impulse

@@ -24,8 +24,8 @@ ROUNDED = 1e-14  # of the largest coordinate: a nearest point that is no farther
 class MeshSolid(DistanceSolid):
     """The inside of a closed surface; its face is the nearest triangle.
 
-    The pseudonormal of the nearest triangle, edge or corner tells what is inside (Baerentzen and Aanaes 2005, Signed
-    Distance Computation Using the Angle Weighted Pseudonormal).
+    The pseudonormal of the nearest triangle, edge or corner tells what is inside (Baerentzen and
+    Aanaes 2005, Signed Distance Computation Using the Angle Weighted Pseudonormal).
     """
 
     def __init__(self, surface: Surface):

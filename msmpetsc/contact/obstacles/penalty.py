@@ -1,5 +1,5 @@
-"""Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside an obstacle,
-and Coulomb friction (contact.obstacles.friction) on those that were.
+"""Contact as a term of the energy that a step minimises: stiff springs on the nodes that are inside
+an obstacle, and Coulomb friction (contact.obstacles.friction) on those that were.
 
 A node at depth d > 0 has the energy 1/2 k d^2. It is convex for one face, and so is what a step minimises.
 
@@ -72,8 +72,8 @@ class Penalty:
     def _depth_to_come(self, q: Positions, time: float, sides: Indices | None, nodes: Indices, depth: Floats) -> Floats:
         """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
 
-        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just come in the way there
-        says nothing of how far it goes.
+        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just
+        come in the way there says nothing of how far it goes.
         """
         coming, _ = self.obstacle.depths(q, time, sides)
         return np.clip(coming[nodes], 0, 2 * depth)
@@ -117,8 +117,8 @@ class ContactState:
 
 
 class Contact:
-    """What all obstacles, and the surface that meets itself, add to E in one step. Positions q are (owned or more, 3)
-    [m].
+    """What all obstacles, and the surface that meets itself, add to E in one step. Positions q are
+    (owned or more, 3) [m].
 
     Gradient and Hessian of obstacles act on nodes alone: the Hessian is a 3 x 3 block a node in contact.
 

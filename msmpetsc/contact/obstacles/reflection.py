@@ -1,12 +1,12 @@
-"""What a node does that strikes an obstacle: it loses speed (``slowed``), or, as the paper has it (section 5), its last
-two positions are exchanged (``Exchange``).
+"""What a node does that strikes an obstacle: it loses speed (``slowed``), or, as the paper has it
+(section 5), its last two positions are exchanged (``Exchange``).
 
-There is no velocity in the state, only q_n and q_(n-1). A node that strikes gets e times its normal velocity by another
-q_(n-1): it stays where the springs want it, and no energy comes in. The push of the face then turns it round, so that
-it leaves with e times the speed that it came with.
+There is no velocity in the state, only q_n and q_(n-1). A node that strikes gets e times its normal
+velocity by another q_(n-1): it stays where the springs want it, and no energy comes in. The push of
+the face then turns it round, so that it leaves with e times the speed that it came with.
 
-The paper reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1). The obstacle thereby moves nodes against their
-springs, which adds energy during the impact; it is not a conservative contact.
+The paper reverses a velocity, v_(n+1) = -v_n, by q_(n+1) = q_(n-1). The obstacle thereby moves
+nodes against their springs, which adds energy during the impact; it is not a conservative contact.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in contact (Obstacle.sides),
-    of several obstacles (o, n); None: as the way of each tells."""
+    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in
+    contact (Obstacle.sides), of several obstacles (o, n); None: as the way of each tells."""
 
     time: float
     length: float

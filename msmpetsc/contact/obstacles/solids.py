@@ -30,8 +30,8 @@ class Solid(ABC):
 
     @abstractmethod
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
-        """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or else the nearest, and
-        that face (n,).
+        """Return how deep positions lie (n,) [m], behind the face of their side (n or more,) or
+        else the nearest, and that face (n,).
 
         Outside it is negative, and no less than minus the distance.
         """
@@ -100,8 +100,8 @@ def side_of(x: Positions, end: Positions, points: Positions, normals: Rows, side
 
     side : by which it was before: it keeps that until it is out of the solid
 
-    It is the node that counts here, however far it sticks out of the surface: with a side, but no depth yet, it is on
-    its way in, or out again.
+    It is the node that counts here, however far it sticks out of the surface: with a side, but no
+    depth yet, it is on its way in, or out again.
     """
     if side > 0 and _stays(x, points, normals, side - 1):
         return side

@@ -1,13 +1,13 @@
-"""Barrier between the triangles of one surface, and its friction, by ipctk (Li et al. 2020, Incremental Potential
-Contact): all that is computed of points on one rank.
+"""Barrier between the triangles of one surface, and its friction, by ipctk (Li et al. 2020,
+Incremental Potential Contact): all that is computed of points on one rank.
 
 A pair of triangles' parts that are nearer than dhat has the energy  kappa a b(d),  a an area of the surface, d their
 distance and b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat), which is smooth where it begins and without bound at d = 0. All such
 pairs count, so that the energy is continuous: with fewer (Chen et al. 2025, Offset Geometric Contact) it jumps where
 one comes to count or ceases to, and line searches end there.
 
-Pairs that are near at rest for being neighbours push each other from smaller distances, each set of them from its own
-(contact.surface.creases); so contacts are one set for each distance.
+Pairs that are near at rest for being neighbours push each other from smaller distances, each set of
+them from its own (contact.surface.creases); so contacts are one set for each distance.
 
 ipctk is used on one thread, so that sums are the same each time; its arrays are of Fortran's order.
 """
@@ -101,15 +101,15 @@ class Barrier:
         return len(self.folded), dropped
 
     def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
-        """Return all pairs that may be nearer than dhat once each point has moved by no more than ``reach`` [m], but
-        for those in creases."""
+        """Return all pairs that may be nearer than dhat once each point has moved by no more than
+        ``reach`` [m], but for those in creases."""
         candidates = self.ipctk.Candidates()
         candidates.build(self.mesh, np.asfortranarray(points), 0.5 * self.law.distance + reach, self.ipctk.LBVH())
         return candidates
 
     def clear_reach(self, candidates: "ipctk.Candidates", points: Positions, reach: float) -> tuple[float, float]:
-        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes as near as it pushes
-        from, and until any pair of the surface does; 0 where one is."""
+        """Return how far [m], up to ``reach``, each point may move until one of these pairs comes
+        as near as it pushes from, and until any pair of the surface does; 0 where one is."""
         clear = [reach]
         for pairs, distance in zip((candidates, *self.creases), self.distances, strict=True):
             near = self._pairs(pairs, points, distance + 2 * reach)
@@ -117,8 +117,8 @@ class Barrier:
         return clear[1], min(clear)
 
     def contacts(self, candidates: "ipctk.Candidates | None", points: Positions) -> ContactSets:
-        """Return the pairs nearer than they push from, one set for each distance; of creases only without
-        ``candidates``."""
+        """Return the pairs nearer than they push from, one set for each distance; of creases only
+        without ``candidates``."""
         kinds = zip((candidates or self.ipctk.Candidates(), *self.creases), self.distances, strict=True)
         return tuple(self._pairs(pairs, points, distance) for pairs, distance in kinds)
 
@@ -158,8 +158,8 @@ class Barrier:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
     def free_share(self, start: Positions, moved: Rows, candidates: "ipctk.Candidates") -> float:
-        """Return the share, up to 1, of a straight way that points go from start (p, 3) by ``moved`` (p, 3) [m]
-        without any meeting.
+        """Return the share, up to 1, of a straight way that points go from start (p, 3) by
+        ``moved`` (p, 3) [m] without any meeting.
 
         candidates : pairs that may meet on it, besides those in creases
         """

@@ -46,8 +46,8 @@ def collision_surface(
 
 
 def _stiffness(comm: MPI.Comm, lattice: Lattice, distance: float, time_step: float) -> float:
-    """Return kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells, E / h, and what
-    its inertia adds in a step, rho h / t^2.
+    """Return kappa [J/m^2]: over dhat^2 it is the stiffness, of an area, of a layer of whole cells,
+    E / h, and what its inertia adds in a step, rho h / t^2.
 
     Ando (2024, A cubic barrier with elasticity-inclusive dynamic stiffness) takes both of each contact; with those of
     the stiffest cell it is the same at all times, and so is the energy of a given state.
@@ -82,8 +82,8 @@ def _prepared(bodies: list[Surface], table: SelfContactTable) -> tuple[list[Surf
 
 
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
-    """Return the median distance [m] of the bodies' points from the coarser surfaces, and say the greatest, of which a
-    part that was lost makes much."""
+    """Return the median distance [m] of the bodies' points from the coarser surfaces, and say the
+    greatest, of which a part that was lost makes much."""
     import igl
 
     squares = [

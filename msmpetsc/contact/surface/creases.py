@@ -1,10 +1,10 @@
 """Pairs of a surface's parts in its creases, which push each other from smaller distances than others do.
 
-At a sharp crease, or between needle-shaped triangles, parts of the surface that share no point are nearer than dhat at
-rest. They would push each other from the start, and bend what should be at rest. A few rings of triangles apart at the
-most, they are one piece of surface. Each of their pairs pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that
-is no more than half of its distance at rest: there it does nothing, and yet it does not cross. Others as near at rest
-do push.
+At a sharp crease, or between needle-shaped triangles, parts of the surface that share no point are
+nearer than dhat at rest. They would push each other from the start, and bend what should be at
+rest. A few rings of triangles apart at the most, they are one piece of surface. Each of their pairs
+pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is no more than half of its distance
+at rest: there it does nothing, and yet it does not cross. Others as near at rest do push.
 """
 
 from collections.abc import Mapping
@@ -27,8 +27,8 @@ NEAREST = 1e-3  # of dhat: pairs nearer than that at rest may cross
 def neighbours(
     candidates: "ipctk.Candidates", mesh: "ipctk.CollisionMesh", points: Positions, distance: float
 ) -> Mapping[tuple[int, int], bool]:
-    """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than ``distance`` [m] at
-    rest."""
+    """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
+    ``distance`` [m] at rest."""
     pairs = [_cross_pairs(kind, mesh, points, distance, split) for kind, split in _kinds(candidates)]
     groups = np.concatenate([np.empty((0, 4, 2), np.int64), *pairs])
     if len(groups) == 0:
@@ -50,8 +50,8 @@ def _kinds(candidates: "ipctk.Candidates") -> list[tuple[list[Any], int]]:
 
 
 def _cross_pairs(kind: list[Any], mesh: Any, points: Positions, distance: float, split: int) -> Indices:
-    """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the second part; of a point
-    and a triangle there are three, one of them twice."""
+    """Return of each near candidate the pairs (k, 4, 2) of a point of the first and one of the
+    second part; of a point and a triangle there are three, one of them twice."""
     points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
     near = [c.vertex_ids(edges, faces) for c in kind if c.compute_distance(points, edges, faces) < distance**2]
     ids = np.array(near, np.int64).reshape(-1, 4)
@@ -97,8 +97,8 @@ def together(sets: list["ipctk.Candidates"]) -> "ipctk.Candidates":
 def _left_out(
     apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
-    """Return the pairs that share no point and of which no point of one may meet any of the other: a point and a
-    triangle, and two edges."""
+    """Return the pairs that share no point and of which no point of one may meet any of the other:
+    a point and a triangle, and two edges."""
     import ipctk
 
     if not apart:

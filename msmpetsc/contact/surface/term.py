@@ -156,8 +156,8 @@ class SurfaceContact:
     def concavity(self, q: Positions) -> Floats:
         """Return c (owned,) [N/m]: the Hessian's negative part is no more than a diagonal of c on the nodes.
 
-        With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w v)^2 is no more
-        than sum |w| times sum |w| v^2.
+        With r the row sums of it on the points it is no more there than a diagonal of r, and (sum w
+        v)^2 is no more than sum |w| times sum |w| v^2.
         """
         whole, kept = (self.hessian(q, projected) for projected in (False, True))
         if whole is None or kept is None:

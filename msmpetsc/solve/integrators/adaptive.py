@@ -13,8 +13,8 @@ changed by is added, as the mean by mass: they push the rest of the body late. A
 a step may have done so early or late in it: that is counted just so, as a step times the change over the mass times a
 step. step_control adds all up and chooses the next step.
 
-Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and so does the history
-that BDF2 needs where the length changes. All methods are collective.
+Frames within a step come from the cubic through positions and velocities at its ends (Hermite), and
+so does the history that BDF2 needs where the length changes. All methods are collective.
 """
 
 import math
@@ -114,8 +114,8 @@ def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: flo
 class Adaptive(Integrator):
     """Takes the scene's steps in steps of its own, shorter or longer ones.
 
-    States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time: the end of a step
-    longer than the scene's. Their history is where the last step began.
+    States are of the scene's step, (q_n - q_(n-1)) / t the velocity, but may be of a later time:
+    the end of a step longer than the scene's. Their history is where the last step began.
 
     make    : makes an integrator of steps of one length
     balance : examines the steps that stand

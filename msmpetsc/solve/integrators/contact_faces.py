@@ -18,8 +18,8 @@ MOST_SOLVES = 10  # of a step, for nodes that pass through a box
 class ContactFaces:
     """Search for the faces of one step, from q to its end. All methods are collective.
 
-    They are settled before the step is solved, by the way to y. Where the way to x shows others, the step is solved
-    again; from then on a node that has a face keeps it, so that this ends.
+    They are settled before the step is solved, by the way to y. Where the way to x shows others,
+    the step is solved again; from then on a node that has a face keeps it, so that this ends.
 
     q, y       : (l, 3) [m], as a StepProblem has them
     q_before   : (l, 3) [m] one step before q, of a step that looks so far back

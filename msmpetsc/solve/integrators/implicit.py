@@ -3,8 +3,8 @@
 Implicit Euler and BDF2 both look for the x where  M (x - y) + tau^2 (grad E(x) - f_ext) = 0;  they differ in y, what
 x were without forces, and in tau, a share of the time step t.
 
-Damping by the mass adds -alpha M v to the forces. With v = (x - c) / tau, the velocity that belongs to x, and
-y = c + tau w
+Damping by the mass adds -alpha M v to the forces. With v = (x - c) / tau, the velocity that belongs
+to x, and y = c + tau w
 
     M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0,
 
@@ -182,8 +182,8 @@ class Bdf2(ImplicitEuler):
 
         q_(n+1) = (4 q_n - q_(n-1)) / 3 + tau v_(n+1),    v_(n+1) = (4 v_n - v_(n-1)) / 3 + tau a_(n+1),    tau = 2/3 t
 
-    (Hairer and Wanner, Solving Ordinary Differential Equations II, III.1), so that
-    y = (4 q_n - q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3. Friction, too, is of what the last two states lead to.
+    (Hairer and Wanner, Solving Ordinary Differential Equations II, III.1), so that y = (4 q_n -
+    q_(n-1)) / 3 + tau (4 v_n - v_(n-1)) / 3. Friction, too, is of what the last two states lead to.
     """
 
     SHARE = 2 / 3

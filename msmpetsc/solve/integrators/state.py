@@ -34,8 +34,8 @@ NO_ENERGY = Ledger()
 
 @dataclass(frozen=True)
 class State:
-    """q_n and q_(n-1), (l, 3) [m], ghosts included; the velocity is (q_n - q_(n-1)) / t. After contact a step's are
-    not what the frame shows, which is the step as it was solved.
+    """q_n and q_(n-1), (l, 3) [m], ghosts included; the velocity is (q_n - q_(n-1)) / t. After
+    contact a step's are not what the frame shows, which is the step as it was solved.
 
     history : q and the velocity [m/s] of one step before, of integrators that look so far back; None: start anew
     sides   : (o, l) by which faces of the obstacles nodes are in contact (environment); None: the nearest

@@ -73,7 +73,7 @@ class LoadSteps:
         self.reached, self.size, self.count = self.share, 2 * self.size, self.count + 1
 
     def halve(self, failure: StepFailed) -> None:
-        """Shorten the next step after a share that failed. Raises StepFailed where it was of the smallest, or one of very many."""
+        """Shorten the next step after a failure. Raises StepFailed after one of the smallest, or very many."""
         self.size, self.failures = 0.5 * (self.share - self.reached), self.failures + 1
         if self.size < SMALLEST or self.failures > MOST_FAILURES:
             raise StepFailed(f"{failure} (and failed with {2 * self.size:.1g} of the load)", failure.kind) from None
@@ -104,8 +104,8 @@ class LoadPath:
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
-        """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one with cells turned
-        inside out, which smaller steps may avoid."""
+        """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one
+        with cells turned inside out, which smaller steps may avoid."""
         share, q = steps.share, self.known[-1][1]
         fixed, time_step = self.stepper.lattice.pinned, self.time_step
         if len(self.known) > 1:  # obstacles move in the first load step alone
@@ -245,8 +245,8 @@ def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError for a body, or a part of one that no spring joins with the rest, that nothing holds, and where
-    no more than two nodes are held (collective)."""
+    """Raise InputError for a body, or a part of one that no spring joins with the rest, that
+    nothing holds, and where no more than two nodes are held (collective)."""
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     held = "held at a point or two, about which it turns"
     if bodies.free.any():

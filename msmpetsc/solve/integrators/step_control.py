@@ -1,14 +1,14 @@
 """How long the next step may be: a credit of error, which the motion earns and steps spend.
 
-A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that with their local
-errors, from a credit that grows as the motion does, and with time:
+A run whose motion is of size U may end with its trajectory off by ``error`` U. Steps pay for that
+with their local errors, from a credit that grows as the motion does, and with time:
 
     credit(t) = error / 2 (U(t) + 1/T integral_0^t U)
 
-A step may spend what it earns itself and a share of what was saved: what was saved in an even flight is there for the
-impact that ends it. Where nothing is left it may still spend a part of what each step could, were all as long as those
-so far: to keep one moment much better than all others takes more steps than it is worth. Steps are 2^level times as
-long as the scene's.
+A step may spend what it earns itself and a share of what was saved: what was saved in an even
+flight is there for the impact that ends it. Where nothing is left it may still spend a part of what
+each step could, were all as long as those so far: to keep one moment much better than all others
+takes more steps than it is worth. Steps are 2^level times as long as the scene's.
 """
 
 import math

@@ -112,8 +112,8 @@ class Verlet(Integrator):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """The step that ends at ``time``, and what the next one starts from (collective). Raises StepFailed.
 
-        Taken again with shorter substeps where its end shows that they were too long: a blow may stiffen a body, folds
-        may heat it.
+        Taken again with shorter substeps where its end shows that they were too long: a blow may
+        stiffen a body, folds may heat it.
         """
         start, self.end = time - self.time_step, time
         self.environment.begin_step(state.q, state.velocity(self.time_step), start)
@@ -170,9 +170,9 @@ class Verlet(Integrator):
         self._kick(time, 0.5 * duration, begin, time)
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
-        """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and its substeps are now
-        halved; they are doubled again for the next one where it gained next to nothing (collective). Where obstacles
-        push, what springs seem to gain may be theirs."""
+        """Whether a step from ``start`` (l, 3) [m] to elastic ``energy`` [J] gained too much, and
+        its substeps are now halved; they are doubled again for the next one where it gained next to
+        nothing (collective). Where obstacles push, what springs seem to gain may be theirs."""
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
         gain, kinetic = self.comm.allreduce(np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))]))
@@ -310,8 +310,8 @@ class HighestMode:
         self.fixed, self.squared = lattice.pinned[: lattice.owned], 0.0
 
     def hold(self, fixed: Mask) -> None:
-        """Set the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever the number of
-        ranks."""
+        """Set the ``fixed`` nodes (owned,) bool, and begin with something of every mode, whatever
+        the number of ranks."""
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))

@@ -16,8 +16,8 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 class Preconditioner:
     """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
 
-    It is this inner one that the options -pc_... set, for every preset: A is also what the true Hessian is
-    preconditioned with.
+    It is this inner one that the options -pc_... set, for every preset: A is also what the true
+    Hessian is preconditioned with.
 
     matrix  : A, m x m, then all three columns go in one call, which MUMPS solves at once; or A (x) I_3, 3m x 3m
     contact : what is added to its diagonal, if anything

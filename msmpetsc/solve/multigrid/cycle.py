@@ -1,5 +1,5 @@
-"""Multigrid cycle on a lattice's grids for the true Hessian, as a PCMG: levels, smoothers, coarse solve and cycle are
-set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
+"""Multigrid cycle on a lattice's grids for the true Hessian, as a PCMG: levels, smoothers, coarse
+solve and cycle are set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
 
 The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
 one has a preconditioner that is, too. The finest level is applied spring by spring in single precision, and smoothed

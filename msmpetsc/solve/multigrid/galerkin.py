@@ -37,8 +37,8 @@ def _weights() -> Rows:
 
 
 def _products(weights: Rows) -> tuple[Indices, Indices, Floats]:
-    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i + 1] of pairs and
-    their factors."""
+    """Of each of some weights (n, 8), w w^T where it is not zero: entry i's are begin[i] to begin[i
+    + 1] of pairs and their factors."""
     factors = weights[:, PAIRS[:, 0]] * weights[:, PAIRS[:, 1]]
     which, pair = np.nonzero(factors)
     begin = np.searchsorted(which, np.arange(len(weights) + 1)).astype(np.int32)
@@ -77,8 +77,8 @@ class GalerkinSum:
     apart  : (l,) how far its body is moved along the first axis, to have coarse cells of its own
     matrix : AIJ of block size 3; it has values after the first ``update``
 
-    On a CPU all cells add to the blocks of this rank's pairs of nodes; on a GPU each has blocks of its own, which PETSc
-    then adds.
+    On a CPU all cells add to the blocks of this rank's pairs of nodes; on a GPU each has blocks of
+    its own, which PETSc then adds.
     """
 
     def __init__(
@@ -131,8 +131,8 @@ class GalerkinSum:
         return matrix
 
     def update(self, q: Positions, contact: Rows) -> None:
-        """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]
-        (collective)."""
+        """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
+        [N/m] (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
         law, mass = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast
         add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
@@ -146,8 +146,8 @@ class GalerkinSum:
 
 
 def set_block_size(matrix: PETSc.Mat) -> None:
-    """Give a matrix of three rows a node this block size, its diagonal part, which pbjacobi inverts, too: PETSc makes
-    that of a matrix on several ranks without one."""
+    """Give a matrix of three rows a node this block size, its diagonal part, which pbjacobi
+    inverts, too: PETSc makes that of a matrix on several ranks without one."""
     matrix.setBlockSize(3)
     matrix.getDiagonalBlock().setBlockSize(3)
 

@@ -1,5 +1,5 @@
-"""The coarse grids of a lattice: every second node of its grid, then every second of those, and how values pass from
-one to the next.
+"""The coarse grids of a lattice: every second node of its grid, then every second of those, and how
+values pass from one to the next.
 
 A node of the finer grid at integer position i is interpolated trilinearly: along an axis it lies on the coarse node
 i / 2, or halfway between two. So all its weights are alike, 1 over the number of its parents: 1, 2, 4 or 8.
@@ -65,8 +65,8 @@ def coarse_grid(comm: MPI.Comm, ijk: Indices) -> CoarseGrid:
 def grids(comm: MPI.Comm, ijk: Indices, total: int, coarsest: int, count: int | None = None) -> list[CoarseGrid]:
     """Return the grids above nodes at grid indices (n, 3), of ``total`` on all ranks, the finest first (collective).
 
-    There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a coarser one would
-    not be much smaller.
+    There are ``count``, or so many that the last has ``coarsest`` nodes or less; but fewer where a
+    coarser one would not be much smaller.
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):

@@ -44,8 +44,8 @@ class Alarm(IntEnum):
 
 
 class SearchEffort(NamedTuple):
-    """block: directions of a long search; least: its iterations where it finds nothing; followed: iterations of a short
-    one, of two directions."""
+    """block: directions of a long search; least: its iterations where it finds nothing; followed:
+    iterations of a short one, of two directions."""
 
     block: int
     least: int
@@ -60,8 +60,8 @@ UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of its contacts with
-    itself included; whether a cell resists.
+    """Compression of a body: the greatest and the sum over free nodes of t^2 concavity / m, that of
+    its contacts with itself included; whether a cell resists.
     """
 
     greatest: float
@@ -172,9 +172,9 @@ class LowestCurvature:
         return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
-        """Search from something of each mode, for near a mode that is known a lower one comes up late, and without
-        rigid motions, for their curvature mostly is about 1, which would hide a lower one as long; then from the best
-        of all of them."""
+        """Search from something of each mode, for near a mode that is known a lower one comes up
+        late, and without rigid motions, for their curvature mostly is about 1, which would hide a
+        lower one as long; then from the best of all of them."""
         start = self._random(effort.block)
         if hint is not None:
             start[0] += self._unit(self.memory.read(hint)[None])[0]
@@ -195,8 +195,8 @@ class LowestCurvature:
         return self._unit(self._of_each(self.preconditioner.apply, like(self.functional.mass, random)))
 
     def _iterate(self, start: Rows, block: int, most: int, least: int) -> tuple[Floats, Rows]:
-        """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l, n), and theirs
-        (k, n)."""
+        """The lowest eigenvalues (k,), k <= block, that the iterations come to from directions (l,
+        n), and theirs (k, n)."""
         size, mass = min(block, len(start)), self.functional.mass
         values, (x, last) = self._ritz((start, self._of_each(self.hessian.mult, start)), size)
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
@@ -237,8 +237,8 @@ class LowestCurvature:
         return values[:size], (best, (moved / lengths, rest @ products[size:] / lengths))
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
-        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal in M; None if nodes
-        are held."""
+        """Translations and rotations of a free body at positions q (l, 3) [m], (6, n) orthonormal
+        in M; None if nodes are held."""
         if self.unknowns.total < self.functional.lattice.table.total:
             return None
         columns = q[self.unknowns.free].T

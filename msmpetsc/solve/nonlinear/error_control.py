@@ -1,8 +1,8 @@
 """Stopping rule of a step: the error that x is known to have, and how closely the next linear solve must be made.
 
-The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). |F(x)|_(M^-1) / |x - y|_M bounds it
-wherever E is convex between x and x*. Where the bound will do already, or no estimate can be had, the bound is the
-error.
+The error of x is |x - x*|_M / |x - y|_M, estimated (solve.nonlinear.estimate). |F(x)|_(M^-1) / |x -
+y|_M bounds it wherever E is convex between x and x*. Where the bound will do already, or no
+estimate can be had, the bound is the error.
 """
 
 from dataclasses import dataclass, replace
@@ -116,8 +116,8 @@ class ErrorControl:
         return min(max(SHARE * now.goal / missing, self.tightest), LOOSEST)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
-        """What is known where a step goes on from a point that is no minimum, or farther from one than it seemed; None
-        where there is no more to gain.
+        """What is known where a step goes on from a point that is no minimum, or farther from one
+        than it seemed; None where there is no more to gain.
 
         has_moved : the point was left; if not the goal becomes closer, until g has no digits left to tell by
         """

@@ -1,7 +1,7 @@
 """Functional that one implicit step minimises, its gradient, and norms of both.
 
-g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), for implicit Euler y = 2 q_n - q_(n-1) (paper Eq. 10-12);
-F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
+g(x) = 1/2 (x - y)^T M (x - y) + t^2 (E(x) - x^T f_ext), for implicit Euler y = 2 q_n - q_(n-1)
+(paper Eq. 10-12); F(x) = grad g(x) = M (x - y) + t^2 (grad E(x) - f_ext).
 """
 
 from dataclasses import dataclass

@@ -30,8 +30,8 @@ class Jacobian:
 
     diagonal : of A (m,), of this rank's free nodes [kg]
 
-    Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays, and for multigrid
-    of the Hessian where the operator is A (collective).
+    Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays,
+    and for multigrid of the Hessian where the operator is A (collective).
     """
 
     functional: StepFunctional

@@ -1,5 +1,5 @@
-"""Examination of where a step ended: at a minimum of g, as near to it as was said, or at a point where F is small and
-no more.
+"""Examination of where a step ended: at a minimum of g, as near to it as was said, or at a point
+where F is small and no more.
 
 The estimate of a step's error is the Newton correction e at x. Where a body is compressed g may have a fold or a saddle
 between x and x - e, or curve so much that e says little; so all is looked at once more at x - e, which is nearer.
@@ -98,8 +98,8 @@ class Minimum:
     def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
         """Estimate the error of x by both corrections, of which the first has the length ``first``.
 
-        Where the second cannot be had, as CG breaks down on an F of little but rounding, what bounds it has its place
-        if the curvature allows; else the error is infinite.
+        Where the second cannot be had, as CG breaks down on an F of little but rounding, what
+        bounds it has its place if the curvature allows; else the error is infinite.
         """
         functional, correction, relative = self.functional, self.estimate.correction, self.rounding.relative
         distance = functional.distance(nearer.q)

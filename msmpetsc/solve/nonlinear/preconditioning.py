@@ -199,8 +199,10 @@ class StepPreconditioner:
 
     @contextmanager
     def searching(self, q: Positions, contact: Contact | None) -> Iterator[None]:
-        """Switch to multigrid, built at positions q (l, 3) [m], for a long search, where it may choose and the body is large:
-        smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it."""
+        """Switch to multigrid, built at positions q (l, 3) [m], for a long search in a large body.
+
+        Smooth modes, which come last with Jacobi's, then come at once. Steps have no part in it.
+        """
         if self.is_chosen or not self.chooses or self.nodes < LARGE:
             yield
             return

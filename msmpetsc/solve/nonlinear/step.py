@@ -1,5 +1,5 @@
-"""One implicit step as one PETSc SNES, which solves F(x) = grad g(x) = 0; a method is a set of options
-(solve.presets)."""
+"""One implicit step as one PETSc SNES, which solves F(x) = grad g(x) = 0; a method is a set of
+options (solve.presets)."""
 
 import ctypes
 from collections.abc import Callable
@@ -214,9 +214,9 @@ class Stepper:
     def solve_once(self, outcome: Outcome) -> Outcome:
         """Bring F at x down to the goal of an outcome so far, by SNES (collective). Raises StepFailed.
 
-        Under compression the true Hessian may be indefinite. CG then stops with the descent it has, but
-        if its very first direction has negative curvature it climbs, as the line search says: the
-        projected Hessian takes over for some iterations (_linearise).
+        Under compression the true Hessian may be indefinite. CG then stops with the descent it has,
+        but if its very first direction has negative curvature it climbs, as the line search says:
+        the projected Hessian takes over for some iterations (_linearise).
         """
         self.outcome = outcome
         if self._is_solved():
@@ -293,8 +293,8 @@ class Stepper:
     def _objective(self, snes: PETSc.SNES, x: PETSc.Vec) -> float:
         """g(x) - g(base): a line search compares values, and their difference must keep its digits.
 
-        Close to the solution g falls by less than the rounding of x changes it: then any move is called
-        a fall, so that Newton's full step is taken.
+        Close to the solution g falls by less than the rounding of x changes it: then any move is
+        called a fall, so that Newton's full step is taken.
         """
         if self.preset.true_hessian and x.handle == snes.getSolution().handle:
             return 0.0  # the start of a line search, which is where it was linearised

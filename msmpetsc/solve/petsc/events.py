@@ -1,7 +1,7 @@
 """What -log_view shows of a run: events by what is done, and stages of the run.
 
-An event within another counts in both, as PETSc's own do: KSPSolve has the products that it makes. What is done at the
-levels of multigrid -pc_mg_log shows.
+An event within another counts in both, as PETSc's own do: KSPSolve has the products that it makes.
+What is done at the levels of multigrid -pc_mg_log shows.
 """
 
 from contextlib import ExitStack

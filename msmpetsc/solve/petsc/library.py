@@ -40,8 +40,8 @@ def dense_pointer(matrix: PETSc.Mat) -> int:
 
 
 def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
-    """View an operator that is only known by its products with all its entries, of one product a column
-    (MatComputeOperator) (collective)."""
+    """View an operator that is only known by its products with all its entries, of one product a
+    column (MatComputeOperator) (collective)."""
     library, matrix = petsc_library(), ctypes.c_void_p()
     _check(library.MatComputeOperator(ctypes.c_void_p(operator.handle), b"aij", ctypes.byref(matrix)))
     _check(library.MatView(matrix, ctypes.c_void_p(viewer.handle)))
@@ -49,8 +49,8 @@ def view_entries(operator: PETSc.Mat, viewer: PETSc.Viewer) -> None:
 
 
 def preallocate_coo(matrix: PETSc.Mat, rows: Indices, columns: Indices) -> None:
-    """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left out, those named
-    twice are added (MatSetPreallocationCOO) (collective)."""
+    """Say which entries ``set_values_coo`` will set, by global indices (n,); negative ones are left
+    out, those named twice are added (MatSetPreallocationCOO) (collective)."""
     index = [np.ascontiguousarray(i, PETSc.IntType) for i in (rows, columns)]
     count = ctypes.c_int64(len(rows))  # PetscCount
     _check(petsc_library().MatSetPreallocationCOO(ctypes.c_void_p(matrix.handle), count, *map(_address, index)))
@@ -112,8 +112,8 @@ def petsc_errors(
 ) -> Iterator[None]:
     """Make PETSc's errors in the block, or in the function decorated, an InputError ``what``: its last words.
 
-    ImportError is that of an object of type python whose context is not there. A solver that did not converge, where an
-    option made that an error, becomes StepFailed.
+    ImportError is that of an object of type python whose context is not there. A solver that did
+    not converge, where an option made that an error, becomes StepFailed.
 
     abandon : called after such an error
     further : more exceptions that come of options here

@@ -24,8 +24,8 @@ def refuse_unknowns(nodes: int) -> None:
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raises InputError where a rank has more nonzeros of a matrix than PETSc can count; ``own`` of this one
-    (collective)."""
+    """Raises InputError where a rank has more nonzeros of a matrix than PETSc can count; ``own`` of
+    this one (collective)."""
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
         raise InputError(

@@ -1,7 +1,7 @@
 """PETSc's vectors and matrices over the memory that a run's arrays are in: the CPU's, or that of a CUDA GPU.
 
-Both forms do the same: hand out the numbers of a vector as an array, without a copy, and make vectors and dense
-blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
+Both forms do the same: hand out the numbers of a vector as an array, without a copy, and make
+vectors and dense blocks over arrays of ours. Which one it is, ``memory_of`` an array tells.
 """
 
 import numpy as np

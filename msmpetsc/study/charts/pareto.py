@@ -108,8 +108,8 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
 def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
     """Return the front of measured rows, by rising error.
 
-    Errors that read alike, to two digits, count as equal: no step can better the trajectory error of its time step but
-    in the last digits, and those are no reason to pay more.
+    Errors that read alike, to two digits, count as equal: no step can better the trajectory error
+    of its time step but in the last digits, and those are no reason to pay more.
     """
     return rows.iloc[front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))]
 

@@ -1,13 +1,13 @@
 """The error of a discretisation from runs of several sizes: Richardson's extrapolation with the order that is seen.
 
-A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p and C (Roache 1994,
-the grid convergence index). Errors are fields: that of a coarse run is its distance d to a finer one, plus the finer
-one's error, as vectors at an angle,
+A size is the edge of a cell, or the time step. Where the error is e = C size^p, three runs tell p
+and C (Roache 1994, the grid convergence index). Errors are fields: that of a coarse run is its
+distance d to a finer one, plus the finer one's error, as vectors at an angle,
 
     e_a^2 = d^2 + e_b^2 + 2 c d e_b,        c its cosine.
 
-With c = 1, which is Roache's, all err to the same side, as time steps do. Lattices of unlike cells err by chance as
-well, each in its own way: distances of three of them tell c.
+With c = 1, which is Roache's, all err to the same side, as time steps do. Lattices of unlike cells
+err by chance as well, each in its own way: distances of three of them tell c.
 """
 
 import math

@@ -269,8 +269,8 @@ class Sizer:
     def _checked(self, model: CostModel, lattices: Sequence[SizeTrial]) -> tuple[SizePlan, CostModel]:
         """Choose, run the choice and measure it, until its error is little less than was asked for.
 
-        Each choice lies between the cells that met the error and those that did not, for errors go up and down from
-        lattice to lattice. Returns the model with what was learnt, too.
+        Each choice lies between the cells that met the error and those that did not, for errors go
+        up and down from lattice to lattice. Returns the model with what was learnt, too.
         """
         law, finest, met = model.law, lattices[-1], None
         fine = [(finest.edge, law.error(finest.edge))] if law.error(finest.edge) < AIM * self.target else []

@@ -5,6 +5,11 @@ import sys
 
 import bench
 
-if __name__ == "__main__":
+
+def main() -> int:
     sys.argv.insert(1, "--gpu")
-    sys.exit(bench.main())
+    return bench.main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -29,7 +29,11 @@ print(json.dumps({
     "version": ".".join(map(str, PETSc.Sys.getVersion())), "bits": 8 * numpy.dtype(PETSc.IntType).itemsize,
     "scalar": numpy.dtype(PETSc.ScalarType).name, **{name: has(name) for name in ("mumps", "hypre", "cuda")}}))
 """
-RANKS = "from mpi4py import MPI; print(MPI.COMM_WORLD.size, MPI.Get_library_version().splitlines()[0].strip(chr(0)))"
+RANKS = """
+from mpi4py import MPI
+if MPI.COMM_WORLD.rank == 0:  # two ranks' lines may come as one
+    print(MPI.COMM_WORLD.size, MPI.Get_library_version().splitlines()[0].strip(chr(0)))
+"""
 DEVICE = """
 import json, cupy
 print(json.dumps([cupy.cuda.runtime.getDeviceProperties(i)["name"].decode()

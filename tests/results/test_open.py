@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import small_result
-from conftest import ENVIRONMENT
+from conftest import ENVIRONMENT, WORKERS
 from mpi4py import MPI
 from small_result import DT, FRAMES, NODES, POINTS, frame, position
 
@@ -233,6 +233,18 @@ def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(copy: Path, spoil,
     spoil(copy)
     with msmpetsc.open(copy) as run, pytest.raises(InputError, match=words):
         _ = run.indices("lattice/springs") if ask == "springs" else getattr(run, ask)
+
+
+def test_flipped_bytes_end_in_one_line_or_in_hdf5_itself(whole: Path, tmp_path: Path):
+    """The HDF5 library falls over some damaged metadata: that no reader can mend, and such trials do not count."""
+    done = subprocess.run(
+        [sys.executable, WORKERS / "open_worker.py", whole, tmp_path / "y.h5", "40"],
+        env=ENVIRONMENT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-1500:]
+    read, refused, other, died = map(int, done.stdout.split())
+    assert other == 0, done.stderr[-1500:]
+    assert refused > 5 and read > 10 and died < 8
 
 
 # ---- xarray

@@ -129,7 +129,7 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     assert "type: pipecg" in done.stdout and "type: cg\n" not in done.stdout
     assert done.stdout.count("PETSc Performance Summary") == 1
     stages = [line.split(": ")[1] for line in done.stdout.splitlines() if line.startswith("--- Event Stage")]
-    assert {"Main Stage", "set-up", "steps", "output"} == set(stages)
+    assert {"Main Stage", "set-up", "steps", "output"} <= set(stages) and "Unknown" not in stages  # 3.22 lists all
 
 
 @pytest.mark.parametrize(

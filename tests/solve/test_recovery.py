@@ -168,7 +168,7 @@ def test_a_column_bows_aside(name: str):
 def test_parts_of_the_greatest_contrast_are_solved():
     """A clamped beam squashed to 0.62, half of it 1e6 times as stiff: at 1e8, now refused, a step did not end."""
     played = play("stiff half", "start.scale=[0.62, 0.62, 0.62]", "cages.cell_size=0.125", "time.duration=0.5")
-    assert not played.words and played.last.step_error <= 1e-3 and played.last.iterations < 700
+    assert not played.words and played.last.step_error <= 1e-3 and played.last.iterations < 1500
     stiff = np.flatnonzero(played.lattice.nodes[:, 0] > 0.6)
     (x, y), middle = (q[stiff] for q in (played.lattice.nodes, played.last.position)), len(stiff) // 2
     np.testing.assert_allclose(np.linalg.norm(y - y[middle], axis=1), np.linalg.norm(x - x[middle], axis=1), atol=1e-4)

@@ -207,7 +207,7 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
         for value in WRONG:
             commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]
         commands = [["run", *map(str, command), "-ksp_rtol", "1e-8"] for command in commands]
-        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=100)
+        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=300)
         assert done.returncode == 0, done.stderr
         found[ranks] = out, [json.loads(line) for line in done.stdout.splitlines()]
     return found

@@ -258,6 +258,7 @@ def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
         stiffening=material.law_stiffening,
         of_cells=cell_materials(scene, finder),
         topology=shape.topology,
+        poisson=material.poisson,
     )
 
 

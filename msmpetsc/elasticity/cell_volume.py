@@ -349,8 +349,8 @@ class CellScatter(Cells):
         """Return what adds (Hessian at q) v [N] to its second argument."""
         return partial(add_resistance_hessian, q.copy(), self.resisting(q), projected)
 
-    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add what Elasticity.add_bound says to ``blocks`` (l, 9) [N/m]."""
         add_resistance_bound(q, self.resisting(q), blocks)
 
 
@@ -386,8 +386,8 @@ class CellGather(Cells):
         """Return what adds (Hessian at q) v [N] to the owned rows of its second argument."""
         return partial(_cell_product_around, self.around.shape[1], q.copy(), *self._all, projected)
 
-    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _cell_bound_around(self.around.shape[1], q, *self._all, blocks)
 
     @property

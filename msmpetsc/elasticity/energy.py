@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array, Floats, Positions, Rows, on_host
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_host, to_host
 from msmpetsc.elasticity.cell_volume import CellGather, CellScatter, least_volumes
+from msmpetsc.elasticity.neo_hookean import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
+from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 
 ONSET = 0.5  # J_0: a cell's corner resists when it is pressed below this share of its volume at rest
@@ -25,6 +27,9 @@ HESSIAN = 20, 10
 PRODUCT = 23
 # edges and cofactors of a corner 36, its lack of volume 8, its slope 4; those few that resist have more, not counted
 CORNER = 48
+# of a neo-Hookean cell: the seven sums of 3 components 72, their slopes and modes 63, forces of the modes 54 and of the
+# corners 144, F and its cofactors 36, J 5, U' and U'' 11, P 27; of a product more by what F x G and cof F : G take
+SOLID_GRADIENT, SOLID_PRODUCT, SOLID_HESSIAN, SOLID_CHANGE = 412, 510, 196, 760
 LEAST_VOLUME = 155  # of a cell: twelve edges 36, eight corners' volumes 112, their minimum 7
 # of a node, all its coordinates: M (x - y) + t^2 (grad E - f), the inertia and work of a change, M v + t^2 p
 GRADIENT_ROW, CHANGE_ROW, PRODUCT_ROW = 15, 36, 9
@@ -43,6 +48,14 @@ class Flops:
     def of_lattice(cls, lattice: Lattice) -> "Flops":
         """Return those of a lattice, M included."""
         springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
+        if lattice.solid is not None:
+            around = len(lattice.local_cells)
+            return cls(
+                SOLID_GRADIENT * around + GRADIENT_ROW * owned,
+                SOLID_CHANGE * lattice.cells_owned + CHANGE_ROW * owned,
+                SOLID_HESSIAN * around,
+                SOLID_PRODUCT * around + PRODUCT_ROW * owned,
+            )
         cells = len(lattice.local_cells) if stiffens else 0
         gradient, change, hessian = (a + stiffens * b for a, b in (GRADIENT, CHANGE, HESSIAN))
         return cls(
@@ -56,24 +69,29 @@ class Flops:
 class Elasticity:
     """E of this rank's part of a lattice, its gradient and its Hessian.
 
-    It is that of Hooke's springs (elasticity.springs), or, where the law stiffens, of stiffening
-    ones and of cells that resist being turned inside out (elasticity.cell_volume).
+    It is that of a neo-Hookean solid (elasticity.neo_hookean), or of Hooke's springs (elasticity.springs), or, where
+    that law stiffens, of stiffening ones and of cells that resist being turned inside out (elasticity.cell_volume).
 
-    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are
-    right at the owned nodes. ``cells`` is None where they do not resist; ``flops`` are of one call.
+    Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
+    nodes. ``springs``, ``cells`` and ``solid`` are None where the law has none; ``flops`` are of one call.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.owned, self.flops = lattice.owned, Flops.of_lattice(lattice)
         on_cpu = on_host(lattice.nodes)
-        self.springs: SpringScatter | SpringGather = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
+        self.springs: SpringScatter | SpringGather | None = None
         self.cells: CellScatter | CellGather | None = None
+        if lattice.solid is not None and not on_cpu:
+            raise InputError('material.law = "neo-hookean" computes on the CPU: choose -mat_type aij')
+        self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
+        if self.solid is None:
+            self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:
             volume, resistance = lattice.cell_size**3, lattice.cell_stiffness * lattice.cell_size**2
             self.cells = (CellScatter if on_cpu else CellGather).of_lattice(
                 lattice, RESISTANCE * resistance, ONSET * volume
             )
-        self.parts = [part for part in (self.springs, self.cells) if part]
+        self.parts = [part for part in (self.solid, self.springs, self.cells) if part]
 
     def energy(self, q: Positions) -> float:
         """Return E [J] of what this rank owns."""
@@ -88,13 +106,27 @@ class Elasticity:
         for part in self.parts:
             part.add_gradient(q, gradient)
 
-    def concavity(self, q: Positions) -> Floats:
-        """Return the diagonal (owned,) [N/m] of a matrix: the springs' Hessian is no less than minus that.
+    @property
+    def corners(self) -> Indices:
+        """Corner nodes (c, 8) of the cells of the law that this rank owns, in its order; (0, 8) of springs alone."""
+        if self.solid:
+            return self.solid.corners
+        return np.empty((0, 8), np.int64) if self.cells is None else to_host(self.cells.owned.cells)
 
-        It is 0 at a node without compressed springs.
+    @property
+    def bound(self) -> float | None:
+        """By how much the projected Hessian may exceed D of ``add_bound``; None where that is to be measured."""
+        return None if self.solid else 2.0
+
+    def concavity(self, q: Positions) -> Floats:
+        """Return the diagonal (owned,) [N/m] of a matrix: the Hessian is no less than minus that where no cell resists.
+
+        It is 0 at a node without compressed springs, and where no cell around it is strained.
         """
         concavity = np.zeros(len(q), like=q)
-        self.springs.add_concavity(q, concavity)
+        law = self.solid or self.springs
+        assert law is not None
+        law.add_concavity(q, concavity)
         return concavity[: self.owned]
 
     def resists(self, q: Positions) -> bool:
@@ -111,15 +143,15 @@ class Elasticity:
         """
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
 
-    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add a block diagonal D, such that the projected Hessian at q is no more than 2 D, to the
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add a block diagonal D, such that the projected Hessian at q is no more than ``bound`` D, to the
         owned rows of ``blocks`` (l, 9) [N/m].
 
-        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its
-        diagonal, and four of a cell's corner, whose D is twice that.
+        A sum over n nodes is no more than n times its diagonal: two of a spring, whose D is its diagonal, four of a
+        cell's corner, whose D is twice that, and eight of a cell, where it is seldom so much.
         """
         for part in self.parts:
-            part.add_half_bound(q, blocks)
+            part.add_bound(q, blocks)
 
 
 @dataclass(frozen=True)

@@ -147,8 +147,8 @@ class SpringScatter:
         elastic_hessian(q, self.springs, projected, blocks)
         return partial(add_elastic_product, self.springs.ends, blocks)
 
-    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_half_bound says to ``blocks`` (l, 9) [N/m]."""
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add what Elasticity.add_bound says to ``blocks`` (l, 9) [N/m]."""
         add_elastic_diagonal(q, self.springs, blocks)
 
 
@@ -354,8 +354,8 @@ class SpringGather:
         """Return what adds (Hessian of E at q) v [N] to the owned rows of its second argument; it stores q alone."""
         return partial(_product_around, self.neighbour.shape[1], q.copy(), *self._all, projected)
 
-    def add_half_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add what Elasticity.add_half_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add what Elasticity.add_bound says to the owned rows of ``blocks`` (l, 9) [N/m]."""
         _diagonal_around(self.neighbour.shape[1], q, *self._all, blocks)
 
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, SortedKeys, log, together
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_shares
+from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, decode_morton, encode_morton, packed, unpacked
 from msmpetsc.geometry.interior import Slab, cells_of_gaps, enclosed_gaps
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
@@ -51,6 +51,7 @@ class Cages:
     kind  : (n_local,) uint8, BOUNDARY or INTERIOR
     share : (n_local, 2, 2, 2) of the cells' corners, LEAST_SHARE to 1 (geometry.fill_fractions) [-]; None where all
             are whole
+    squares : (n_local, 3) of what is inside them, from their middles (geometry.fill_fractions) [cells^5]; None as share
     fills : of each body, whether its boundary cells count by their fill
     """
 
@@ -58,7 +59,12 @@ class Cages:
     table: SortedKeys
     kind: Array
     share: Rows | None = None
+    squares: Rows | None = None
     fills: tuple[bool, ...] = (False,)
+
+    def squares_of(self, ijk: Indices) -> Rows | None:
+        """Return the squares (c, 3) of valid cells (c, 3) of any rank; None where all are whole (collective)."""
+        return None if self.squares is None else self.table.rows_of(encode_morton(ijk), self.squares)
 
     @property
     def ijk(self) -> Indices:
@@ -109,35 +115,52 @@ def fill(
     table = SortedKeys(comm, keys)
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
-    kind, share = np.concatenate([kind for _, kind, _ in parts]), None
-    fills = tuple(of_body is not None for _, _, of_body in parts)
+    kind = np.concatenate([kind for _, kind, _ in parts])
+    fills = tuple(inside is not None for _, _, inside in parts)
+    share = squares = None
     if any(fills):
-        whole = (np.ones((len(kind), 2, 2, 2)) for _, kind, _ in parts)
-        shares = [ones if of_body is None else of_body for ones, (_, _, of_body) in zip(whole, parts, strict=True)]
-        share = route.send(np.concatenate(shares))[order]
-    return Cages(grids, table, route.send(kind)[order], share, fills)
+        of_bodies = [_whole(len(kind)) if inside is None else inside for _, kind, inside in parts]
+        share, squares = (route.send(np.concatenate(rows))[order] for rows in zip(*of_bodies, strict=True))
+    return Cages(grids, table, route.send(kind)[order], share, squares, fills)
 
 
-def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Rows | None]:
-    """Return grid index (n, 3), kind (n,) and shares (n, 2, 2, 2) of this rank's cells of a body (collective)."""
+Inside = tuple[Rows, Rows]  # shares (n, 2, 2, 2) of cells' corners, and their squares (n, 3)
+
+
+def _whole(count: int) -> Inside:
+    """Return what is inside whole cells."""
+    return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
+
+
+def _cells_of(body: BodySurface, grid: Grid, cells: SlabCells, boundary: str) -> tuple[Indices, Array, Inside | None]:
+    """Return grid index (n, 3), kind (n,) and inside of this rank's cells of a body (collective)."""
     interior = cells_of_gaps(cells.gaps)
     ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
-    share = _share(body, grid, cells) if boundary == "fill" else None
-    return ijk, kind, None if share is None else np.concatenate([share, np.ones((len(interior), 2, 2, 2))])
+    cut = _inside(body, grid, cells) if boundary == "fill" else None
+    if cut is None:
+        return ijk, kind, None
+    share, squares = (np.concatenate(rows) for rows in zip(cut, _whole(len(interior)), strict=True))
+    return ijk, kind, (share, squares)
 
 
-def _share(body: BodySurface, grid: Grid, cells: SlabCells) -> Rows | None:
-    """Return the shares (b, 2, 2, 2) of boundary cells; None, with a warning, if the surface does not tell."""
+def _inside(body: BodySurface, grid: Grid, cells: SlabCells) -> Inside | None:
+    """Return what of boundary cells is inside; None, with a warning, if the surface does not tell.
+
+    A share that is raised to the least, or lowered to 1, is mass put into or taken out of that very corner, which then
+    counts in the squares, too.
+    """
     axes = np.argsort(_axes(body))
     if cells.columns is not None:
-        share = cells.columns.corner_shares(cells.boundary).transpose(0, *(1 + axes))
+        share, squares = cells.columns.inside(cells.boundary)
+        share, squares = share.transpose(0, *(1 + axes)), squares[:, axes]
     elif body.report.closed:
         log.warning('triangles are wound against each other, so boundary cells count whole: prepare = ["orient"]')
         return None
     else:
-        share = sampled_shares(body.comm.bcast(body.surface), grid, cells.boundary[:, axes])
-    return np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
+        share, squares = sampled_inside(body.comm.bcast(body.surface), grid, cells.boundary[:, axes])
+    counted = np.clip(np.where(share > WHOLE, 1.0, share), LEAST_SHARE, 1.0)
+    return counted, squares + (counted - share).mean(axis=(1, 2, 3))[:, None] / 4
 
 
 def slabs_of_all(

@@ -10,7 +10,8 @@ the ray, within the body and a cell, is a sum over the places z where it crosses
     sum_in sign S(z) + sum_above sign S(1),      sign = 1 where the ray leaves, -1 where it enters, S' = N(z), S(0) = 0.
 
 Over all rays that is an integral over pieces of triangles as seen along the ray: the divergence theorem for the body
-within the cell. Of an open surface it is counted in samples by the generalized winding number (Jacobson et al. 2013).
+within the cell. So are the squares, the integrals of x^2, y^2 and z^2 from the middle of the cell. Of an open
+surface they are counted in samples by the generalized winding number (Jacobson et al. 2013).
 
 All is in cell units, axes cycled as in geometry.cages. Rays run along the last axis, so a slab of
 the first has its columns whole.
@@ -30,6 +31,8 @@ SAMPLES = 6  # a side of a cell of an open surface: a plane through a cell is se
 OUTSIDE = 0.5  # a winding number below this
 LEAK = 1e-6  # windings left below a column: above rounding, far below what one triangle wound the wrong way leaves
 
+SEEN, SUMS = 6, 17  # sums of a piece: those that count for the cells below it too, and all
+
 # barycentric coordinates and weights that integrate polynomials of degree 4 over a triangle (Dunavant 1985)
 _ONE, _TWO = 0.445948490915965, 0.091576213509771
 POINTS = np.array([np.roll([1 - 2 * a, a, a], turn) for a in (_ONE, _TWO) for turn in range(3)])
@@ -42,11 +45,13 @@ class Columns:
 
     keys    : (c,) of the cells (grid.packed)
     corners : (c, 2, 2, 2) shares of their corners; what is inside twice counts twice
+    squares : (c, 3) integrals of x^2, y^2, z^2 over what is inside, from the middle of the cell: 1/12 in a whole one
     below   : (c, 2, 2) winding number below the cell, a mean over its base weighted by each corner's bilinear function
     """
 
     keys: Indices
     corners: Rows
+    squares: Rows
     below: Rows
 
     @classmethod
@@ -56,10 +61,14 @@ class Columns:
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
         keys, sums = _sums_of_keys(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
-        seen, lower, upper = np.moveaxis(sums.reshape(-1, 3, 2, 2), 1, 0)
-        below = _sums_above(keys // LIMIT, seen)
-        above = 0.5 * (below - seen)
-        return cls(keys, 8 * np.stack([lower + above, upper + above], axis=3), 4 * below)
+        at = _sums_above(keys // LIMIT, sums[:, :SEEN])
+        below, above = at[:, :4].reshape(-1, 2, 2), at - sums[:, :SEEN]
+        half = 0.5 * above[:, :4]
+        squares: Rows = sums[:, -3:].copy()
+        corners = 8 * np.stack([sums[:, SEEN : SEEN + 4] + half, sums[:, SEEN + 4 : SEEN + 8] + half], axis=2)
+        squares[:, :2] += above[:, 4:]
+        squares[:, 2] += above[:, :4].sum(axis=1) / 12
+        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), squares, 4 * below)
 
     @property
     def leak(self) -> float:
@@ -69,25 +78,31 @@ class Columns:
 
     def corner_shares(self, cells: Indices) -> Rows:
         """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3)."""
+        return self.inside(cells)[0]
+
+    def inside(self, cells: Indices) -> tuple[Rows, Rows]:
+        """Return the shares (k, 2, 2, 2) of the corners of any cells (k, 3), and their squares (k, 3)."""
         if len(self.keys) == 0:
-            return np.zeros((len(cells), 2, 2, 2))
+            return np.zeros((len(cells), 2, 2, 2)), np.zeros((len(cells), 3))
         keys = packed(cells)
         place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
         found = self.keys[place]
         is_above = (found >= keys) & (found // LIMIT == keys // LIMIT)
         uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
-        return np.where((found == keys)[:, None, None, None], self.corners[place], uncut[..., None])
+        is_cut = found == keys
+        share = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
+        return share, np.where(is_cut[:, None], self.squares[place], uncut.mean(axis=(1, 2))[:, None] / 12)
 
 
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
-    """Return the distinct keys (c,) in ascending order, and the sums (c, 12) of the rows (p, 12) of each."""
+    """Return the distinct keys (c,) in ascending order, and the sums (c, k) of the rows (p, k) of each."""
     distinct, place = np.unique(keys, return_inverse=True)
     return distinct, np.stack([np.bincount(place, rows, len(distinct)) for rows in values.T], axis=1)
 
 
 @numba.njit(cache=True)
 def _sums_above(column: Indices, values: Rows) -> Rows:
-    """Return for each row the sum of the values (c, 2, 2) from it to the end of its column, (c,) ascending."""
+    """Return for each row the sum of the values (c, k) from it to the end of its column, (c,) ascending."""
     sums = values.copy()
     for c in range(len(column) - 2, -1, -1):
         if column[c] == column[c + 1]:
@@ -99,10 +114,10 @@ def _sums_above(column: Indices, values: Rows) -> Rows:
 def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows]:
     """Cut triangles into cells.
 
-    returns : cell (p, 3) of each piece, and its sums (p, 12) of ``_add_sums``
+    returns : cell (p, 3) of each piece, and its sums (p, SUMS) of ``_add_sums``
     """
     cells = np.empty((4 * len(triangles) + 16, 3), np.int64)
-    values = np.empty((len(cells), 12))
+    values = np.empty((len(cells), SUMS))
     used = 0
     rooms = np.empty((4, 12, 3))
     work, across, along, piece = rooms[0], rooms[1], rooms[2], rooms[3]
@@ -136,10 +151,11 @@ def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tu
 
 @numba.njit(cache=True)
 def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> None:
-    """Add the integrals over a triangle of a cell, as seen along the last axis, to ``sums`` (12,).
+    """Add the integrals over a triangle of a cell, as seen along the last axis, to ``sums`` (SUMS,).
 
-    With z the height in the cell and N_ab the bilinear function of the edge at (a, b) of its base, they are of N_ab,
-    of N_ab S for the lower corner, S = z - z^2/2, and of N_ab S for the upper one, S = z^2/2; 2 a + b is the place.
+    With z the height in the cell and N_ab the bilinear function of the edge at (a, b) of its base, they are of N_ab and
+    of x^2 and y^2 from the middle; then of N_ab S for the lower corner, S = z - z^2/2, of N_ab S for the upper one,
+    S = z^2/2, and of the three squares' S; 2 a + b is the place among four.
     """
     area = 0.5 * ((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
     for s in range(len(WEIGHTS)):
@@ -150,18 +166,25 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
         for edge in range(4):
             part = area * WEIGHTS[s] * (x if edge >= 2 else 1.0 - x) * (y if edge % 2 else 1.0 - y)
             sums[edge] += part
-            sums[4 + edge] += part * (z - 0.5 * z * z)
-            sums[8 + edge] += part * 0.5 * z * z
+            sums[SEEN + edge] += part * (z - 0.5 * z * z)
+            sums[SEEN + 4 + edge] += part * 0.5 * z * z
+        part, x, y, up = area * WEIGHTS[s], x - 0.5, y - 0.5, z - 0.5
+        sums[4] += part * x * x
+        sums[5] += part * y * y
+        sums[SEEN + 8] += part * x * x * z
+        sums[SEEN + 9] += part * y * y * z
+        sums[SEEN + 10] += part * (up * up * up + 0.125) / 3
 
 
-def sampled_shares(surface: Surface, grid: Grid, cells: Indices) -> Rows:
-    """Return the shares (c, 2, 2, 2) of the corners of the grid's cells (c, 3), by samples in an open surface."""
+def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, Rows]:
+    """Return what ``Columns.inside`` does of the grid's cells (c, 3), by samples in an open surface."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     along = np.stack([1 - at, at]) / SAMPLES  # the two linear functions of an axis
     middles = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
-    shares, step = np.empty((len(cells), 2, 2, 2)), max(1, CHUNK // len(middles))
+    shares, squares, step = np.empty((len(cells), 2, 2, 2)), np.empty((len(cells), 3)), max(1, CHUNK // len(middles))
     for start in range(0, len(cells), step):
         points = grid.node_positions(cells[start : start + step, None, :] + middles).reshape(-1, 3)
         inside = is_inside(surface, points).reshape(-1, SAMPLES, SAMPLES, SAMPLES)
         shares[start : start + step] = 8 * np.einsum("cxyz,ax,by,dz->cabd", inside, along, along, along)
-    return shares
+        squares[start : start + step] = inside.reshape(len(inside), -1) @ (middles - 0.5) ** 2 / len(middles)
+    return shares, squares

@@ -18,12 +18,27 @@ from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.cell_fractions import CORNERS as CORNERS
 from msmpetsc.lattice.cell_fractions import shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.material import CellMaterial, calibrated_stiffness, edge_stiffness
+from msmpetsc.lattice.cell_moments import WHOLE, forms_of, laplacians
+from msmpetsc.lattice.material import CellMaterial, calibrated_stiffness, edge_stiffness, lame_constants
 
 # the index in a 3 x 3 x 3 block of nodes of corner b seen from corner a
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1) ** 2).sum(axis=1)
 NO_CELLS = np.empty((0, 8), np.int64)
+
+
+class SolidCells(NamedTuple):
+    """What a law of solids takes of each of a lattice's ``local_cells`` (elasticity.neo_hookean).
+
+    forms  : (d, 13) of strain within a cell (lattice.cell_moments)
+    volume : (d,) of what is inside the surface [m^3]
+    shear, lame : (d,) mu and lambda [Pa]
+    """
+
+    forms: Rows
+    volume: Floats
+    shear: Floats
+    lame: Floats
 
 
 @dataclass(frozen=True)
@@ -38,15 +53,16 @@ class Lattice:
     cell_kind   : (c,) geometry.cages' BOUNDARY or INTERIOR
     springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
                   lower-numbered end first, the others to the rank of their lower-numbered end
-    rest_length : (s,) [m]
-    stiffness   : (s,) [N/m]
+    rest_length : (s,) distance of their ends at rest [m]
+    stiffness   : (s,) [N/m]; with ``solid`` of springs of no rest length, whose L is that of the shear modulus
     pinned      : (l,) bool, nodes that do not move
     stiffening  : of the springs' law (elasticity.springs) [-]; 0 for Hooke's
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
-                  first ``cells_owned``; then, only where the law stiffens, of all others around the owned nodes
+                  first ``cells_owned``; then, only where the law is of cells too, of all others around the owned nodes
     cell_stiffness : (d,) [N/m] of an edge among cells of the same material as each of them
     cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
     first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
+    solid       : where the law is neo-Hookean; None where it is of springs
     """
 
     table: SortedKeys
@@ -67,6 +83,7 @@ class Lattice:
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
     cell_share: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
+    solid: SolidCells | None = None
 
     @property
     def owned(self) -> int:
@@ -104,6 +121,7 @@ def build_lattice(
     stiffening: float = 0.0,
     of_cells: Callable[[Indices], CellMaterial] | None = None,
     topology: "Topology | None" = None,
+    poisson: float | None = None,
 ) -> Lattice:
     """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
 
@@ -113,12 +131,23 @@ def build_lattice(
     stiffening    : of the springs' law (elasticity.springs) [-]
     of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (lattice.region)
     topology      : that of the cages, where it is known already
+    poisson       : Poisson's ratio of a neo-Hookean solid [-]; None for springs
     """
     h, net = cages.grids.cell_size, topology or topology_of(cages)
-    mass, of_spring, of_cell = _sums(net, h, density, stiffness or young_modulus, of_cells)
+    kept, cells_owned = _kept_cells(net.cells, len(net.octants), stiffening > 0 or poisson is not None)
+    solid = None
+    if poisson is None:
+        mass, of_spring, of_cell = _sums(net, h, density, stiffness or young_modulus, of_cells)
+    else:
+        assert young_modulus is not None
+        uniform = CellMaterial.uniform(len(net.cells), density, young_modulus, poisson)
+        made_of = of_cells(net.ijk[net.cells[:, 0]]) if of_cells else uniform
+        mass, of_spring, of_cell, solid = _solid(net, h, made_of)
+        solid = SolidCells(*(rows[kept] for rows in solid))
     if stiffness is None:
-        of_spring, of_cell = calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
-    kept, cells_owned = _kept_cells(net.cells, len(mass), stiffening)
+        if solid is None:
+            of_spring = calibrated_stiffness(of_spring, h, net.kind, net.sharing)
+        of_cell = edge_stiffness(of_cell, h)
     return Lattice(
         table=net.table,
         cell_size=h,
@@ -138,6 +167,7 @@ def build_lattice(
         cells_owned=cells_owned,
         cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
         first_of_body=_first_of_body(cages, net.ijk[: len(mass)]),
+        solid=solid,
     )
 
 
@@ -156,6 +186,7 @@ class Topology(NamedTuple):
     octants : (owned, 8) bool, which of the 8 cells around each owned node are valid
     cells   : (c, 8) local corner nodes of all cells around the owned nodes
     share   : (c, 8) of the corners of these cells; None where all are whole
+    squares : (c, 3) of what is inside of them (geometry.fill_fractions); None where all are whole
     kind    : (s,) of the springs, their squared lengths in cells
     sharing : (s,) number of cells that share each spring
     """
@@ -167,6 +198,7 @@ class Topology(NamedTuple):
     ghosts: Indices
     cells: Indices
     share: Rows | None
+    squares: Rows | None
     springs: Indices
     springs_owned: int
     kind: Indices
@@ -183,8 +215,9 @@ def topology_of(cages: Cages) -> Topology:
     ghosts = table.find(encode_morton(ijk[owned:]))
     share = cages.share_of(ijk[cells[:, 0]])
     share = None if share is None else share[:, *CORNERS.T]
+    squares = cages.squares_of(ijk[cells[:, 0]])
     numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    return Topology(table, corners, ijk, octants, ghosts, cells, share, *_springs(cells, numbers, owned))
+    return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *_springs(cells, numbers, owned))
 
 
 def _sums(
@@ -198,10 +231,7 @@ def _sums(
     if of_cells is None and net.share is None:
         return density * h**3 / 8 * net.octants.sum(axis=1), given, given
     owned, cells = len(net.octants), len(net.cells)
-    if of_cells is None:
-        made_of = CellMaterial(np.full(cells, density), np.full(cells, given))
-    else:
-        made_of = of_cells(net.ijk[net.cells[:, 0]])
+    made_of = of_cells(net.ijk[net.cells[:, 0]]) if of_cells else CellMaterial.uniform(cells, density, given)
     share = np.ones((cells, 8)) if net.share is None else net.share
     of_pairs = shares_of_pairs(share)
     of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
@@ -210,13 +240,35 @@ def _sums(
     return mass, of_spring, share.mean(axis=1) * made_of.spring
 
 
-def _kept_cells(local_cells: Indices, owned: int, stiffening: float) -> tuple[Indices, int]:
+def _solid(net: Topology, h: float, made_of: CellMaterial) -> tuple[Floats, Floats, Floats, SolidCells]:
+    """Return the mass (owned,) [kg], the springs (s,) [N/m] of the constant L, Young's modulus of cells by what is
+    inside (c,) [Pa], and the cells (lattice.cell_moments).
+
+    As with springs each corner's mass goes as the diagonal of L.
+    """
+    owned, count = len(net.octants), len(net.cells)
+    shear, lame = lame_constants(made_of.spring, made_of.poisson)
+    if net.share is None or net.squares is None:
+        forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
+        pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
+    else:
+        forms, volume = forms_of(net.share, net.squares), net.share.mean(axis=1)
+        pairs = laplacians(forms, volume)
+    diagonal = np.diagonal(pairs, axis1=1, axis2=2)
+    of_corners: Rows = (h**3 * made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
+    mass: Floats = np.bincount(net.cells.ravel(), of_corners.ravel().astype(float), owned)[:owned]
+    of_spring = _sums_of_springs(net.cells, -h * shear, pairs, net.ijk, net.springs, owned)
+    inside: Floats = volume * made_of.spring
+    return mass, of_spring, inside, SolidCells(forms, h**3 * volume, shear, lame)
+
+
+def _kept_cells(local_cells: Indices, owned: int, all_around: bool) -> tuple[Indices, int]:
     """Return which cells a lattice keeps, those of this rank first, and how many these are.
 
-    The others, of which an owned node is a corner, matter only where the law stiffens.
+    The others, of which an owned node is a corner, matter only where the law is of cells too.
     """
     first_owned = local_cells[:, 0] < owned
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & (stiffening > 0))])
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & all_around)])
     return kept, int(first_owned.sum())
 
 

@@ -1,4 +1,4 @@
-"""From a material to springs: how stiff the three kinds of spring of a cubic lattice are.
+"""From a material to a law's constants: Lame's, or how stiff the three kinds of spring of a cubic lattice are.
 
 Central forces between the corners of cubes give Poisson's ratio 1/4 whatever the stiffness.
 """
@@ -24,10 +24,17 @@ class CellMaterial:
 
     density : (c,) [kg/m^3]
     spring  : (c,) Young's modulus [Pa], or stiffness [N/m] where the material gives that
+    poisson : (c,) Poisson's ratio [-], which springs have no use for
     """
 
     density: Floats
     spring: Floats
+    poisson: Floats
+
+    @classmethod
+    def uniform(cls, count: int, density: float, spring: float, poisson: float = 0.25) -> "CellMaterial":
+        """Return that of cells that are all alike."""
+        return cls(np.full(count, density), np.full(count, spring), np.full(count, poisson))
 
 
 def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices) -> Floats:
@@ -42,6 +49,12 @@ def calibrated_stiffness(young_modulus: float | Floats, cell_size: float, kind: 
     """
     stiffness: Floats = edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
     return stiffness
+
+
+def lame_constants(young_modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
+    """Return mu and lambda [Pa] by Young's modulus [Pa] and Poisson's ratio, below 1/2."""
+    shear = young_modulus / (2 * (1 + poisson))
+    return shear, 2 * shear * poisson / (1 - 2 * poisson)
 
 
 def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | Floats:

@@ -20,7 +20,7 @@ from msmpetsc.lattice.cell_fractions import CORNERS
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.scene.bodies import OfBody
-from msmpetsc.scene.body import Material, Region
+from msmpetsc.scene.body import Material, OwnMaterial, Region
 from msmpetsc.scene.reading import Scene
 
 
@@ -165,18 +165,25 @@ def cell_materials(scene: Scene, finder: Finder) -> Callable[[Indices], CellMate
     if not parts and not any(bodies):
         return None
     (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)
-    density, stiffness = (
-        np.array([getattr(own, name, None) or getattr(material, name) for own in bodies or [None]])
-        for name in ("density", spring)
+    density, stiffness, poisson = (
+        np.array([_own(own, material, name) for own in bodies or [None]])
+        for name in ("density", spring, "poisson_ratio")
     )
 
     def of_cells(ijk: Indices) -> CellMaterial:
         body = finder.cages.grids.body_of(ijk)
-        cells = CellMaterial(density[body], stiffness[body])
+        cells = CellMaterial(density[body], stiffness[body], poisson[body])
         for part in parts:
-            where = finder.find_cells(part, ijk)
-            cells.density[where] = part.table.density or cells.density[where]
-            cells.spring[where] = getattr(part.table, spring) or cells.spring[where]
+            where, own = finder.find_cells(part, ijk), part.table
+            for values, name in ((cells.density, "density"), (cells.spring, spring), (cells.poisson, "poisson_ratio")):
+                if getattr(own, name) is not None:
+                    values[where] = getattr(own, name)
         return cells
 
     return of_cells
+
+
+def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
+    """Return a number of a body's own material; the scene's where it gives none."""
+    value = None if own is None else getattr(own, name)
+    return getattr(material, name) if value is None else value

@@ -64,6 +64,9 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
             if getattr(other, name) is not None and getattr(scene.material, name) is None:
                 words = f"may give {name} only where material does, as {key} does"
                 yield key.partition(".")[0], rule(words, "material")
+        if other.poisson_ratio is not None and scene.material.poisson is None:
+            words = f'may give poisson_ratio only where material.law = "neo-hookean", as {key} does'
+            yield key.partition(".")[0], rule(words, "material")
     for name in (*Material.one_of, "density"):
         values = {key: value for key, table in others.items() if (value := getattr(table, name)) is not None}
         given = [*values.values(), *filter(None, [getattr(scene.material, name)])]

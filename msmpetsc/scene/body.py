@@ -21,6 +21,9 @@ from msmpetsc.scene.values import (
 )
 
 DEFAULT_STIFFENING = 10.0
+SOLID = "neo-hookean"
+
+PoissonRatio = Annotated[float, Field(ge=0, le=0.4999)]
 
 
 class Rotate(Table):
@@ -92,10 +95,13 @@ class Material(Table):
     """Material of the lattice."""
 
     one_of = ("young_modulus", "stiffness")
-    young_modulus: Positive | None = Field(None, description="Young's modulus; Poisson's ratio is 1/4 [Pa]")
+    young_modulus: Positive | None = Field(None, description="Young's modulus [Pa]")
     stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
     density: Positive = Field(description="mass density [kg/m^3]")
-    law: Literal["linear", "stiffening"] = Field("linear", description="how a spring pulls at large strain")
+    law: Literal["neo-hookean", "linear", "stiffening"] = Field(
+        "linear", description="a solid's, or how springs pull at large strain, whose Poisson's ratio is 1/4"
+    )
+    poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
     stiffening: Positive | None = Field(
         None, description='b of law = "stiffening", a pull of k r (s + b s^3) at strain s; 10 if absent [-]'
     )
@@ -105,11 +111,23 @@ class Material(Table):
     )
 
     _has_a_use = field_validator("stiffening")(only_for("law", "stiffening"))
+    _is_of_solids = field_validator("poisson_ratio")(only_for("law", "neo-hookean"))
+
+    @model_validator(mode="after")
+    def _solids_have_no_springs(self) -> Self:
+        if self.law == SOLID and self.stiffness is not None:
+            raise rule('is of springs; law = "neo-hookean" takes young_modulus', "stiffness")
+        return self
 
     @property
     def law_stiffening(self) -> float:
         """b of the springs' law, 0 for Hooke's."""
-        return 0.0 if self.law == "linear" else self.stiffening or DEFAULT_STIFFENING
+        return self.stiffening or DEFAULT_STIFFENING if self.law == "stiffening" else 0.0
+
+    @property
+    def poisson(self) -> float | None:
+        """Poisson's ratio of a solid; None of springs."""
+        return self.poisson_ratio if self.law == SOLID else None
 
 
 class Sphere(Table):
@@ -155,14 +173,15 @@ class OwnMaterial(Table):
 
     density: Positive | None = Field(None, description="mass density; the material's if absent [kg/m^3]")
     young_modulus: Positive | None = Field(None, description="Young's modulus; the material's if absent [Pa]")
+    poisson_ratio: PoissonRatio | None = Field(None, description="Poisson's ratio; the material's if absent [-]")
     stiffness: Positive | None = Field(
         None, description="of springs; one between cells of several parts has the mean of its cells' [N/m]"
     )
 
     @model_validator(mode="after")
     def _says_something(self) -> Self:
-        if self.density is None and self.young_modulus is None and self.stiffness is None:
-            raise rule("needs density, young_modulus or stiffness")
+        if all(each is None for each in (self.density, self.young_modulus, self.poisson_ratio, self.stiffness)):
+            raise rule("needs density, young_modulus, poisson_ratio or stiffness")
         return self
 
 

@@ -39,8 +39,8 @@ WORDS = {  # pydantic's error types: {gt} and the like are its own figures
     "rule": "{words}, got {got}",
     "one_of": "must give exactly one of {names}; has {given}",
 }
-POISSON = "Poisson's ratio is 1/4, for the springs' forces are central"
-NO_KEYS = {name: POISSON for name in ("poisson_ratio", "poissons_ratio", "poisson", "nu")}
+POISSON = 'poisson_ratio, with material.law = "neo-hookean"; that of springs is 1/4'
+NO_KEYS = {name: POISSON for name in ("poissons_ratio", "poisson", "nu")}
 EXAMPLES = {"gravity": "acceleration = [0, 0, -9.81]"}  # of tables that are taken for numbers
 
 

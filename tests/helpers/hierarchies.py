@@ -89,8 +89,10 @@ def build(
     contrast: float = 1.0,
     stiffening: float = 0.0,
     pins: bool = False,
+    poisson: float | None = None,
 ) -> Lattice:
-    """contrast : the cells beyond the middle of x are so many times stiffer; pins: the lowest nodes of x are held."""
+    """contrast : the cells beyond the middle of x are so many times stiffer; pins: the lowest nodes of x are held;
+    poisson : of a solid."""
     grid = Grid(ORIGIN, CELL, cells.max(axis=0) + 1)
     mine = encode_morton(cells)[comm.rank :: comm.size]
     table = SortedKeys(comm, mine)
@@ -98,9 +100,11 @@ def build(
     middle = cells[:, 0].mean()
 
     def of_cells(ijk: np.ndarray) -> CellMaterial:
-        return CellMaterial(np.full(len(ijk), density), np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
+        uniform = CellMaterial.uniform(len(ijk), density, young, poisson or 0.25)
+        return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
 
-    lattice = build_lattice(cages, density, young, stiffening=stiffening, of_cells=of_cells if contrast != 1 else None)
+    more = {"stiffening": stiffening, "poisson": poisson}
+    lattice = build_lattice(cages, density, young, of_cells=of_cells if contrast != 1 else None, **more)
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
 

@@ -175,7 +175,7 @@ MISTAKES = [
     (
         "density = 1000",
         "density = 1000\npoisson_ratio = 0.3",
-        "material.poisson_ratio: unknown key: Poisson's ratio is 1/4, for the springs' forces are central (line 15)",
+        'material.poisson_ratio: is for law = "neo-hookean" only, got 0.3 (line 15)',
     ),
     ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
     ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),

@@ -2,8 +2,8 @@
 solve and cycle are set by PETSc's options (-pc_mg_..., -mg_levels_..., -mg_coarse_...).
 
 The hierarchy is that of the projected Hessian H, which is positive definite at any positions, so that CG on the true
-one has a preconditioner that is, too. The finest level is applied spring by spring in single precision, and smoothed
-with a block diagonal D, of which H is no more than twice. The first coarse one is summed spring by spring
+one has a preconditioner that is, too. The finest level is applied spring by spring or cell by cell in single precision,
+and smoothed with a block diagonal D. The first coarse one is summed spring by spring or cell by cell
 (solve.multigrid.galerkin), those below are products P^T H P of PETSc's.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions, Rows, to_host
+from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.errors import InputError
@@ -31,8 +31,8 @@ from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev, square_
 
 COARSEST = 800  # nodes of the grid whose matrix is factored: thin limbs vanish on a coarser one
 LEAST = 0.25  # of the greatest eigenvalue of D^-1 H: where a smoother's range begins
-FINEST = 2.0  # that eigenvalue on the finest level, at most (elasticity.add_half_bound); thrice for D's own diagonal
-SAFETY = 1.1  # times it on a coarser level, as some iterations of CG know it
+DIAGONAL = 3.0  # times that eigenvalue where only the diagonal of D is taken
+SAFETY = 1.1  # times it where no bound is known, as some iterations of CG know it
 ITERATIONS = 10  # of these
 BLOCK = 15  # operations of a product with a 3 x 3 block
 
@@ -66,7 +66,8 @@ class Multigrid:
             self.owned.close()
             raise
         smoother = PETSc.Options(prefix).getString("mg_levels_pc_type", "")
-        self.bounds = [FINEST * (3 if smoother == PETSc.PC.Type.JACOBI else 1)] + [0.0] * (len(self.levels) - 1)
+        self.widened = DIAGONAL if smoother == PETSc.PC.Type.JACOBI else 1.0
+        self.bounds = [0.0] * len(self.levels)
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
 
@@ -104,12 +105,22 @@ class Multigrid:
         is_new = self.pc.getType() is None
         if is_new:
             self._create_cycle()
+        self.bounds[0] = self.widened * self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
-            self.bounds[i] = SAFETY * greatest_eigenvalue(level)
+            noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
+            self.bounds[i] = SAFETY * greatest_eigenvalue(level.matrix, noise)
         for i, bound in enumerate(self.bounds):
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), LEAST * bound, bound)
         if is_new:
             self._read_options()
+
+    def _finest_bound(self) -> float:
+        """Greatest eigenvalue of D^-1 H on the finest level, at most, or as some iterations of CG know it."""
+        bound, unknowns = self.fine.elasticity.bound, self.unknowns
+        if bound is not None:
+            return bound
+        noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
+        return SAFETY * greatest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """P^T H P, its diagonal raised as that of the first one is."""
@@ -174,15 +185,20 @@ class Multigrid:
         self.owned.close()
 
 
-def greatest_eigenvalue(level: Level) -> float:
-    """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective)."""
-    x, b = level.matrix.createVecs()
-    first = level.grid.table.first
-    b.array[:] = uniform(first + np.arange(len(level.grid.table.keys))).ravel() - 0.5
-    ksp = PETSc.KSP().create(level.matrix.comm)
+def greatest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: "DiagonalBlocks | None" = None) -> float:
+    """Return about the greatest eigenvalue of D^-1 H of a level, D its 3 x 3 diagonal blocks (collective).
+
+    noise  : (n,) of this rank, from 0 to 1
+    blocks : D^-1 where H is not assembled
+    """
+    x, b = matrix.createVecs()
+    b.array[:] = noise - 0.5
+    ksp = PETSc.KSP().create(matrix.comm)
     ksp.setType(PETSc.KSP.Type.CG)
-    ksp.setOperators(level.matrix)
-    ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
+    ksp.setOperators(matrix)
+    ksp.getPC().setType(PETSc.PC.Type.PYTHON if blocks else PETSc.PC.Type.PBJACOBI)
+    if blocks:
+        ksp.getPC().setPythonContext(blocks)
     ksp.setComputeEigenvalues(True)
     ksp.setTolerances(max_it=ITERATIONS, rtol=np.finfo(float).eps)
     ksp.solve(b, x)
@@ -213,19 +229,19 @@ class ProjectedHessian(Viewable):
     def update(self, q: Positions, contact: Rows) -> None:
         """Take the Hessian at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes [N/m]."""
         self.elastic, self.q, self.contact = self.elasticity.hessian_at(q, projected=True, dtype=np.float32), q, contact
-        unknowns, blocks = self.unknowns, self._half_bound()
+        unknowns, blocks = self.unknowns, self._bound()
         invert_blocks(unknowns.size, blocks, unknowns.free, unknowns.ballast, contact, self.t2, self.inverse)
 
     def getDiagonal(self, _: PETSc.Mat, diagonal: PETSc.Vec) -> None:
         """Write that of D, for -mg_levels_pc_type jacobi."""
-        unknowns, (blocks, contact) = self.unknowns, (self._half_bound(), self.contact)
+        unknowns, (blocks, contact) = self.unknowns, (self._bound(), self.contact)
         acting = blocks[unknowns.free] + (contact[unknowns.free] if len(contact) else 0)
         own = unknowns.ballast[unknowns.free] + self.t2 * acting[:, [0, 4, 8]].T
         unknowns.columns_to_write(diagonal)[:] = own
 
-    def _half_bound(self) -> Rows:
+    def _bound(self) -> Rows:
         blocks = np.zeros((len(self.q), 9), like=self.q)
-        self.elasticity.add_half_bound(self.q, blocks)
+        self.elasticity.add_bound(self.q, blocks)
         return blocks
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:

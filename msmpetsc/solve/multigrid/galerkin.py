@@ -2,8 +2,9 @@
 
 Each spring lies within one coarse cell of 2 x 2 x 2 cells. With w_a the weights (8,) of a cell's corners at the end a,
 zero where that is held, a spring of block B adds (w_a - w_b)(w_a - w_b)^T (x) t^2 B to the matrix (24 x 24) of its
-cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C); and the corner of a cell that resists
-being turned inside out, t^2 times its curvature times G G^T, G the slopes of its volume at the cell's corners.
+cell; a node of mass m with the block C of contact adds w w^T (x) (m I + t^2 C); the corner of a cell that resists
+being turned inside out, t^2 times its curvature times G G^T, G the slopes of its volume at the cell's corners; and a
+cell of a solid its Hessian, whose strains are taken of the coarse cell's corners (elasticity.neo_hookean).
 """
 
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, lik
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_volume import FRAMES, cofactors, corner_curvature, edges, vector_of
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.neo_hookean import add_coarse
 from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.geometry.grid import decode_morton, encode_morton
 from msmpetsc.lattice.lattice import CORNERS
@@ -134,10 +136,13 @@ class GalerkinSum:
         """Sum the matrix at positions q (l, 3) [m]; ``contact`` (owned, 9), or (0, 9), of the nodes
         [N/m] (collective)."""
         symmetric, count = np.zeros((self.blocks, 6), like=q), len(self.places)
-        law, mass = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast
-        add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
+        law, mass, solid = (*self.law, self.unknowns.lattice.stiffening), self.unknowns.ballast, self.elasticity.solid
+        if solid is None:
+            add_springs(count, q, *self.springs, *law, self.t2, *self.of_springs, self.places, symmetric)
         add_nodes(count, *self.nodes, mass, contact, self.t2, *self.of_nodes, self.places, symmetric)
         values = symmetric[:, self.full]
+        if solid:
+            add_coarse(*self.cells, solid.blocks, solid.state(q, True), self.t2, self.weights, self.places, values)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)
@@ -155,13 +160,12 @@ def set_block_size(matrix: PETSc.Mat) -> None:
 def _by_cell(
     unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, apart: Indices
 ) -> tuple[Indices, ByCell, ByCell, ByCell]:
-    """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and resisting cells."""
+    """Keys of the coarse cells that anything of this rank lies in; its springs, free nodes and cells."""
     lattice = unknowns.lattice
     held, free = to_host(lattice.pinned), to_host(unknowns.free)
-    springs = to_host(lattice.springs)[: lattice.springs_owned]
+    springs = to_host(lattice.springs)[: lattice.springs_owned if elasticity.springs else 0]
     moving = np.flatnonzero(~held[springs].all(axis=1))
-    cells = elasticity.cells
-    corners = np.empty((0, 8), np.int64) if cells is None else to_host(cells.owned.cells)
+    corners = elasticity.corners
     ends = [springs[moving], free[:, None], corners]
     low = [ijk[nodes].min(axis=1) // 2 for nodes in ends]
     along = [apart[nodes].max(axis=1) // 2 for nodes in ends]  # what is held is moved with what it holds

@@ -4,6 +4,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -89,9 +90,12 @@ class Jacobian:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None
 
     def _stiffness_ratio(self) -> float:
-        """Return the greatest t^2 k / m of a free node (collective)."""
-        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
-        return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
+        """Return the greatest t^2 k / m of a free node, k the trace of the Hessian's block at rest (collective)."""
+        lattice, free, t2 = self.unknowns.lattice, self.unknowns.free, self.functional.time_step**2
+        blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
+        self.functional.elasticity.add_bound(lattice.nodes, blocks)
+        stiffness = blocks[free][:, [0, 4, 8]].sum(axis=1)
+        return self.comm.allreduce(greatest(t2 * stiffness / lattice.mass[free]), MPI.MAX)
 
     def linearise(
         self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False

@@ -15,6 +15,8 @@ CASES = {  # lattice, shape, contact, more
     "in two pieces": ("two bodies in one coarse cell", "crushed", True, {"stiffening": 2.0}),
     "many": ("many bodies", "twisted", True, {}),
     "thin": ("thin sheet", "twisted", False, {"pins": True}),
+    "solid": ("block that begins at odd indices", "twisted", True, {"poisson": 0.45, "pins": True}),
+    "solid, crushed, of two materials": ("limbs", "crushed", False, {"poisson": 0.49, "contrast": 1e3}),
 }
 
 

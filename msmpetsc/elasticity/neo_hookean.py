@@ -1,0 +1,481 @@
+"""Neo-Hookean solid, cell by cell: a constant Laplacian of positions, and one volume energy for each cell.
+
+With mu and lambda of a cell, V of it inside the surface, F the mean deformation gradient over that and J = det F,
+
+    E = 1/2 mu (integral of |grad x|^2 - 3 V) + V U(J),     U(J) = -mu ln J + lambda/2 (J - 1)^2
+
+above J_0, below it the Taylor polynomial of second order there (Bonet and Wood 2008, Eq. 6.27; Smith, de Goes and Kim
+2018 on why the logarithm stays). The first part is that of springs of no rest length, so that A = M + t^2 L is the
+paper's matrix; the integral is that of lattice.cell_moments. U'' > 0 everywhere: a cell that is turned inside out is
+pushed back. At rest the second variation is  2 mu |sym G|^2 + lambda (tr G)^2 >= 0  of the mean slope G of a
+displacement, and what the modes add is not negative: semidefinite whatever part of a cell is inside.
+
+The Hessian of a cell is, on G,  V (mu G + U'' (cof F : G) cof F + U' F x G),  with F x G the change of cof F. In the
+singular values s of F it has the 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu], and one of 3 x 3 that is not negative where
+U' < 0 and J >= 1/2: with y_i = x_i / s_i it is sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2. Elsewhere
+what U' takes from it is no more than |U'| R |F|, R^2 = 4/3: the traceless matrix of s has the norm sqrt(2) |F|. Where
+U' is cut to what mu bears, the product is semidefinite: the projected Hessian.
+
+Whole cells of one material share their constants; a Hessian keeps F, U' and U'' of each cell (elasticity.cell_lanes).
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numba
+import numpy as np
+
+from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.elasticity.cell_lanes import (
+    AT_STATE,
+    BY_AXIS,
+    CONSTANTS,
+    FAST,
+    LANES,
+    STATE,
+    WORK,
+    Blocks,
+    corner_strain,
+    gather,
+    in_blocks,
+    load,
+    modes_forces,
+    scatter,
+    shared,
+    strain,
+    write_forces,
+)
+from msmpetsc.elasticity.springs import Product
+from msmpetsc.lattice.lattice import Lattice
+
+ONSET = 0.2  # J_0: below it U is a parabola
+CONVEX = 0.5  # J from which on compression takes nothing from the 3 x 3 block
+NORM = math.sqrt(4 / 3)  # R
+
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@numba.njit(cache=True, inline="always")
+def _cofactors(f: Nine) -> Nine:
+    """Return cof F by rows."""
+    return (
+        f[4] * f[8] - f[5] * f[7],
+        f[5] * f[6] - f[3] * f[8],
+        f[3] * f[7] - f[4] * f[6],
+        f[2] * f[7] - f[1] * f[8],
+        f[0] * f[8] - f[2] * f[6],
+        f[1] * f[6] - f[0] * f[7],
+        f[1] * f[5] - f[2] * f[4],
+        f[2] * f[3] - f[0] * f[5],
+        f[0] * f[4] - f[1] * f[3],
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def _inner(a: Nine, b: Nine) -> float:
+    rows = a[0] * b[0] + a[1] * b[1] + a[2] * b[2], a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+    return rows[0] + rows[1] + (a[6] * b[6] + a[7] * b[7] + a[8] * b[8])
+
+
+@numba.njit(cache=True, inline="always")
+def _change_of_cofactors(f: Nine, g: Nine) -> Nine:
+    """Return F x G: by how much cof F changes along G."""
+    return (
+        f[4] * g[8] + g[4] * f[8] - f[5] * g[7] - g[5] * f[7],
+        f[5] * g[6] + g[5] * f[6] - f[3] * g[8] - g[3] * f[8],
+        f[3] * g[7] + g[3] * f[7] - f[4] * g[6] - g[4] * f[6],
+        f[2] * g[7] + g[2] * f[7] - f[1] * g[8] - g[1] * f[8],
+        f[0] * g[8] + g[0] * f[8] - f[2] * g[6] - g[2] * f[6],
+        f[1] * g[6] + g[1] * f[6] - f[0] * g[7] - g[0] * f[7],
+        f[1] * g[5] + g[1] * f[5] - f[2] * g[4] - g[2] * f[4],
+        f[2] * g[3] + g[2] * f[3] - f[0] * g[5] - g[0] * f[5],
+        f[0] * g[4] + g[0] * f[4] - f[1] * g[3] - g[1] * f[3],
+    )
+
+
+@numba.njit(cache=True, inline="always")
+def _slopes(j: float, mu: float, lame: float) -> tuple[float, float]:
+    """Return U' and U'' at J = j."""
+    above = max(j, ONSET)
+    curvature = mu / (above * above) + lame
+    return lame * (above - 1.0) - mu / above + curvature * (j - above), curvature
+
+
+@numba.njit(cache=True, inline="always")
+def _volume_energy(j: float, mu: float, lame: float) -> float:
+    """Return U at J = j."""
+    above = max(j, ONSET)
+    slope, curvature = lame * (above - 1.0) - mu / above, mu / (above * above) + lame
+    below = j - above
+    return 0.5 * lame * (above - 1.0) ** 2 - mu * math.log(above) + below * (slope + 0.5 * curvature * below)
+
+
+@numba.njit(cache=True, inline="always")
+def _volume_change(j: float, before: float, change: float, mu: float, lame: float) -> float:
+    """Return U(j) - U(before), which keeps the digits of change = j - before."""
+    if j >= ONSET and before >= ONSET:
+        return 0.5 * lame * change * (j + before - 2.0) - mu * math.log1p(change / before)
+    if j < ONSET and before < ONSET:
+        slope, curvature = _slopes(ONSET, mu, lame)
+        return change * (slope + 0.5 * curvature * (j + before - 2.0 * ONSET))
+    return _volume_energy(j, mu, lame) - _volume_energy(before, mu, lame)
+
+
+@numba.njit(cache=True, inline="always")
+def _norms(f: Nine) -> tuple[float, float]:
+    """Return Gershgorin's bound of the greatest singular value of F, exact in a rotation, and |F|."""
+    xx, yy, zz = f[0] ** 2 + f[3] ** 2 + f[6] ** 2, f[1] ** 2 + f[4] ** 2 + f[7] ** 2, f[2] ** 2 + f[5] ** 2 + f[8] ** 2
+    xy = abs(f[0] * f[1] + f[3] * f[4] + f[6] * f[7])
+    xz = abs(f[0] * f[2] + f[3] * f[5] + f[6] * f[8])
+    yz = abs(f[1] * f[2] + f[4] * f[5] + f[7] * f[8])
+    return math.sqrt(max(xx + xy + xz, yy + xy + yz, zz + xz + yz)), math.sqrt(xx + yy + zz)
+
+
+@numba.njit(cache=True, inline="always")
+def _borne(f: Nine, j: float, slope: float, least: float) -> float:
+    """Return by what |U'| is multiplied in what it may take from mu; J above ``least`` counts as convex."""
+    largest, norm = _norms(f)
+    return largest if slope < 0.0 and j >= least else NORM * norm
+
+
+@numba.njit(cache=True, inline="always")
+def _gradient_of(w: Floats, lane: int, over: float) -> Nine:
+    """Return F of a lane whose corners' positions are in the work array; ``over`` is 1 / (4 h)."""
+    a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+    return (
+        over * a[0], over * a[1], over * a[2],
+        over * b[0], over * b[1], over * b[2],
+        over * c[0], over * c[1], over * c[2],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _product_lanes(w: Floats) -> None:
+    for lane in range(LANES):
+        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+        g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+        s = AT_STATE + lane
+        f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
+        m, slope, n = w[CONSTANTS + 104 + lane], w[s + 72], _cofactors(f)
+        along, t = w[s + 80] * _inner(n, g), _change_of_cofactors(f, g)
+        x = (
+            m * g[0] + along * n[0] + slope * t[0],
+            m * g[1] + along * n[1] + slope * t[1],
+            m * g[2] + along * n[2] + slope * t[2],
+        )
+        y = (
+            m * g[3] + along * n[3] + slope * t[3],
+            m * g[4] + along * n[4] + slope * t[4],
+            m * g[5] + along * n[5] + slope * t[5],
+        )
+        z = (
+            m * g[6] + along * n[6] + slope * t[6],
+            m * g[7] + along * n[7] + slope * t[7],
+            m * g[8] + along * n[8] + slope * t[8],
+        )
+        write_forces(w, 0, lane, x, a)
+        write_forces(w, 8, lane, y, b)
+        write_forces(w, 16, lane, z, c)
+
+
+@numba.njit(cache=True)
+def add_product(nodes: Indices, which: Indices, constants: Rows, state: Rows, v: Rows, product: Rows) -> None:
+    """Add (Hessian) v [N] to ``product`` (l, 3), its ``state`` that of ``linearise``; all of one dtype."""
+    w = np.zeros(WORK, v.dtype)
+    for b in range(len(nodes)):
+        gather(nodes, b, v, w)
+        load(constants, which[b], w, CONSTANTS)
+        load(state, b, w, AT_STATE)
+        _product_lanes(w)
+        scatter(nodes, b, w, product)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _gradient_lanes(w: Floats, h4: float) -> None:
+    for lane in range(LANES):
+        a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
+        g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+        m, lame = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
+        n, over = _cofactors(g), 1.0 / h4
+        j = (g[0] * n[0] + g[1] * n[1] + g[2] * n[2]) * (over * over * over)
+        slope = over * _slopes(j, m, lame)[0]
+        x = m * g[0] + slope * n[0], m * g[1] + slope * n[1], m * g[2] + slope * n[2]
+        y = m * g[3] + slope * n[3], m * g[4] + slope * n[4], m * g[5] + slope * n[5]
+        z = m * g[6] + slope * n[6], m * g[7] + slope * n[7], m * g[8] + slope * n[8]
+        write_forces(w, 0, lane, x, a)
+        write_forces(w, 8, lane, y, b)
+        write_forces(w, 16, lane, z, c)
+
+
+@numba.njit(cache=True)
+def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> None:
+    """Add grad E [N] at q (l, 3) [m] to ``gradient`` (l, 3); ``h4`` is 4 h [m]."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        gather(blocks.nodes, b, q, w)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _gradient_lanes(w, h4)
+        scatter(blocks.nodes, b, w, gradient)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _state_lanes(w: Floats, over: float, projected: bool) -> None:
+    for lane in range(LANES):
+        f = _gradient_of(w, lane, over)
+        m, lame, n = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], _cofactors(f)
+        j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+        slope, curvature = _slopes(j, m, lame)
+        if projected:
+            most = m / _borne(f, j, slope, ONSET)
+            slope = min(max(slope, -most), most)
+        s = AT_STATE + lane
+        w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32] = f[0], f[1], f[2], f[3], f[4]
+        w[s + 40], w[s + 48], w[s + 56], w[s + 64] = f[5], f[6], f[7], f[8]
+        w[s + 72], w[s + 80] = slope, curvature
+
+
+@numba.njit(cache=True)
+def linearise(blocks: Blocks, h4: float, q: Positions, projected: bool, state: Rows) -> None:
+    """Write what a Hessian keeps of each cell into ``state`` (b, STATE * LANES)."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        gather(blocks.nodes, b, q, w)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        _state_lanes(w, 1.0 / h4, projected)
+        for i in range(STATE * LANES):
+            state[b, i] = w[AT_STATE + i]
+
+
+@numba.njit(cache=True, inline="always")
+def _quadratic(w: Floats, other: Floats, lane: int) -> float:
+    """Return the inner product of two lanes' strains in the form that mu has: mean slopes and modes, times m."""
+    total, m = 0.0, w[CONSTANTS + 104 + lane]
+    for k in range(3):
+        a, b = strain(w, 8 * k, lane), strain(other, 8 * k, lane)
+        x, y, z, v = modes_forces(w, lane, b[3], b[4], b[5], b[6])
+        total += m * (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) + a[3] * x + a[4] * y + a[5] * z + a[6] * v
+    return total
+
+
+@numba.njit(cache=True)
+def elastic_energy(blocks: Blocks, owned: int, h4: float, q: Positions) -> float:
+    """Return E [J] of the first ``owned`` blocks, 0 at rest."""
+    w, energy = np.zeros(WORK), 0.0
+    for b in range(owned):
+        gather(blocks.nodes, b, q, w)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        for lane in range(LANES):
+            f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            n = _cofactors(f)
+            j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+            volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
+            energy += 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
+    return energy
+
+
+@numba.njit(cache=True)
+def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Positions) -> float:
+    """Return E(q) - E(base) [J] of the first ``owned`` blocks, from how the nodes moved, so that it keeps its digits.
+
+    With D the change of F_0, J - J_0 = cof F_0 : D + F_0 : cof D + det D.
+    """
+    moved, mean = q - base, 0.5 * (q + base)
+    w, w_mean, w_base, change = np.zeros(WORK), np.zeros(WORK), np.zeros(WORK), 0.0
+    for b in range(owned):
+        for values, work in ((moved, w), (mean, w_mean), (base, w_base)):
+            gather(blocks.nodes, b, values, work)
+            load(blocks.constants, blocks.which[b], work, CONSTANTS)
+        for lane in range(LANES):
+            d, f, m = _gradient_of(w, lane, 1.0 / h4), _gradient_of(w_base, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            n, n_d = _cofactors(f), _cofactors(d)
+            before = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+            more = _inner(n, d) + _inner(f, n_d) + d[0] * n_d[0] + d[1] * n_d[1] + d[2] * n_d[2]
+            if m > 0.0:
+                volume = _volume_change(before + more, before, more, m, w[CONSTANTS + 112 + lane])
+                change += _quadratic(w, w_mean, lane) + h4 * h4 * volume
+    return change
+
+
+@numba.njit(cache=True)
+def add_diagonal(blocks: Blocks, state: Rows, diagonal: Rows) -> None:
+    """Add the diagonal blocks of the Hessian whose ``state`` it is to ``diagonal`` (l, 9) [N/m]."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        load(state, b, w, AT_STATE)
+        for lane in range(LANES):
+            s = AT_STATE + lane
+            n = _cofactors(
+                (w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64])
+            )
+            for a in range(8):
+                g, block = corner_strain(w, a, lane), diagonal[blocks.nodes[b, lane, a]]
+                x, y, z, v = modes_forces(w, lane, g[3], g[4], g[5], g[6])
+                own = w[CONSTANTS + 104 + lane] * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+                own += x * g[3] + y * g[4] + z * g[5] + v * g[6]
+                e = (
+                    n[0] * g[0] + n[1] * g[1] + n[2] * g[2],
+                    n[3] * g[0] + n[4] * g[1] + n[5] * g[2],
+                    n[6] * g[0] + n[7] * g[1] + n[8] * g[2],
+                )
+                for r in range(3):
+                    block[4 * r] += own
+                    for c in range(3):
+                        block[3 * r + c] += w[s + 80] * e[r] * e[c]
+
+
+@numba.njit(cache=True)
+def add_concavity(blocks: Blocks, h4: float, q: Positions, concavity: Floats) -> None:
+    """Add to ``concavity`` (l,) [N/m] what the Hessian at q (l, 3) [m] takes from mu at the most.
+
+    V |G|^2 is no more than sum_a |g_a| (sum_b |g_b|) V |v_a|^2, with g_a the mean slope of corner a.
+    """
+    w, sizes = np.zeros(WORK), np.empty(8)
+    for b in range(len(blocks.nodes)):
+        gather(blocks.nodes, b, q, w)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        for lane in range(LANES):
+            f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            n = _cofactors(f)
+            j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+            slope = _slopes(j, m, w[CONSTANTS + 112 + lane])[0]
+            lost = max(abs(slope) * _borne(f, j, slope, CONVEX) - m, 0.0)
+            for a in range(8):
+                g = corner_strain(w, a, lane)
+                sizes[a] = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+            lost *= sizes.sum()
+            for a in range(8):
+                concavity[blocks.nodes[b, lane, a]] += lost * sizes[a]
+
+
+@numba.njit(cache=True)
+def add_coarse(
+    start: Indices, order: Indices, code: Array, blocks: Blocks, state: Rows, t2: float, weights: Rows, places: Indices,
+    values: Rows,
+) -> None:  # fmt: skip
+    """Add t^2 times the Hessians of cells, whose corners follow coarse cells of 2 x 2 x 2, to these cells' blocks.
+
+    start, order, code : the fine cells of each coarse one (solve.multigrid.galerkin.ByCell)
+    weights            : (28, 8) of a coarse cell's corners at the place of each code
+    places, values     : (c, 36) rows of values (b, 9), the blocks of a coarse cell's pairs of corners; -1 of none
+    """
+    w, g, modes, pushed, n = np.zeros(WORK), np.empty((8, 3)), np.empty((8, 4)), np.empty((8, 4)), np.empty((8, 3))
+    f = np.empty((3, 3))
+    for i in range(len(start) - 1):
+        for at in range(start[i], start[i + 1]):
+            b, lane = order[at] // LANES, order[at] % LANES
+            load(blocks.constants, blocks.which[b], w, CONSTANTS)
+            load(state, b, w, AT_STATE)
+            s, m = AT_STATE + lane, t2 * w[CONSTANTS + 104 + lane]
+            of_f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
+            slope, curvature, k = t2 * w[s + 72], t2 * w[s + 80], _cofactors(of_f)
+            for r in range(9):
+                f[r // 3, r % 3] = of_f[r]
+            for a in range(8):
+                for corner in range(8):
+                    w[24 * corner + lane] = weights[code[at, corner], a]
+                e = strain(w, 0, lane)
+                g[a, 0], g[a, 1], g[a, 2] = e[0], e[1], e[2]
+                modes[a, 0], modes[a, 1], modes[a, 2], modes[a, 3] = e[3], e[4], e[5], e[6]
+                pushed[a, 0], pushed[a, 1], pushed[a, 2], pushed[a, 3] = modes_forces(w, lane, e[3], e[4], e[5], e[6])
+                n[a, 0] = k[0] * e[0] + k[1] * e[1] + k[2] * e[2]
+                n[a, 1] = k[3] * e[0] + k[4] * e[1] + k[5] * e[2]
+                n[a, 2] = k[6] * e[0] + k[7] * e[1] + k[8] * e[2]
+            pair = -1
+            for a in range(8):
+                for c in range(a, 8):
+                    pair += 1
+                    if places[i, pair] >= 0:
+                        own = m * (g[a, 0] * g[c, 0] + g[a, 1] * g[c, 1] + g[a, 2] * g[c, 2])
+                        for mode in range(4):
+                            own += t2 * modes[a, mode] * pushed[c, mode]
+                        _add_block(values[places[i, pair]], own, curvature, n[a], n[c], slope, f, g[a], g[c])
+
+
+@numba.njit(cache=True)
+def _add_block(
+    block: Floats, own: float, curvature: float, m: Floats, n: Floats, slope: float, f: Rows, g: Floats, h: Floats
+) -> None:
+    """Add own I + curvature m n^T + slope [t]_x with t = F (h x g), what v . (F x (u (x) h)) g is of u and v."""
+    x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
+    for r in range(3):
+        block[4 * r] += own
+        for c in range(3):
+            block[3 * r + c] += curvature * m[r] * n[c]
+        t = slope * (f[r, 0] * x + f[r, 1] * y + f[r, 2] * z)
+        one, two = (r + 1) % 3, (r + 2) % 3
+        block[3 * two + one] += t
+        block[3 * one + two] -= t
+
+
+@dataclass(frozen=True)
+class NeoHookean:
+    """The cells around this rank's nodes, those that it owns first: what Elasticity asks of a law.
+
+    owned  : number of blocks of cells that this rank owns
+    h4     : four times the side of a cell [m]
+    single : the same blocks with constants in single precision
+    """
+
+    blocks: Blocks
+    owned: int
+    h4: float
+    single: Rows
+
+    @classmethod
+    def of_lattice(cls, lattice: Lattice) -> "NeoHookean":
+        """Return the solid of a lattice."""
+        assert lattice.solid is not None
+        h4 = 4 * lattice.cell_size
+        forms, volume, shear, lame = lattice.solid
+        m = (shear * volume / h4**2)[:, None]
+        constants = np.concatenate([forms[:, :6], m * forms[:, 6:], m, (lame * volume / h4**2)[:, None]], axis=1)
+        owned = np.arange(len(forms)) < lattice.cells_owned
+        nodes, rows, blocks = [], [], []
+        for kind in (owned, ~owned):
+            own = np.flatnonzero(kind)
+            order = own[np.argsort((constants[own] != constants[:1]).any(axis=1), kind="stable")]
+            of_kind, values = in_blocks(lattice.local_cells[order][:, BY_AXIS], constants[order])
+            nodes.append(of_kind)
+            rows.append(values)
+            blocks.append(len(of_kind))
+        which, distinct = shared(np.concatenate(rows))
+        cells = Blocks(np.concatenate(nodes), which, distinct)
+        return cls(cells, blocks[0], h4, distinct.astype(np.float32))
+
+    @property
+    def corners(self) -> Indices:
+        """Corner nodes (c, 8) of the cells that this rank owns, in the order of its blocks."""
+        return self.blocks.nodes[: self.owned].reshape(-1, 8)
+
+    def energy(self, q: Positions) -> float:
+        """Return E [J] of the cells that this rank owns."""
+        return elastic_energy(self.blocks, self.owned, self.h4, q)
+
+    def change(self, q: Positions, base: Positions) -> float:
+        """Return E(q) - E(base) [J] of the cells that this rank owns."""
+        return elastic_change(self.blocks, self.owned, self.h4, q, base)
+
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add grad E [N] to ``gradient`` (l, 3)."""
+        add_gradient(self.blocks, self.h4, q, gradient)
+
+    def add_concavity(self, q: Positions, concavity: Floats) -> None:
+        """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""
+        add_concavity(self.blocks, self.h4, q, concavity)
+
+    def state(self, q: Positions, projected: bool, dtype: type = np.float64) -> Array:
+        """Return F, V U' and V U'' of all cells at q, as ``add_product`` takes them."""
+        state: Rows = np.empty((len(self.blocks.nodes), STATE * LANES), dtype)
+        linearise(self.blocks, self.h4, q, projected, state)
+        return state
+
+    def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> Product:
+        """Return what adds (Hessian of E at q) v [N] to its second argument."""
+        constants = self.single if dtype == np.float32 else self.blocks.constants
+        return partial(add_product, self.blocks.nodes, self.blocks.which, constants, self.state(q, projected, dtype))
+
+    def add_bound(self, q: Positions, blocks: Rows) -> None:
+        """Add the diagonal blocks of the projected Hessian to ``blocks`` (l, 9) [N/m]: an eighth of what bounds it."""
+        add_diagonal(self.blocks, self.state(q, True), blocks)

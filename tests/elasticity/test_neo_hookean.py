@@ -1,0 +1,163 @@
+"""The neo-Hookean solid against closed forms, finite differences and dense eigenvalues, in whole and in cut cells."""
+
+import numpy as np
+import pytest
+from lattices import COMM, block, cages_of
+from scipy.spatial.transform import Rotation
+
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.neo_hookean import ONSET
+from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
+from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
+
+RNG = np.random.default_rng(30)
+YOUNG, H = 3e4, 0.1
+
+
+def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Points (k, 3) of a random part of a cell about its middle: a half space of it, from a sliver to all but one."""
+    points = rng.random((n, 3)) - 0.5
+    height = points @ rng.standard_normal(3)
+    return points[height >= np.quantile(height, rng.uniform(0, 0.99))]
+
+
+def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shares (8,) of the corners and squares (3,) of a part of a cell, that are sums over points of it."""
+    return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(axis=0) / n
+
+
+def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
+    """A block of whole or of randomly cut cells."""
+    lattice = build_lattice(cages_of(block(*sides), H), 1000.0, young_modulus=YOUNG, poisson=poisson)
+    if not cut:
+        return lattice
+    share, squares = map(
+        np.array, zip(*(moments(points_inside(RNG, 400), 400) for _ in lattice.local_cells), strict=True)
+    )
+    cells = lattice.solid._replace(forms=forms_of(share, squares), volume=H**3 * share.mean(axis=1))
+    return Lattice(**(vars(lattice) | {"solid": cells}))
+
+
+def gradient(elastic: Elasticity, q: np.ndarray) -> np.ndarray:
+    g = np.zeros_like(q)
+    elastic.add_gradient(q, g)
+    return g
+
+
+def hessian(elastic: Elasticity, q: np.ndarray, projected: bool = False) -> np.ndarray:
+    """The dense Hessian at q."""
+    product, columns = elastic.hessian_at(q, projected), []
+    for i in range(q.size):
+        v, column = np.zeros_like(q), np.zeros_like(q)
+        v.flat[i] = 1
+        product.add_product(v, column)
+        columns.append(column.ravel())
+    return np.array(columns)
+
+
+cases = pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.0, True), (0.45, True), (0.49, False)])
+
+
+@cases
+def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool):
+    """In states from strained to inverted: both branches of U."""
+    lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
+    elastic = Elasticity(COMM, lattice)
+    for strain in (0.05, 0.5):
+        q = lattice.nodes + strain * H * RNG.standard_normal(lattice.nodes.shape)
+        v, e = RNG.standard_normal(q.shape), 1e-6 * H
+        slope = elastic.change(q + e * v, q - e * v) / (2 * e)
+        assert slope == pytest.approx(np.vdot(gradient(elastic, q), v), rel=1e-6)
+        curved = (gradient(elastic, q + e * v) - gradient(elastic, q - e * v)) / (2 * e)
+        product = np.zeros_like(q)
+        elastic.hessian_at(q).add_product(v, product)
+        np.testing.assert_allclose(curved, product, rtol=1e-4, atol=1e-5 * np.abs(product).max())
+
+
+@cases
+def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(poisson: float, cut: bool):
+    lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
+    elastic = Elasticity(COMM, lattice)
+    q, v = (lattice.nodes + 0.3 * H * RNG.standard_normal(lattice.nodes.shape) for _ in range(2))
+    assert elastic.change(q, v) == pytest.approx(elastic.energy(q) - elastic.energy(v), rel=1e-12)
+    moved = q + 1e-12 * H * RNG.standard_normal(q.shape)
+    assert elastic.change(moved, q) == pytest.approx(np.vdot(gradient(elastic, q), moved - q), rel=1e-8)
+
+
+@cases
+def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: bool):
+    lattice = solid(3, 3, 2, poisson=poisson, cut=cut)
+    elastic = Elasticity(COMM, lattice)
+    turned = Rotation.from_rotvec([1.0, -2.0, 0.5]).apply(lattice.nodes) + np.array([3, 2, 1])
+    for q in (lattice.nodes, turned):
+        assert np.abs(gradient(elastic, q)).max() < 1e-12 * YOUNG * H
+        assert abs(elastic.energy(q)) < 1e-12 * YOUNG * H**3
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.25, 0.45, 0.499])
+@pytest.mark.parametrize("size", [0.5, 0.8, 1.3])
+def test_uniform_strain_has_the_textbooks_stress(poisson: float, size: float):
+    """P = mu (F - F^-T) + lambda (J - 1) J F^-T on a face, whatever the cells; below, shear."""
+    lattice = solid(3, 2, 2, poisson=poisson)
+    mu, lame = YOUNG / 2 / (1 + poisson), YOUNG * poisson / (1 + poisson) / (1 - 2 * poisson)
+    elastic = Elasticity(COMM, lattice)
+    for f in (np.diag([size, 1, 1]), np.diag([size, size, 1.1]), [[1, size, 0], [0, 1, 0], [0.2, 0, 1]]):
+        f = np.array(f)
+        g, top = gradient(elastic, lattice.nodes @ f.T), lattice.nodes[:, 0] > lattice.nodes[:, 0].max() - H / 2
+        j, inverse = np.linalg.det(f), np.linalg.inv(f).T
+        stress = mu * (f - inverse) + lame * (j - 1) * j * inverse
+        area = 4 * H**2
+        np.testing.assert_allclose(g[top].sum(axis=0) / area, stress[:, 0], atol=1e-9 * (mu + lame))
+
+
+@cases
+def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(poisson: float, cut: bool):
+    lattice = solid(2, 2, 1, poisson=poisson, cut=cut)
+    elastic, worst = Elasticity(COMM, lattice), 0.0
+    shapes = [np.diag([0.6, 1.2, 1.2]), np.diag([1.4, 1.4, 0.9]), np.diag([0.1, 0.1, -0.02]), np.diag([0.9, 0.9, -0.5])]
+    for f in (np.eye(3), *shapes, *RNG.normal(size=(8, 3, 3))):
+        for noise in (0.0, 0.3):
+            q = lattice.nodes @ f.T + noise * H * RNG.standard_normal(lattice.nodes.shape)
+            size = np.abs(hessian(elastic, q)).max()
+            assert np.linalg.eigvalsh(hessian(elastic, q, projected=True)).min() > -1e-12 * size
+            concavity = np.repeat(elastic.concavity(q), 3)
+            lowest = np.linalg.eigvalsh(hessian(elastic, q) + np.diag(concavity)).min()
+            assert lowest > -1e-12 * size
+            worst = max(worst, -np.linalg.eigvalsh(hessian(elastic, q)).min())
+    assert worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3  # there was something to bound
+    assert elastic.concavity(lattice.nodes).max() < 1e-9 * YOUNG * H
+
+
+def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
+    """mu |grad|^2 and the second variation of one cell each; and what F sees of strain is what the integral sees."""
+    count, n = 10_000, 60
+    share, squares = map(np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True))
+    forms, volume = forms_of(share, squares), share.mean(axis=1)
+    slopes, _ = slopes_and_modes(forms)
+    k = laplacians(forms, volume)
+    lowest = np.linalg.eigvalsh(k)[:, 0] / np.trace(k, axis1=1, axis2=2)
+    assert lowest.min() > -1e-14
+    jensen = np.linalg.eigvalsh(k - (volume / 16)[:, None, None] * slopes.transpose(0, 2, 1) @ slopes)[:, 0]
+    assert (jensen / np.trace(k, axis1=1, axis2=2)).min() > -1e-14
+    for shear, lame in ((1.0, 0.0), (1.0, 49.0)):
+        lattice = solid(1, 1, 1, poisson=0.25)
+        for i in range(0, count, 250):
+            cells = SolidCells(forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame]))
+            one = Elasticity(COMM, Lattice(**(vars(lattice) | {"solid": cells})))
+            h = hessian(one, lattice.nodes)
+            assert np.linalg.eigvalsh(h).min() > -1e-13 * np.abs(h).max()
+
+
+def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
+    """mu h / 12 each, and none on edges: K of a trilinear cell."""
+    lattice = build_lattice(cages_of(block(1, 1, 1), H), 1000.0, young_modulus=2.5, poisson=0.25)
+    kind = np.rint((lattice.rest_length / H) ** 2).astype(int)
+    np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 1, 1])[kind] * H / 12, atol=1e-17)
+
+
+def test_below_the_onset_the_volume_energy_goes_on_smoothly():
+    lattice = solid(1, 1, 1, poisson=0.3)
+    elastic = Elasticity(COMM, lattice)
+    above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
+    np.testing.assert_allclose(gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2)
+    np.testing.assert_allclose(hessian(elastic, above), hessian(elastic, below), atol=1e-6 * YOUNG * H)

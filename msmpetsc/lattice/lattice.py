@@ -255,8 +255,8 @@ def _solid(net: Topology, h: float, made_of: CellMaterial) -> tuple[Floats, Floa
         forms, volume = forms_of(net.share, net.squares), net.share.mean(axis=1)
         pairs = laplacians(forms, volume)
     diagonal = np.diagonal(pairs, axis1=1, axis2=2)
-    of_corners: Rows = (h**3 * made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
-    mass: Floats = np.bincount(net.cells.ravel(), of_corners.ravel().astype(float), owned)[:owned]
+    of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
+    mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     of_spring = _sums_of_springs(net.cells, -h * shear, pairs, net.ijk, net.springs, owned)
     inside: Floats = volume * made_of.spring
     return mass, of_spring, inside, SolidCells(forms, h**3 * volume, shear, lame)

@@ -14,11 +14,11 @@ from petsc4py import PETSc
 from msmpetsc import __version__
 from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.profile import Cost, refuse_unwritable, versions
+from msmpetsc.app.profile import Cost, versions
 from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
-from msmpetsc.backend.compiling import compilation_logged
+from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
@@ -80,8 +80,6 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     probes, interval = Probes(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(comm, scene, probes)
-    refuse_steps_beyond(scene.time.steps, request, earlier.step if earlier else 0)
-    on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
     return RunPlan(request, scene, probes, interval, resumed, attributes, began)
@@ -90,8 +88,9 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
     """Build the model and take its steps; after each, keep its frame and a checkpoint that is due (collective)."""
     failure = None
+    if cache_is_empty():
+        log.info("compiling kernels, once, about a minute")
     with (
-        compilation_logged(),
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
@@ -187,15 +186,6 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     else:
         raise InputError("a SCENE is needed, or --resume OUT.h5")
     return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
-
-
-def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
-    """Raise InputError for steps to be measured that the run does not come to, or that it took before."""
-    if request.trace is not None and request.trace <= taken:
-        raise InputError(f"--trace {request.trace}: the run goes on after step {taken}")
-    for option, number in {"--true-error": request.true_error, "--trace": request.trace}.items():
-        if number is not None and number > steps:
-            raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
 
 
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:

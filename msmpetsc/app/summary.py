@@ -18,8 +18,6 @@ from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.simulate import Simulation
 
-MOST_NAMED = 12  # tables whose nodes are counted one by one
-
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
     """Log size, volume and mass of bodies and lattice, counts, and nodes that the scene's tables take (collective)."""
@@ -85,8 +83,7 @@ def taken(reaches: Iterable[Reach]) -> list[str]:
         elif reach.kind == "force":
             held = f" ({reach.held} of them held)" if reach.held else ""
             named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
-    more = len(named) - MOST_NAMED
-    return named if more <= 1 else [*named[:MOST_NAMED], f"and {more} more"]
+    return named
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:

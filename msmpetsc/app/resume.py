@@ -145,7 +145,7 @@ class Resumed:
     def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
-        if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
+        if not (self.differs or self.force) and earlier.planned == self.stored:
             return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))

@@ -6,7 +6,6 @@ An error is the greatest difference at a frame over the scale of its field, whic
     kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
                                             at least that of the stiffest spring strained by 1e-6
     momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
-    anything else                           its own largest |value|
 
 each over both runs and all frames compared. What the digits of the coarser of the two stored types
 cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
@@ -19,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
-from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
-DEFAULT = ("position", "surface", *ENERGIES, "momentum")
+COMPARED = ("position", "surface", *ENERGIES, "momentum")
 LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
 SAME_POINT = 1e-6  # of a cell
 SAME_TIME = 1e-6  # of the spacing of frames
@@ -84,14 +83,14 @@ class Distances(NamedTuple):
 
 
 @np.errstate(all="ignore")  # what overflows differs, and is reported as that
-def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
-    """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
+def compare(a: Result, b: Result) -> Comparison:
+    """Compare the fields COMPARED of two runs, those that both have, at the times that both have.
 
-    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or
-    not these fields in common.
+    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time in common.
     """
     refuse_different_lattices(a, b)
-    chosen, left_out = _chosen(a, b, names)
+    either = [name for name in COMPARED if name in a.frames or name in b.frames]
+    chosen = [name for name in either if name in a.frames and name in b.frames]
     times = a.frames.time[:]
     pairs = common_times(times, b.frames.time[:])
     if not len(pairs):
@@ -103,24 +102,12 @@ def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Compari
         with np.errstate(divide="ignore", invalid="ignore"):
             errors = np.where(greatest == 0, 0.0, greatest / scales[name])
         fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
-    return Comparison(pairs, times[pairs[:, 0]], fields, left_out)
-
-
-def _chosen(a: Result, b: Result, names: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Return the fields to compare, and those of DEFAULT that only one run has."""
-    shared = [name for name in a.frames if name in b.frames and name != "time"]
-    if names is None:
-        either = [name for name in DEFAULT if name in a.frames or name in b.frames]
-        return [n for n in either if n in shared], [n for n in either if n not in shared]
-    for name in names:
-        if name not in shared:
-            raise InputError(f"{a.path} and {b.path} do not both have frames/{name}{did_you_mean(name, shared)}")
-    return list(dict.fromkeys(names)), []
+    return Comparison(pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen])
 
 
 def rest_of(run: Result, name: str) -> Positions | None:
     """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
-    at_rest = FRAME_FIELDS[name].at_rest if name in FRAME_FIELDS else ""
+    at_rest = FRAME_FIELDS[name].at_rest
     return run[at_rest][:] if at_rest in run else None
 
 
@@ -170,7 +157,7 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indice
     for name in scales:
         if name in ENERGIES:
             scales[name] = energy
-        elif name in FRAME_FIELDS and FRAME_FIELDS[name].at_rest:
+        elif FRAME_FIELDS[name].at_rest:
             scales[name] = max(scales[name], LEAST_STRAIN * side)
     if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
         scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -43,14 +43,6 @@ DEFLATE_MOST = 1032  # zlib packs no better than this
 AXES: dict[int | str, str] = {"T": "time", "n": "node", "v": "point", 3: "axis"}  # xarray's names of dimensions
 
 
-class StoredState(NamedTuple):
-    """The positions of a checkpoint, q_n and q_(n-1), (n, 3) [m] each, after `step` steps."""
-
-    step: int
-    q: Positions
-    q_previous: Positions
-
-
 class Result:
     """A result file, opened to be read; also one that is being written, up to the frames finished by now.
 
@@ -72,7 +64,7 @@ class Result:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
-        self.frames, self._checkpoint = map(self._group, ("frames", "checkpoint"))
+        self.frames = self._group("frames")
 
     def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
         count = finished(self.file)
@@ -169,20 +161,6 @@ class Result:
         if f"{group}/body" in self:
             return self[f"{group}/body"][:].astype(np.int64)
         return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
-
-    @property
-    def checkpoint(self) -> StoredState | None:
-        """The newest checkpoint by now, or None."""
-        if not {"step", "q", "q_previous"} <= self._checkpoint.keys():
-            return None
-        while True:
-            slot = newest_slot(self._checkpoint.step[:])
-            if slot is None:
-                return None
-            step = int(self._checkpoint.step[slot])
-            state = StoredState(step, self._checkpoint.q[slot], self._checkpoint.q_previous[slot])
-            if step >= 0 and self._checkpoint.step[slot] == step:  # or a running process has begun to replace it
-                return state
 
     def to_xarray(self) -> "Dataset":
         """Return the frames, read where they are used: with coordinates, the lattice at rest, units and long names."""
@@ -339,17 +317,12 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
     return node
 
 
-def _is_external(dataset: h5py.Dataset) -> bool:
-    """Tell whether its numbers are in other files. To be asked before its shape, which HDF5 may look up there."""
-    return dataset.is_virtual or bool(dataset.external)
-
-
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """Return the dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")
-    if _is_external(dataset):
+    if dataset.is_virtual or dataset.external:  # to be asked before its shape, which HDF5 may look up there
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
     field = FIELDS.get(name)
     kinds = "f" if field is None or field.dtype.startswith("f") else "iu"

@@ -213,15 +213,6 @@ def test_steps_since_the_last_checkpoint_are_taken_again(tmp_path, monkeypatch):
     assert_same(path, whole)
 
 
-def test_a_file_with_more_in_its_checkpoints_as_older_ones_have_goes_on_from_their_state(whole: Path, stopped: Path):
-    with h5py.File(stopped, "r+") as file:
-        file["checkpoint/correction"] = file["checkpoint/q"][...]
-    assert main(["run", "--resume", str(stopped)]) == 0
-    with h5py.File(stopped) as file:
-        assert "correction" not in file["checkpoint"]
-    assert_same(stopped, whole)
-
-
 @pytest.mark.parametrize(("every", "steps"), [("1", {39, 40}), ("4", {24, 36, 40}), ("1h", {0, 40})])
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path, every, steps):
     path = tmp_path / "x.h5"

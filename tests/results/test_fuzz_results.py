@@ -30,11 +30,11 @@ def read_all(path: Path) -> None:
         for arrays in (run.lattice, run.surface, run.frames):
             for name in arrays:
                 arrays[name][:]
-        _ = run.embedding, run.checkpoint
+        _ = run.embedding
 
 
 def compared(one: Path, other: Path) -> None:
-    compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, fields=None, shared=False, json=False))
+    compare.run(argparse.Namespace(first=one, second=other, rtol=1e-6, json=False))
 
 
 NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]

@@ -31,7 +31,7 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on its first use. Raises InputError naming the extra that brings a missing package."""
+    """Import a public name on its first use. Raises InputError for a package that is missing."""
     if name not in FROM:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

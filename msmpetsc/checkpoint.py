@@ -98,7 +98,7 @@ class Checkpoint:
         return value
 
     def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
-        """Raise InputError for rows not of the shape of those in ``like``, not finite or absurd (collective)."""
+        """Raise InputError for rows of another shape than in ``like``, or absurd (collective)."""
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():
                 rows = self.rows[name]

@@ -1,4 +1,4 @@
-"""A run, once PETSc has its options: prepared, its output opened, its steps taken and observed, its files finished."""
+"""A run, once PETSc has its options: prepared, its steps taken and observed, finished."""
 
 import logging
 import shlex
@@ -86,7 +86,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
-    """Build the model and take its steps; after each, keep its frame and a checkpoint that is due (collective)."""
+    """Take the steps; after each, keep its frame and a checkpoint that is due (collective)."""
     failure = None
     if cache_is_empty():
         log.info("compiling kernels, once, about a minute")
@@ -155,7 +155,7 @@ def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int
 
 
 def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> list[str]:
-    """Return what PETSc's options database holds for the solvers of a run, or of a preset alone (collective)."""
+    """Return the options in PETSc's database of a run, or of a preset alone (collective)."""
     refuse_early(comm, FLAGS)
     choose(comm, request.device)
     if request.scene or earlier:
@@ -189,7 +189,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
 
 
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
-    """Return what the file says of the run that made it; PETSc's options are the user's, before ours are among them."""
+    """Return what the file says of the run that made it, with the user's PETSc options alone."""
     options = PETSc.Options().getAll().items()
     file = request.made[0] / "scene" if request.made else request.file  # where its paths start
     return {

@@ -20,7 +20,7 @@ from msmpetsc.solve.simulate import Simulation
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
-    """Log size, volume and mass of bodies and lattice, counts, and nodes that the scene's tables take (collective)."""
+    """Log what the model is of, its counts, and the nodes that tables take (collective)."""
     lattice = model.lattice
     log_bodies(comm, model)
     held = int(lattice.pinned[: lattice.owned].sum())
@@ -75,7 +75,7 @@ def sides(lengths: Iterable[float]) -> str:
 
 
 def taken(reaches: Iterable[Reach]) -> list[str]:
-    """Name what each anchor and force takes; of a force's nodes some may be held, which take their part of it, too."""
+    """Name what each anchor and force takes; of a force's nodes some may be held."""
     named = []
     for reach in reaches:
         if reach.kind == "anchor":

@@ -35,7 +35,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Split into ours and PETSc's: those of one dash, each with the value that follows it, as PETSc reads them."""
+    """Split into ours and PETSc's: those of one dash, each with the value that follows it."""
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
@@ -60,7 +60,7 @@ def _refuse_unknown_command(ours: list[str]) -> None:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for options of ours that lack a dash, and for any of PETSc's where there is no use for them."""
+    """Raise InputError for options of ours that lack a dash, and for needless ones of PETSc's."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return

@@ -34,7 +34,7 @@ class Command:
 
 
 class Shown(argparse.Action):
-    """Prints what a function of no arguments, its ``const``, returns, and leaves; libraries are loaded only then."""
+    """Prints what its ``const``, a function, returns, and leaves; libraries are loaded then."""
 
     def __init__(self, option_strings: list[str], const: Any, help: str, **_: Any):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, const=const, help=help)

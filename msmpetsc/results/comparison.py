@@ -49,7 +49,7 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
+        """Return which of the frames compared is the first whose error is above rtol; None for none."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
@@ -181,7 +181,7 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
 
 
 def _least_energy(run: Result) -> float:
-    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 where the file has no springs."""
+    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 for none."""
     if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
         return 0.0
     return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)

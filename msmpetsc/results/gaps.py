@@ -98,7 +98,7 @@ def gaps_to_obstacles(
 
 
 def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
-    """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first; infinite if unknown."""
+    """Return the distance (n,) [m] of points to an obstacle at time 0; infinite if unknown."""
     gaps: Floats = np.full(len(points), np.inf)
     if obstacle.center is not None:
         gaps = np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
@@ -112,7 +112,7 @@ def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
 
 
 def _gaps_to(surface: Surface, points: Positions) -> Floats:
-    """Return the distance (n,) [m] of points (n, 3) to a surface, negative behind the nearest of its triangles."""
+    """Return the distance (n,) [m] of points to a surface, negative behind its triangles."""
     if not len(surface.triangles):
         return np.full(len(points), np.inf)
     import igl  # for scenes with such obstacles

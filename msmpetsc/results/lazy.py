@@ -94,7 +94,7 @@ class Arrays(Mapping[str, LazyArray]):
 
 
 def xarray_variable(dimensions: Sequence[str], array: LazyArray, long_name: str) -> Any:
-    """Return an xarray.Variable that reads the array where it is used, as xarray's own readers of files do it."""
+    """Return an xarray.Variable that reads the array where it is used, as xarray's own do."""
     import xarray
     from xarray.backends import BackendArray
     from xarray.core import indexing

@@ -106,13 +106,13 @@ class Result:
         return name in self._datasets
 
     def __getitem__(self, name: str) -> LazyArray:
-        """Return the array of a dataset by its name in the file, "lattice/nodes"; InputError where it has none."""
+        """Return the array of a dataset, "lattice/nodes". Raises InputError where there is none."""
         if name not in self._datasets:
             raise InputError(f"{self.path} is damaged: it has no {name}")
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return all of a dataset that names nodes or points. Raises InputError where there are no such ones."""
+        """Return a dataset that names nodes or points. Raises InputError where it names others."""
         rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
         plural = NAMED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
@@ -163,7 +163,7 @@ class Result:
         return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
 
     def to_xarray(self) -> "Dataset":
-        """Return the frames, read where they are used: with coordinates, the lattice at rest, units and long names."""
+        """Return the frames, read where they are used, with coordinates, units and long names."""
         try:
             import xarray
         except ImportError as error:  # also of what xarray itself needs
@@ -279,7 +279,7 @@ def as_python(value: Any) -> Any:
 
 
 def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return all that belong to a result, "frames/time" and the like; InputError if one is not what it should be."""
+    """Return all that belong to a result by their names. Raises InputError for a wrong one."""
     path = Path(file.filename)
     for name in NEEDED:
         if object_at(path, file, name) is None:
@@ -291,7 +291,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
-    """Raise InputError where one letter of the table stands for two numbers, or frames for fewer than `count`."""
+    """Raise InputError where a letter of the table is two numbers, or frames are too few."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):
@@ -305,7 +305,7 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
 
 
 def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
-    """Return what the file has under a name, None for nothing; InputError if a link on the way leads elsewhere."""
+    """Return what the file has under a name, None for nothing. Raises InputError for links."""
     node = file
     for part in name.split("/"):
         # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
@@ -318,7 +318,7 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
 
 
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Return the dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
+    """Return the dataset, if it holds numbers as it should, no more than the file can hold."""
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")

@@ -1,4 +1,4 @@
-"""Restart: what a result file says of the run that wrote it, its last checkpoint, whether a lattice is its own."""
+"""Restart: what a result file says of its run, its last checkpoint, its lattice."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -73,7 +73,7 @@ def _is_at_rest(result: Result, names: list[str]) -> bool:
 
 
 def _refuse_foreign_series(result: Result) -> None:
-    """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
+    """Raise InputError where the numbers of frames are not stored as a run stores them."""
     for name, array in result.frames.items():
         if name not in ("position", "surface"):
             field = FRAME_FIELDS[name]
@@ -184,7 +184,7 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
 
 @contextmanager
 def opened_on_root(comm: MPI.Comm, path: Path) -> Iterator[Any]:
-    """Open a result file on rank 0 alone, None elsewhere (collective). Raises InputError where it is no result."""
+    """Open a result file on rank 0 alone, None elsewhere (collective). Raises InputError."""
     file = on_root(comm, lambda: open_result(path))
     try:
         yield file

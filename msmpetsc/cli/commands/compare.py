@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.results.reader import Result, refuse_deadly
-from msmpetsc.results.surfaces import MEAN, compare_surfaces
+from msmpetsc.results.surfaces import compare_surfaces
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
-    """Compare two results, of different lattices by their surfaces alone; return what is to be said of that, too."""
+    """Compare two results, of different lattices by their surfaces alone; say so in notes."""
     try:
         return compare(first, second), []
     except DifferentLattices as error:
@@ -50,7 +50,7 @@ def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
         comparison = compare_surfaces(first, second)
     except InputError as error:
         raise InputError(f"{differ}; {error}") from None
-    mean = next(field for field in comparison.fields if field.name == MEAN)
+    _, mean = comparison.fields
     overall = np.sqrt(np.mean(mean.errors**2))
     return comparison, [
         f"{differ}: their surfaces alone are compared",
@@ -89,7 +89,7 @@ def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterato
 
 
 def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
-    """Yield the first frame at which anything differs, and the node that is farthest off when positions first do."""
+    """Yield the first frame that differs, and the node that is farthest off there."""
     firsts = {field.name: first for field in comparison.fields if (first := field.first_above(rtol)) is not None}
     if not firsts:
         yield f"they agree to {rtol:g} at these {len(comparison.pairs)} frames"
@@ -108,5 +108,5 @@ def farthest(result: Result, comparison: Comparison, field: FieldError, first: i
     number, rest_rows = field.worst[first], rest_of(result, field.name)
     rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
-    off = f"{field.errors[first] * field.scale:.3g} m off at frame {comparison.pairs[first, 0]}"
+    off = f"{field.errors[first] * (field.scale or 1.0):.3g} m off at frame {comparison.pairs[first, 0]}"
     return f"{kind} {number}{rest}, is {off}, farther than any other"

@@ -75,7 +75,7 @@ Finding = tuple[str, str, str]  # what, its state, and in words
 
 
 class Unsound(Exception):
-    """Raised by what examines a thing that is missing or broken: its state, and in words what brings or ails it."""
+    """Raised of a thing that is missing or broken: its state, and what brings or ails it."""
 
 
 def run(_: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ from msmpetsc.fields import Frame
 from msmpetsc.results.disk import write_whole
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
 
 class Cost:
@@ -32,7 +32,7 @@ class Cost:
     products : with the Hessian
     """
 
-    def __init__(self, comm: MPI.Comm, simulation: "Simulation", setup: float):
+    def __init__(self, comm: MPI.Comm, simulation: "TimeLoop", setup: float):
         self.comm, self.simulation, self.setup = comm, simulation, setup
         self.output, self.stepping, self.products = 0.0, 0.0, 0
         model = simulation.model

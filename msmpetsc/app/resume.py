@@ -25,7 +25,7 @@ from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.build import Model
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
 OF_NO_EFFECT = re.compile(  # on results
     r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
@@ -160,7 +160,7 @@ class Resumed:
             rows["lattice/mass"] = lattice.mass
         refuse_changed_lattice(comm, self.earlier.path, rows)
 
-    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
+    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
         path = self.earlier.path
         saved = read_checkpoint(comm, path, simulation.model.lattice.owned)

@@ -34,7 +34,7 @@ from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, preset_names, shown_options
 from msmpetsc.solve.refused_options import refuse_bad_values, refuse_early, silence_options_left
-from msmpetsc.solve.simulate import Simulation, refuse_bad_options, solvers_of
+from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class RunPlan:
 class RunEnd:
     """How the steps of a run ended: at its last step, by a signal, or by a step that failed."""
 
-    simulation: Simulation
+    simulation: TimeLoop
     file: ResultFile
     cost: Cost
     signal: int
@@ -94,7 +94,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
-        Simulation(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
+        TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
     ):
         try:
             with ending_together(comm):
@@ -223,7 +223,7 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     return model
 
 
-def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: Simulation) -> int:
+def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: TimeLoop) -> int:
     """Write the model, go on where an earlier run stopped, and make room for frames (collective).
 
     model : as it was built; the simulation's own may be on a GPU

@@ -134,7 +134,7 @@ class Simulation:
         if self._shape is None or not self._shape.fits(scene):
             self._shape = Geometry(self.comm, scene)
         self.model = model = build_model(self.comm, scene, self._shape)
-        simulation = until_the_end.enter_context(simulate.Simulation(self.comm, scene, model))
+        simulation = until_the_end.enter_context(simulate.TimeLoop(self.comm, scene, model))
         if alone:
             simulation.refuse_unused_options()
         return simulation.frames()

@@ -16,7 +16,7 @@ from msmpetsc.constraints.coverage import Reach
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
@@ -99,7 +99,7 @@ def spoken(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)
 
 
-def tell_stop(number: int, path: Path, simulation: Simulation) -> int:
+def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:
     """Say in one line how to go on after a signal; return the exit status of that signal."""
     log.warning(
         "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",

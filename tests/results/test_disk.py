@@ -12,7 +12,7 @@ from stopped_runs import assert_same, every_step_forgets, hanging  # noqa: F401 
 
 from msmpetsc.cli.main import main
 from msmpetsc.results.reader import finished
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room
 FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}  # 2,601 nodes, 62 kB a frame
@@ -40,7 +40,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def at_step(monkeypatch: pytest.MonkeyPatch, action) -> None:
     """`action` happens after step BEFORE."""
-    advance = Simulation.advance
+    advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -48,7 +48,7 @@ def at_step(monkeypatch: pytest.MonkeyPatch, action) -> None:
             if simulation.step == BEFORE:
                 action()
 
-    monkeypatch.setattr(Simulation, "advance", watched)
+    monkeypatch.setattr(TimeLoop, "advance", watched)
 
 
 def assert_stops_in_one_line(arguments: list[str], capsys, *words: str) -> None:

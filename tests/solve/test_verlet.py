@@ -24,7 +24,7 @@ from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import verlet
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 T = 1 / 60
 COMM = MPI.COMM_SELF
@@ -232,7 +232,7 @@ def settled(folder: Path, friction: float) -> tuple[Path, State]:
 def go_on(scene: Path, state: State, steps: int) -> tuple[Model, list[Frame]]:
     scene = load_scene(scene, (VERLET, f"time.step={T}", f"time.duration={steps * T}"))
     model = build_model(COMM, scene)
-    with Simulation(COMM, scene, model) as simulation:
+    with TimeLoop(COMM, scene, model) as simulation:
         simulation.state = state
         return model, list(simulation.frames())
 

@@ -14,7 +14,6 @@ from msmpetsc.backend.arrays import Array
 from msmpetsc.checkpoint import AT_REST, Checkpoint
 from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError, printable
-from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.reader import (
     Result,
@@ -58,7 +57,6 @@ class Earlier:
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
             names = _checked_numbers(path, result.file)
-            _refuse_foreign_series(result)
             count, planned = len(result.frames.time), result.frames.time.planned[0]
             at_rest = bool(count) and _is_at_rest(result, names or [])
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
@@ -70,15 +68,6 @@ def _is_at_rest(result: Result, names: list[str]) -> bool:
     """Return whether the newest checkpoint, with numbers of these names, is of a run at rest."""
     slot = newest_slot(result["checkpoint/step"][:]) if AT_REST in names else None
     return slot is not None and bool(result["checkpoint/numbers"][slot][names.index(AT_REST)] == 1)
-
-
-def _refuse_foreign_series(result: Result) -> None:
-    """Raise InputError where the numbers of frames are not stored as a run stores them."""
-    for name, array in result.frames.items():
-        if name not in ("position", "surface"):
-            field = FRAME_FIELDS[name]
-            if array.dtype != field.dtype or array.shape[1:] != field.shape[1:]:
-                raise InputError(f"{result.path} is damaged: frames/{name} has type {array.dtype}")
 
 
 def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:

@@ -106,20 +106,6 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
 # The command
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--ranks", "0"], "--ranks must be at least 1"),
-        (["--set", "cages.cuont=3"], "did you mean 'count'"),
-        (["--ranks", "many"], "--ranks must be at least 1, not many"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, words: list[str], said: str):
-    assert main(["inspect", str(scene), *words]) == 2
-    told = capsys.readouterr()
-    assert said in told.err and told.err.count("\n") == 1 and told.out == ""
-
-
 def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
     found = counted(scene, 300, 3)
     assert main(["inspect", str(scene), "--ranks", "3"]) == 0

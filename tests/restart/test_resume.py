@@ -199,20 +199,6 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
         assert np.array_equal(file["frames/wall_time"][:8], times)
 
 
-def test_steps_since_the_last_checkpoint_are_taken_again(tmp_path, monkeypatch):
-    """Of every fourth step, of a run that is stopped after its tenth."""
-    monkeypatch.setattr(simulate, "REMEMBERED", 4)
-    scene, path, whole = hanging(tmp_path, 14), tmp_path / "x.h5", tmp_path / "whole.h5"
-    assert main(["run", str(scene), "-o", str(whole)]) == 0
-    with monkeypatch.context() as patch:
-        signal_after(patch, 10, signal.SIGUSR1)
-        assert main(["run", str(scene), "-o", str(path)]) == 0
-    with h5py.File(path) as file:
-        assert max(file["checkpoint/step"]) == 8 and finished(file) == 4
-    assert main(["run", "--resume", str(path)]) == 0
-    assert_same(path, whole)
-
-
 @pytest.mark.parametrize(("every", "steps"), [("1", {39, 40}), ("4", {24, 36, 40}), ("1h", {0, 40})])
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path, every, steps):
     path = tmp_path / "x.h5"

@@ -155,7 +155,3 @@ def test_where_hdf5_itself_fails_a_child_fails(whole, monkeypatch, ending):
     monkeypatch.setattr(reader, "_read_tables", lambda path: exec(code, {"os": __import__("os")}))
     with pytest.raises(InputError, match=f"good.h5 is damaged: the HDF5 library {ending} on it"):
         refuse_deadly(whole)
-
-
-def test_a_good_file_passes_the_child(whole):
-    refuse_deadly(whole)

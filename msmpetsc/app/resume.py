@@ -92,7 +92,8 @@ def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes:
 
     The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
     """
-    given, known = [tuple(change.partition("=")[0].strip().split(".")) for change in changes], set(MODELS)
+    given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
+    known = set(MODELS)
     with suppress(InputError):
         known |= {name for _, name in load_scene(file).named_files()}
     for path, name in scene.named_files():

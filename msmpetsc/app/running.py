@@ -77,7 +77,8 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     began = perf_counter()
     if request.measure:
         begin_timing()
-    probes, interval = Probes(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
+    probes = Probes(request.true_error, request.trace)
+    interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(comm, scene, probes)
     attributes = attributes_of(comm, scene, request)

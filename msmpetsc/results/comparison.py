@@ -117,7 +117,9 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
     rest = rest_of(a, name)
     digits = max(float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0 for rows in (a_rows, b_rows))
-    greatest, worst, size = np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
+    greatest = np.empty(len(pairs))
+    worst = np.empty(len(pairs), int)
+    size = 0.0
     for number, (a_frame, b_frame) in enumerate(pairs):
         a_values, b_values = (np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame]))
         apart = _row_lengths(difference(a_values, b_values, digits))
@@ -210,13 +212,6 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
     if not same.all():
         node = int(np.argmin(same))
         refuse(f"node {node} rests at {point_text(nodes[node])} in one, at {point_text(b_nodes[node])} in the other")
-    if "springs" not in a.lattice or "springs" not in b.lattice:
-        return
-    springs, b_springs = a.lattice.springs[:], b.lattice.springs[:]
-    if len(springs) != len(b_springs):
-        refuse(f"{len(springs)} and {len(b_springs)} springs")
-    if not np.array_equal(springs, b_springs) and not np.array_equal(_sorted(springs), _sorted(b_springs)):
-        refuse("their springs join other nodes")
 
 
 def cell_size(run: Result, nodes: Positions) -> float:
@@ -230,12 +225,6 @@ def cell_size(run: Result, nodes: Positions) -> float:
 def point_text(point: Floats) -> str:
     """Return a point (3,) [m] for a message."""
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
-
-
-def _sorted(springs: Indices) -> Indices:
-    """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
-    ordered: Indices = np.unique(np.sort(springs, axis=1), axis=0)
-    return ordered
 
 
 def common_times(a: Floats, b: Floats) -> Indices:

@@ -64,8 +64,9 @@ class SurfaceGaps:
         sums = [np.bincount(self.triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_triangles.T]
         normals = unit_vectors(np.stack(sums, axis=1))
         near = self.reach + float(np.quantile(np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1), USUAL))
-        ours, theirs = np.hstack([points, near * normals]), np.hstack([middles, -near * of_triangles])
-        pairs = KDTree(ours).sparse_distance_matrix(KDTree(theirs), np.sqrt(2) * near, output_type="ndarray")
+        ours = KDTree(np.hstack([points, near * normals]))
+        theirs = KDTree(np.hstack([middles, -near * of_triangles]))
+        pairs = ours.sparse_distance_matrix(theirs, np.sqrt(2) * near, output_type="ndarray")
         number, which = pairs["i"], pairs["j"]
         at_rest = self.rest[number] - self.rest[self.triangles[which]].mean(axis=1)
         other = self.body[number] != self.body[self.triangles[which, 0]]

@@ -114,6 +114,7 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
     dcpl.set_obj_track_times(False)  # the same run makes the same bytes
     if plan.name == "frames/time":
         dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
-    space, kind = h5py.h5s.create_simple(plan.shape, plan.shape), h5py.h5t.py_create(np.dtype(plan.dtype))
+    space = h5py.h5s.create_simple(plan.shape, plan.shape)
+    kind = h5py.h5t.py_create(np.dtype(plan.dtype))
     h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
     file[plan.name].attrs["unit"] = unit_of(plan.name)

@@ -130,10 +130,6 @@ def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
     assert status == 0 and f"surface is in {a} only: not compared" in out
 
 
-OTHER_SPRINGS = small_result.springs().copy()
-OTHER_SPRINGS[4] = [0, 11]
-
-
 @pytest.mark.parametrize(
     ("lattice", "reason"),
     [
@@ -143,8 +139,6 @@ OTHER_SPRINGS[4] = [0, 11]
             dict(nodes=NODES + np.array([1e-3, 0, 0])),
             r"node 0 rests at \(0, 0, 0\) m in one, at \(0.001, 0, 0\) m in the other",
         ),
-        (dict(springs=OTHER_SPRINGS), "their springs join other nodes"),
-        (dict(springs=OTHER_SPRINGS[:-1], rest_length=np.ones(19), stiffness=np.ones(19)), "20 and 19 springs"),
         (dict(cells=np.full((2, 8), 99)), "lattice/cells names what is not among its 12 nodes"),
     ],
 )
@@ -197,11 +191,6 @@ def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path, capsys):
     with pytest.raises(InputError, match="nothing moves"):
         still = small_result.write(tmp_path / "still.h5", [frame(0)])
         surface_error(a, still)
-
-
-def test_the_order_of_springs_does_not_matter(a: Path, tmp_path: Path, capsys):
-    b = small_result.write(tmp_path / "b.h5", springs=small_result.springs()[::-1, ::-1])
-    assert told(capsys, a, b)[0] == 0
 
 
 @pytest.mark.parametrize("options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--field"]])

@@ -1,7 +1,6 @@
 """A disk that is full, or may not be written: one line, exit status 2, and the run goes on when there is room."""
 
 import os
-import resource
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -78,22 +77,6 @@ def test_a_disk_that_fills_up(whole: Path, small_disk: Path, monkeypatch, capsys
     with h5py.File(path) as file:
         assert finished(file) == 1 + BEFORE
     ballast.unlink()
-    assert main(["run", "--resume", str(path)]) == 0
-    assert_same(path, whole)
-
-
-def test_writes_that_fail(whole: Path, tmp_path, monkeypatch, capsys):
-    """By the limit on the size of files, of which HDF5 learns as of a full disk."""
-    path, limits = tmp_path / "x.h5", resource.getrlimit(resource.RLIMIT_FSIZE)
-    with monkeypatch.context() as patch:
-        at_step(patch, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1])))
-        try:
-            arguments = ["run", str(whole.parent / "scene.toml"), "-o", str(path), "--checkpoint-every", "1"]
-            assert_stops_in_one_line(arguments, capsys, f"{path} cannot be written", "File too large")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with h5py.File(path) as file:
-        assert finished(file) == 1 + BEFORE and max(file["checkpoint/step"]) == BEFORE
     assert main(["run", "--resume", str(path)]) == 0
     assert_same(path, whole)
 

@@ -60,7 +60,8 @@ def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
 
 def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, Any]:
     """Return what is said of a field: frames are numbered as in the first file."""
-    greatest, first = int(np.argmax(field.errors)), field.first_above(rtol)
+    greatest = int(np.argmax(field.errors))
+    first = field.first_above(rtol)
     return {
         "error": float(field.errors[greatest]),
         "frame": int(comparison.pairs[greatest, 0]),

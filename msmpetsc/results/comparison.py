@@ -99,8 +99,7 @@ def compare(a: Result, b: Result) -> Comparison:
     scales = _scales(a, b, distances, pairs)
     fields = []
     for name, (greatest, worst, _) in distances.items():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            errors = np.where(greatest == 0, 0.0, greatest / scales[name])
+        errors = np.where(greatest == 0, 0.0, greatest / scales[name])
         fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
     return Comparison(pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen])
 
@@ -146,8 +145,7 @@ def _row_lengths(rows: Array) -> Floats:
     """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.ravel(np.linalg.norm(rows, axis=-1))
+    return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:

@@ -5,27 +5,18 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from msmpetsc.app.simulation import Simulation, frames
-    from msmpetsc.app.start import run
-    from msmpetsc.extensions import register_force, register_obstacle, register_preset
-    from msmpetsc.fields import Frame
-    from msmpetsc.results.reader import Result
-    from msmpetsc.scene.reading import Scene
+if TYPE_CHECKING:  # what FROM says, for type checkers
+    from msmpetsc.app.simulation import Simulation as Simulation
+    from msmpetsc.app.simulation import frames as frames
+    from msmpetsc.app.start import run as run
+    from msmpetsc.extensions import register_force as register_force
+    from msmpetsc.extensions import register_obstacle as register_obstacle
+    from msmpetsc.extensions import register_preset as register_preset
+    from msmpetsc.fields import Frame as Frame
+    from msmpetsc.results.reader import Result as Result
+    from msmpetsc.scene.reading import Scene as Scene
 
 __version__ = "0.2.0"
-__all__ = [
-    "Frame",
-    "Result",
-    "Scene",
-    "Simulation",
-    "frames",
-    "open",
-    "register_force",
-    "register_obstacle",
-    "register_preset",
-    "run",
-]
 FROM = {  # what is imported when it is first used: reading a result needs numpy and h5py alone
     "Frame": "msmpetsc.fields",
     "Result": "msmpetsc.results.reader",
@@ -40,7 +31,7 @@ FROM = {  # what is imported when it is first used: reading a result needs numpy
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on its first use. Raises InputError naming the extra that brings a missing package."""
+    """Import a public name on its first use. Raises InputError for a package that is missing."""
     if name not in FROM:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -19,7 +19,6 @@ from msmpetsc.errors import InputError
 MOST = 1e60  # of any number: its fourth power is still finite
 MOST_COUNT = 2**53  # the whole numbers that a double holds
 AT_REST = "Rest.has_come"  # number of a run that ends at rest (time.until): whether it has come there
-ROWS = {"q", "q_previous", "history_q", "history_v", "sides", "lowest_mode"}  # of any run's state
 Range = tuple[float, float]
 COUNT: Range = (0, MOST_COUNT)
 ANY: Range = (-math.inf, math.inf)
@@ -99,7 +98,7 @@ class Checkpoint:
         return value
 
     def refuse_rows_unlike(self, comm: MPI.Comm, like: "Checkpoint") -> None:
-        """Raise InputError for rows not of the shape of those in ``like``, not finite or absurd (collective)."""
+        """Raise InputError for rows of another shape than in ``like``, or absurd (collective)."""
         with together(comm):
             for name in self.rows.keys() & like.rows.keys():
                 rows = self.rows[name]

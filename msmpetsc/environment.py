@@ -327,7 +327,7 @@ class Environment:
         return q, q_previous, work
 
     def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:
-        """Return an obstacle's work [J] that changes velocities by change / t: the impulse times its velocity."""
+        """Return an obstacle's work [J] that changes velocities: the impulse times its velocity."""
         if not obstacle.path.leads_away:
             return 0.0
         way = obstacle.path.displacement_between(step.time - step.length, step.time)

@@ -76,7 +76,7 @@ def missing_package(name: str, extra: str = "run") -> InputError:
 
 
 def extra_of(module: str, first: str = "run") -> str | None:
-    """Return the extra of pyproject.toml that brings a module, the first if several do; None for any other module."""
+    """Return the extra that brings a module, the first if several do; None for any other."""
     package = module.partition(".")[0]
     return next((extra for extra in (first, *EXTRAS) if package in EXTRAS[extra]), None)
 
@@ -93,7 +93,7 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(error: Exception, length: int = 160) -> str:
-    """Return the first line of what a library says went wrong, in printable characters: files speak through it, too."""
+    """Return the first line of what a library says went wrong, in printable characters."""
     return printable((str(error).strip().splitlines() or [type(error).__name__])[0], length)
 
 

@@ -35,7 +35,7 @@ class Extensions(Generic[T]):
         return [*self._registered, *(point.name for point in entry_points(group=self.group))]
 
     def find(self, name: str) -> T:
-        """Return the value of a name, imported where it is installed. Raises InputError for a name of nothing."""
+        """Return the value of a name, imported where it is installed. Raises InputError."""
         if name in self._registered:
             return self._registered[name]
         points = entry_points(group=self.group, name=name)

@@ -1,7 +1,7 @@
 """Every dataset of a result file in one table: its type, shape, unit and meaning.
 
 `Frame`, the writer's datasets, the reader's checks, xarray's names, a study's columns and the table
-of the documentation (`markdown_table`) come from it.
+of the documentation come from it.
 """
 
 import math
@@ -10,28 +10,12 @@ from typing import Annotated, NamedTuple, get_type_hints
 
 from msmpetsc.backend.arrays import Floats, Positions
 
-SIZES = {
-    "T": "frames, at least the finished ones",
-    "n": "nodes",
-    "c": "cells",
-    "s": "springs",
-    "p": "pinned nodes",
-    "v": "surface points",
-    "f": "triangles",
-    "r": "surface points + 1",
-    "e": "weights",
-    "k": "numbers",
-    "o": "obstacles",
-    "m": "points of obstacles",
-    "h": "triangles of obstacles",
-}
-
 
 class Field(NamedTuple):
     """One dataset of a result file.
 
     dtype     : numpy's name of the type written; a reader takes any size of its kind
-    shape     : numbers, and letters of `SIZES`, each of which is the same number throughout a file
+    shape     : numbers, and letters (msmpetsc/results/README.md), each of which is the same number throughout a file
     unit      : "1" for what has none
     long_name : meaning, in a few words
     at_rest   : name of the dataset that holds the same of the body at rest, "" for none
@@ -149,14 +133,3 @@ FIELDS = {f"{group}/{name}": field for group, fields in GROUPS.items() for name,
 def unit_of(name: str) -> str:
     """Return the unit of dataset `name`, such as "frames/time"; "1" where the table does not have it."""
     return FIELDS[name].unit if name in FIELDS else "1"
-
-
-def markdown_table() -> str:
-    """Return the table of all datasets in Markdown, for the documentation."""
-    head = ["| dataset | type | shape | unit | meaning |", "|---|---|---|---|---|"]
-    rows = [
-        f"| /{name} | {field.dtype} | ({', '.join(map(str, field.shape))}{',' * (len(field.shape) == 1)}) "
-        f"| {field.unit} | {field.long_name} |"
-        for name, field in FIELDS.items()
-    ]
-    return "\n".join([*head, *rows])

@@ -15,7 +15,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.writer import ResultFile
 
 if TYPE_CHECKING:  # PETSc must first be given its options
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
 STATUS: dict[int, int] = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 CHECKPOINT_TIME = 0.01  # part of the time that checkpoints may take
@@ -47,7 +47,7 @@ class Checkpoints:
     signal : the one that ended the run before its last step; 0 for none
     """
 
-    def __init__(self, file: ResultFile, simulation: "Simulation", interval: Interval, signals: "Signals"):
+    def __init__(self, file: ResultFile, simulation: "TimeLoop", interval: Interval, signals: "Signals"):
         self.file, self.simulation, self.interval, self.signals = file, simulation, interval, signals
         self.signal = 0
         self._written = -1  # step of the last checkpoint

@@ -5,6 +5,7 @@ import unicodedata
 from pathlib import Path
 
 from msmpetsc.errors import InputError, printable
+from msmpetsc.results.disk import refuse_no_file
 
 RESULT_NAMES, PICTURE_NAMES, MEASURE_NAMES = (".h5", ".hdf5"), (".png",), (".json",)
 MOVIE_NAMES, PAGE_NAMES = (".mp4", ".gif", ".webp"), (".html",)
@@ -31,10 +32,9 @@ def checked_path(given: str | os.PathLike[str]) -> Path:
 def checked_file(given: str | os.PathLike[str]) -> Path:
     """Return the path of a file: no folder, pipe or device. Raises InputError."""
     path = checked_path(given)
-    if path.is_dir() or path.name in ("", "..") or os.fspath(given).endswith("/"):
+    if path.name in ("", "..") or os.fspath(given).endswith("/"):
         raise InputError(f"{given} is a folder, not a file")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{given} is a pipe or a device, not a file")
+    refuse_no_file(path)
     return path
 
 

@@ -25,7 +25,7 @@ from msmpetsc.solve.petsc.words import options_of, unsafe_word
 
 if TYPE_CHECKING:  # these import PETSc, which must first be given its options
     from msmpetsc.build import Model
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
 OF_NO_EFFECT = re.compile(  # on results
     r"_view|_monitor|_converged_reason|^log_|^options_left|^citations|^malloc|^use_gpu_aware_mpi$|^device_"
@@ -92,7 +92,8 @@ def _refuse_files_of_others(earlier: Earlier, file: Path, scene: Scene, changes:
 
     The result may be from anywhere, and so may be what it says of the folder in which its scene lay.
     """
-    given, known = [tuple(change.partition("=")[0].strip().split(".")) for change in changes], set(MODELS)
+    given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
+    known = set(MODELS)
     with suppress(InputError):
         known |= {name for _, name in load_scene(file).named_files()}
     for path, name in scene.named_files():
@@ -145,7 +146,7 @@ class Resumed:
     def file(self, comm: MPI.Comm, attributes: dict, gathers: bool) -> ResultFile:
         """Open the file that the run writes into (collective)."""
         earlier = self.earlier
-        if not (self.differs or self.force) and earlier.planned == self.stored and earlier.exact:
+        if not (self.differs or self.force) and earlier.planned == self.stored:
             return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
@@ -160,7 +161,7 @@ class Resumed:
             rows["lattice/mass"] = lattice.mass
         refuse_changed_lattice(comm, self.earlier.path, rows)
 
-    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "Simulation") -> None:
+    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop") -> None:
         """Put the simulation where the last checkpoint was (collective)."""
         path = self.earlier.path
         saved = read_checkpoint(comm, path, simulation.model.lattice.owned)

@@ -1,4 +1,4 @@
-"""A run, once PETSc has its options: prepared, its output opened, its steps taken and observed, its files finished."""
+"""A run, once PETSc has its options: prepared, its steps taken and observed, finished."""
 
 import logging
 import shlex
@@ -14,11 +14,11 @@ from petsc4py import PETSc
 from msmpetsc import __version__
 from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.profile import Cost, refuse_unwritable, versions
+from msmpetsc.app.profile import Cost, versions
 from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
-from msmpetsc.backend.compiling import compilation_logged
+from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
@@ -34,7 +34,7 @@ from msmpetsc.solve.petsc.device import choose
 from msmpetsc.solve.petsc.events import SETUP, begun
 from msmpetsc.solve.presets import find_preset, preset_names, shown_options
 from msmpetsc.solve.refused_options import refuse_bad_values, refuse_early, silence_options_left
-from msmpetsc.solve.simulate import Simulation, refuse_bad_options, solvers_of
+from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options, solvers_of
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class RunPlan:
 class RunEnd:
     """How the steps of a run ended: at its last step, by a signal, or by a step that failed."""
 
-    simulation: Simulation
+    simulation: TimeLoop
     file: ResultFile
     cost: Cost
     signal: int
@@ -77,25 +77,25 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     began = perf_counter()
     if request.measure:
         begin_timing()
-    probes, interval = Probes(request.true_error, request.trace), Interval.parsed(request.checkpoint_every)
+    probes = Probes(request.true_error, request.trace)
+    interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(comm, scene, probes)
-    refuse_steps_beyond(scene.time.steps, request, earlier.step if earlier else 0)
-    on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
     return RunPlan(request, scene, probes, interval, resumed, attributes, began)
 
 
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> RunEnd:
-    """Build the model and take its steps; after each, keep its frame and a checkpoint that is due (collective)."""
+    """Take the steps; after each, keep its frame and a checkpoint that is due (collective)."""
     failure = None
+    if cache_is_empty():
+        log.info("compiling kernels, once, about a minute")
     with (
-        compilation_logged(),
         Signals(comm) as signals,
         begun(SETUP) as set_up,
         open_output(comm, plan) as file,
-        Simulation(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
+        TimeLoop(comm, plan.scene, model := described_model(comm, plan), plan.probes) as simulation,
     ):
         try:
             with ending_together(comm):
@@ -156,7 +156,7 @@ def tell_done(comm: MPI.Intracomm, request: RunRequest, resumed: Resumed) -> int
 
 
 def lines_of_options(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> list[str]:
-    """Return what PETSc's options database holds for the solvers of a run, or of a preset alone (collective)."""
+    """Return the options in PETSc's database of a run, or of a preset alone (collective)."""
     refuse_early(comm, FLAGS)
     choose(comm, request.device)
     if request.scene or earlier:
@@ -189,17 +189,8 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
     return scene.changed({"time.duration": request.frames * scene.time.step} if request.frames else {})
 
 
-def refuse_steps_beyond(steps: int, request: RunRequest, taken: int) -> None:
-    """Raise InputError for steps to be measured that the run does not come to, or that it took before."""
-    if request.trace is not None and request.trace <= taken:
-        raise InputError(f"--trace {request.trace}: the run goes on after step {taken}")
-    for option, number in {"--true-error": request.true_error, "--trace": request.trace}.items():
-        if number is not None and number > steps:
-            raise InputError(f"{option} {number}: the run has {steps} step{'s' * (steps > 1)} only")
-
-
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, str | int]:
-    """Return what the file says of the run that made it; PETSc's options are the user's, before ours are among them."""
+    """Return what the file says of the run that made it, with the user's PETSc options alone."""
     options = PETSc.Options().getAll().items()
     file = request.made[0] / "scene" if request.made else request.file  # where its paths start
     return {
@@ -233,7 +224,7 @@ def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
     return model
 
 
-def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: Simulation) -> int:
+def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Model, simulation: TimeLoop) -> int:
     """Write the model, go on where an earlier run stopped, and make room for frames (collective).
 
     model : as it was built; the simulation's own may be on a GPU

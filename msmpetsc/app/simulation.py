@@ -134,13 +134,13 @@ class Simulation:
         if self._shape is None or not self._shape.fits(scene):
             self._shape = Geometry(self.comm, scene)
         self.model = model = build_model(self.comm, scene, self._shape)
-        simulation = until_the_end.enter_context(simulate.Simulation(self.comm, scene, model))
+        simulation = until_the_end.enter_context(simulate.TimeLoop(self.comm, scene, model))
         if alone:
             simulation.refuse_unused_options()
         return simulation.frames()
 
     def _lend_options(self, until_the_end: ExitStack) -> bool:
-        """Lend PETSc this simulation's options; return whether no other simulation is under way (collective)."""
+        """Lend PETSc these options; return whether no other simulation is under way (collective)."""
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
         from msmpetsc.solve.presets import in_use
         from msmpetsc.solve.refused_options import refuse_early
@@ -158,7 +158,7 @@ class Simulation:
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
-        """Let warnings be seen on rank 0, and a failure end all ranks, while it computes and not between frames."""
+        """Show warnings on rank 0, and end all ranks at a failure, but not between frames."""
         with (
             logged_on_root(self.comm, logging.WARNING),
             ending_together(self.comm),

@@ -54,7 +54,7 @@ def carry_out(comm: "MPI.Intracomm", request: RunRequest) -> int:
 
 
 def options_shown(comm: "MPI.Intracomm", request: RunRequest) -> list[str]:
-    """Return what a run would have in PETSc's options database as lines of a file; no mesh is read (collective)."""
+    """Return a run's options of PETSc as lines of a file; no mesh is read (collective)."""
     with options_given(comm, request) as (asked, earlier):
         from msmpetsc.app.running import lines_of_options
 
@@ -63,7 +63,7 @@ def options_shown(comm: "MPI.Intracomm", request: RunRequest) -> list[str]:
 
 @contextmanager
 def options_given(comm: "MPI.Intracomm", request: RunRequest) -> Iterator[tuple[RunRequest, "Earlier | None"]]:
-    """Give PETSc the options of a request, and those of the run that it goes on from, for the block (collective)."""
+    """Give PETSc the options of a request, and of the run that it goes on from (collective)."""
     import numpy as np
 
     from msmpetsc.app.resume import as_before, earlier_run

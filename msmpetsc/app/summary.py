@@ -16,13 +16,11 @@ from msmpetsc.constraints.coverage import Reach
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
-from msmpetsc.solve.simulate import Simulation
-
-MOST_NAMED = 12  # tables whose nodes are counted one by one
+from msmpetsc.solve.simulate import TimeLoop
 
 
 def log_model(comm: MPI.Intracomm, model: Model) -> None:
-    """Log size, volume and mass of bodies and lattice, counts, and nodes that the scene's tables take (collective)."""
+    """Log what the model is of, its counts, and the nodes that tables take (collective)."""
     lattice = model.lattice
     log_bodies(comm, model)
     held = int(lattice.pinned[: lattice.owned].sum())
@@ -77,7 +75,7 @@ def sides(lengths: Iterable[float]) -> str:
 
 
 def taken(reaches: Iterable[Reach]) -> list[str]:
-    """Name what each anchor and force takes; of a force's nodes some may be held, which take their part of it, too."""
+    """Name what each anchor and force takes; of a force's nodes some may be held."""
     named = []
     for reach in reaches:
         if reach.kind == "anchor":
@@ -85,8 +83,7 @@ def taken(reaches: Iterable[Reach]) -> list[str]:
         elif reach.kind == "force":
             held = f" ({reach.held} of them held)" if reach.held else ""
             named.append(f"{reach.key} pulls {reach.nodes} nodes{held}")
-    more = len(named) - MOST_NAMED
-    return named if more <= 1 else [*named[:MOST_NAMED], f"and {more} more"]
+    return named
 
 
 def log_end(frames: int, seconds: float, setup: float, files: Iterable[Path]) -> None:
@@ -102,7 +99,7 @@ def spoken(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 10 else duration(seconds)
 
 
-def tell_stop(number: int, path: Path, simulation: Simulation) -> int:
+def tell_stop(number: int, path: Path, simulation: TimeLoop) -> int:
     """Say in one line how to go on after a signal; return the exit status of that signal."""
     log.warning(
         "stopped by %s after step %d of %d (t = %.6g s); to go on: msmpetsc run --resume %s",

@@ -1,11 +1,18 @@
 """One body for every index, where the arrays are: a compiled loop on the CPU, one thread an index on a GPU."""
 
+import os
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 
 import numba
 
 from msmpetsc.backend.arrays import on_host
+
+
+def cache_is_empty() -> bool:
+    """Return whether numba's cache for these sources (msmpetsc/__init__.py) has no kernel's index file."""
+    return not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi"))
 
 
 def kernel(body: Callable[..., None]) -> Callable[..., None]:

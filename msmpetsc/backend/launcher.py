@@ -102,7 +102,7 @@ class Launch:
 
 
 def compiled(body: Callable[..., None], kinds: tuple[str, ...]) -> str:
-    """Return the PTX of a body for arguments of these kinds and the GPU in use; kept beside numba's own cache."""
+    """Return the PTX of a body for these arguments and this GPU; kept beside numba's cache."""
     capability = cupy.cuda.Device().compute_capability
     target = f"{body.__module__}.{body.__name__} {kinds} {capability} {version('numba-cuda')}"
     path = Path(os.environ["NUMBA_CACHE_DIR"]) / f"{hashlib.sha256(target.encode()).hexdigest()[:24]}.ptx"
@@ -123,7 +123,7 @@ def ptx_of(body: Callable[..., None], kinds: tuple[str, ...], capability: tuple[
 
 
 def kernel_of(body: Callable[..., None]) -> Callable[..., None]:
-    """Return the kernel of a body, not compiled: it takes a count and the tuple of the body's further arguments."""
+    """Return the kernel of a body: it takes a count and the tuple of the further arguments."""
     inlined = cuda.jit(device=True)(body)
 
     def threads(count, arguments):

@@ -7,6 +7,8 @@ import argparse
 import platform
 import re
 import shlex
+import textwrap
+from argparse import RawDescriptionHelpFormatter
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +20,6 @@ from msmpetsc.errors import InputError, did_you_mean, printable
 
 OUR_SHORT = ("-o", "-h")
 TAKE_PETSC_OPTIONS = ("run",)
-EXAMPLES_HEAD = "examples:"
 
 
 def parsed(words: list[str]) -> argparse.Namespace:
@@ -34,7 +35,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Split into ours and PETSc's: those of one dash, each with the value that follows it, as PETSc reads them."""
+    """Split into ours and PETSc's: those of one dash, each with the value that follows it."""
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
@@ -59,7 +60,7 @@ def _refuse_unknown_command(ours: list[str]) -> None:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for options of ours that lack a dash, and for any of PETSc's where there is no use for them."""
+    """Raise InputError for options of ours that lack a dash, and for needless ones of PETSc's."""
     name = ours[0] if ours else ""
     if name not in COMMANDS:  # -h, or nothing at all, of which argparse says so
         return
@@ -81,13 +82,6 @@ class Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:  # where argparse prints help and version
         if world().rank == 0:
             super()._print_message(message, file)
-
-
-class ExamplesKept(argparse.HelpFormatter):
-    """Formats help, and leaves the lines of examples as they are."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:  # where argparse wraps description and epilog
-        return text if text.startswith(EXAMPLES_HEAD) else super()._fill_text(text, width, indent)
 
 
 def versions_line() -> str:
@@ -122,9 +116,10 @@ def command_parser() -> Parser:
     parser.add_argument("--version", action=Shown, const=versions_line, help=about)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
-        examples = "\n  ".join((EXAMPLES_HEAD, *command.examples))
+        examples = "\n  ".join(("examples:", *command.examples))
+        about = textwrap.fill(command.description or "")
         add = commands.add_parser(
-            name, help=command.help, description=command.description, epilog=examples, formatter_class=ExamplesKept
+            name, help=command.help, description=about, epilog=examples, formatter_class=RawDescriptionHelpFormatter
         )
         for argument in command.arguments:
             add.add_argument(*argument.names, **argument.keywords)

@@ -34,7 +34,7 @@ class Command:
 
 
 class Shown(argparse.Action):
-    """Prints what a function of no arguments, its ``const``, returns, and leaves; libraries are loaded only then."""
+    """Prints what its ``const``, a function, returns, and leaves; libraries are loaded then."""
 
     def __init__(self, option_strings: list[str], const: Any, help: str, **_: Any):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, const=const, help=help)
@@ -233,14 +233,7 @@ COMMANDS = {
         (
             argument("first", metavar="A.h5", type=checked_file),
             argument("second", metavar="B.h5", type=checked_file),
-            argument(
-                "--rtol", type=float, default=1e-6, metavar="E", help="relative error that still agrees (1e-6)"
-            ),
-            argument(
-                "--fields", metavar="NAME,...",
-                help="of /frames; position, surface, the energies and momentum if not given",
-            ),
-            switch("--shared", "times that only one of them has do not count as different"),
+            argument("--rtol", type=float, default=1e-6, metavar="E", help="relative error that still agrees (1e-6)"),
             JSON,
         ),
         description="Compare two results at the times that both have; of different lattices their surfaces alone. "

@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import os
 import signal
 import sys
 import traceback
@@ -49,6 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
         except KeyboardInterrupt:
             print("msmpetsc: rank 0: interrupted", file=sys.stderr, flush=True)
             return STATUS_INTERRUPTED
+        except BrokenPipeError:  # its reader went away: entry_point ends quietly
+            raise
         except Exception:
             print(f"msmpetsc: rank 0: {traceback.format_exc()}", file=sys.stderr, flush=True)
             return STATUS_BUG
@@ -67,9 +70,20 @@ def start_alone(comm: "MPI.Comm", command: str) -> None:
 
 
 def entry_point() -> None:
-    """Entry point of the installed ``msmpetsc``; where only results can be read, one line says what a run needs."""
+    """Entry point of the installed ``msmpetsc``; where only results can be read, one line says what a run needs.
+
+    It ends quietly, as other programs do, when who reads what it prints goes away: ``msmpetsc doctor | head -1``.
+    """
     try:
-        status = main()
+        try:
+            status = main()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):  # what is left to be written, at the exit too, has no reader
+            os.dup2(nowhere, stream.fileno())
+        status = 128 + signal.SIGPIPE
     except ModuleNotFoundError as error:
         expected = as_expected(error)
         if expected is None:

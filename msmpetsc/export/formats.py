@@ -24,27 +24,25 @@ class Format(NamedTuple):
     module, writer : below this folder; the function writes moments under a path, and needs packages of its own
     moves  : whether a file holds frames in time, or one frame
     meshes : of which it can hold one; the first if none is asked for
-    about  : what reads it
     """
 
     module: str
     writer: str
     moves: bool
     meshes: tuple[Mesh, ...]
-    about: str
 
 
 ONE_FRAME = ("formats", "write_one_frame", False)
-USD = Format("usd", "write_usd", True, ("surface",), "Blender, Houdini, Omniverse, usdview")
+USD = Format("usd", "write_usd", True, ("surface",))
 FORMATS = {
-    ".glb": Format("gltf", "write_glb", True, ("surface",), "Blender, browsers"),
+    ".glb": Format("gltf", "write_glb", True, ("surface",)),
     ".usd": USD,
     ".usda": USD,
     ".usdc": USD,
-    ".obj": Format(*ONE_FRAME, ("surface",), "nearly everything"),
-    ".ply": Format(*ONE_FRAME, ("surface",), "MeshLab, Blender, trimesh"),
-    ".stl": Format(*ONE_FRAME, ("surface",), "printers"),
-    ".vtu": Format(*ONE_FRAME, ("lattice", "surface"), "ParaView, VTK, pyvista, meshio"),
+    ".obj": Format(*ONE_FRAME, ("surface",)),
+    ".ply": Format(*ONE_FRAME, ("surface",)),
+    ".stl": Format(*ONE_FRAME, ("surface",)),
+    ".vtu": Format(*ONE_FRAME, ("lattice", "surface")),
 }
 
 

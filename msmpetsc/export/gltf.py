@@ -87,7 +87,7 @@ def write_glb(moments: Moments, path: Path) -> None:
 
 
 def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the unit normals (v, 3) float32 at points (v, 3), of the triangles (f, 3) around each by their areas."""
+    """Return unit normals (v, 3) float32 at points (v, 3), of triangles (f, 3) by their areas."""
     a, b, c = (points[triangles[:, corner]].astype(float) for corner in range(3))
     of_faces = np.cross(b - a, c - a)
     corners = triangles.ravel()

@@ -1,4 +1,4 @@
-"""The chosen frames of a result as any format has them: points, cells and data, one frame in memory at a time."""
+"""The chosen frames of a result as any format has them, one frame in memory at a time."""
 
 from collections.abc import Sequence
 from typing import Literal

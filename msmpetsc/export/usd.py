@@ -77,7 +77,7 @@ class UsdBody:
 
 
 def up_axis(scene: dict[str, Any]) -> str:
-    """Return the axis that is upward in a scene: against its gravity as far as USD knows that one, z without it."""
+    """Return the axis that is upward: against gravity where USD knows that one, else z."""
     acceleration = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
     return UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z) if acceleration.any() else UsdGeom.Tokens.z
 

@@ -6,7 +6,6 @@ An error is the greatest difference at a frame over the scale of its field, whic
     kinetic, elastic, potential, contact    the largest |energy| among these, the potential one counted from its start;
                                             at least that of the stiffest spring strained by 1e-6
     momentum                                sqrt(2 m K), m the whole mass, K the largest kinetic energy or that least
-    anything else                           its own largest |value|
 
 each over both runs and all frames compared. What the digits of the coarser of the two stored types
 cannot tell apart is equal, and so are two NaN, or two infinities of one sign.
@@ -19,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions
-from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.errors import InputError
 from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
-DEFAULT = ("position", "surface", *ENERGIES, "momentum")
+COMPARED = ("position", "surface", *ENERGIES, "momentum")
 LEAST_STRAIN = 1e-6  # of the body or of a spring: less is rounding
 SAME_POINT = 1e-6  # of a cell
 SAME_TIME = 1e-6  # of the spacing of frames
@@ -50,7 +49,7 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return the number, among the frames compared, of the first whose error is above rtol; None for none."""
+        """Return which of the frames compared is the first whose error is above rtol; None for none."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 
@@ -84,14 +83,14 @@ class Distances(NamedTuple):
 
 
 @np.errstate(all="ignore")  # what overflows differs, and is reported as that
-def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Comparison:
-    """Compare the fields `names` of two runs at the times that both have, or those of DEFAULT that both have.
+def compare(a: Result, b: Result) -> Comparison:
+    """Compare the fields COMPARED of two runs, those that both have, at the times that both have.
 
-    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time or
-    not these fields in common.
+    Raises DifferentLattices if the lattices do not match, InputError if the runs have no time in common.
     """
     refuse_different_lattices(a, b)
-    chosen, left_out = _chosen(a, b, names)
+    either = [name for name in COMPARED if name in a.frames or name in b.frames]
+    chosen = [name for name in either if name in a.frames and name in b.frames]
     times = a.frames.time[:]
     pairs = common_times(times, b.frames.time[:])
     if not len(pairs):
@@ -100,27 +99,14 @@ def compare(a: Result, b: Result, names: Sequence[str] | None = None) -> Compari
     scales = _scales(a, b, distances, pairs)
     fields = []
     for name, (greatest, worst, _) in distances.items():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            errors = np.where(greatest == 0, 0.0, greatest / scales[name])
+        errors = np.where(greatest == 0, 0.0, greatest / scales[name])
         fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
-    return Comparison(pairs, times[pairs[:, 0]], fields, left_out)
-
-
-def _chosen(a: Result, b: Result, names: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Return the fields to compare, and those of DEFAULT that only one run has."""
-    shared = [name for name in a.frames if name in b.frames and name != "time"]
-    if names is None:
-        either = [name for name in DEFAULT if name in a.frames or name in b.frames]
-        return [n for n in either if n in shared], [n for n in either if n not in shared]
-    for name in names:
-        if name not in shared:
-            raise InputError(f"{a.path} and {b.path} do not both have frames/{name}{did_you_mean(name, shared)}")
-    return list(dict.fromkeys(names)), []
+    return Comparison(pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen])
 
 
 def rest_of(run: Result, name: str) -> Positions | None:
     """Return the rows (r, 3) at rest [m] of a field of positions; None for other fields, or without them."""
-    at_rest = FRAME_FIELDS[name].at_rest if name in FRAME_FIELDS else ""
+    at_rest = FRAME_FIELDS[name].at_rest
     return run[at_rest][:] if at_rest in run else None
 
 
@@ -130,7 +116,9 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")
     rest = rest_of(a, name)
     digits = max(float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0 for rows in (a_rows, b_rows))
-    greatest, worst, size = np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
+    greatest = np.empty(len(pairs))
+    worst = np.empty(len(pairs), int)
+    size = 0.0
     for number, (a_frame, b_frame) in enumerate(pairs):
         a_values, b_values = (np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame]))
         apart = _row_lengths(difference(a_values, b_values, digits))
@@ -157,8 +145,7 @@ def _row_lengths(rows: Array) -> Floats:
     """Return (r,) lengths of vectors (r, 3) or of one (3,), or sizes of plain numbers."""
     if rows.ndim == 0:
         return np.abs(rows)[None]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.ravel(np.linalg.norm(rows, axis=-1))
+    return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
 def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indices) -> dict[str, float]:
@@ -170,7 +157,7 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indice
     for name in scales:
         if name in ENERGIES:
             scales[name] = energy
-        elif name in FRAME_FIELDS and FRAME_FIELDS[name].at_rest:
+        elif FRAME_FIELDS[name].at_rest:
             scales[name] = max(scales[name], LEAST_STRAIN * side)
     if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
         scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
@@ -194,7 +181,7 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
 
 
 def _least_energy(run: Result) -> float:
-    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 where the file has no springs."""
+    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 for none."""
     if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
         return 0.0
     return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
@@ -223,13 +210,6 @@ def refuse_different_lattices(a: Result, b: Result) -> None:
     if not same.all():
         node = int(np.argmin(same))
         refuse(f"node {node} rests at {point_text(nodes[node])} in one, at {point_text(b_nodes[node])} in the other")
-    if "springs" not in a.lattice or "springs" not in b.lattice:
-        return
-    springs, b_springs = a.lattice.springs[:], b.lattice.springs[:]
-    if len(springs) != len(b_springs):
-        refuse(f"{len(springs)} and {len(b_springs)} springs")
-    if not np.array_equal(springs, b_springs) and not np.array_equal(_sorted(springs), _sorted(b_springs)):
-        refuse("their springs join other nodes")
 
 
 def cell_size(run: Result, nodes: Positions) -> float:
@@ -243,12 +223,6 @@ def cell_size(run: Result, nodes: Positions) -> float:
 def point_text(point: Floats) -> str:
     """Return a point (3,) [m] for a message."""
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
-
-
-def _sorted(springs: Indices) -> Indices:
-    """Return springs (s, 2) in an order of their own: that of the file depends on the number of ranks."""
-    ordered: Indices = np.unique(np.sort(springs, axis=1), axis=0)
-    return ordered
 
 
 def common_times(a: Floats, b: Floats) -> Indices:

@@ -24,7 +24,7 @@ def _slice(text: str) -> slice:
 
 
 def frames_of(path: str, frames: Frames, total: int) -> list[int]:
-    """Return the numbers of frames and slices of them, in their order. Raises InputError where there are none."""
+    """Return the numbers of frames and slices of them. Raises InputError for none."""
     numbers = range(total)
     chosen: list[int] = []
     for part in frames:

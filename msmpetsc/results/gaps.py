@@ -64,8 +64,9 @@ class SurfaceGaps:
         sums = [np.bincount(self.triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_triangles.T]
         normals = unit_vectors(np.stack(sums, axis=1))
         near = self.reach + float(np.quantile(np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1), USUAL))
-        ours, theirs = np.hstack([points, near * normals]), np.hstack([middles, -near * of_triangles])
-        pairs = KDTree(ours).sparse_distance_matrix(KDTree(theirs), np.sqrt(2) * near, output_type="ndarray")
+        ours = KDTree(np.hstack([points, near * normals]))
+        theirs = KDTree(np.hstack([middles, -near * of_triangles]))
+        pairs = ours.sparse_distance_matrix(theirs, np.sqrt(2) * near, output_type="ndarray")
         number, which = pairs["i"], pairs["j"]
         at_rest = self.rest[number] - self.rest[self.triangles[which]].mean(axis=1)
         other = self.body[number] != self.body[self.triangles[which, 0]]
@@ -98,7 +99,7 @@ def gaps_to_obstacles(
 
 
 def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
-    """Return the distance (n,) [m] of points (n, 3) to an obstacle where it stands at first; infinite if unknown."""
+    """Return the distance (n,) [m] of points to an obstacle at time 0; infinite if unknown."""
     gaps: Floats = np.full(len(points), np.inf)
     if obstacle.center is not None:
         gaps = np.linalg.norm(points - np.array(obstacle.center), axis=1) - (obstacle.radius or 0.0)
@@ -112,7 +113,7 @@ def _gaps(obstacle: ObstacleTable, points: Positions) -> Floats:
 
 
 def _gaps_to(surface: Surface, points: Positions) -> Floats:
-    """Return the distance (n,) [m] of points (n, 3) to a surface, negative behind the nearest of its triangles."""
+    """Return the distance (n,) [m] of points to a surface, negative behind its triangles."""
     if not len(surface.triangles):
         return np.full(len(points), np.inf)
     import igl  # for scenes with such obstacles

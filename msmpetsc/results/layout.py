@@ -18,18 +18,13 @@ from msmpetsc.results.disk import Storage
 CHUNK_BYTES = 64 * 2**20
 
 
-def open_new(storage: Storage) -> h5py.File:
-    """Begin an empty file, of a kind that a kill cannot spoil.
+def open_to_write(storage: Storage, mode: str) -> h5py.File:
+    """Begin an empty file ("w") of a kind that a kill cannot spoil, or write one of that kind further ("r+").
 
     libver earliest: its superblock has no flag "open for writing", which would shut a killed run's
     file. No chunk cache: nothing waits to be written. No lock: a running result may be looked at.
     """
-    return h5py.File(storage, "w", libver="earliest", rdcc_nbytes=0, locking=False)
-
-
-def open_again(storage: Storage) -> h5py.File:
-    """Open a file of that kind, to be written further."""
-    return h5py.File(storage, "r+", libver="earliest", rdcc_nbytes=0, locking=False)
+    return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
 
 
 class Plan(NamedTuple):
@@ -119,6 +114,7 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
     dcpl.set_obj_track_times(False)  # the same run makes the same bytes
     if plan.name == "frames/time":
         dcpl.set_fill_value(np.array(np.nan))  # what shrinking puts behind the new end
-    space, kind = h5py.h5s.create_simple(plan.shape, plan.shape), h5py.h5t.py_create(np.dtype(plan.dtype))
+    space = h5py.h5s.create_simple(plan.shape, plan.shape)
+    kind = h5py.h5t.py_create(np.dtype(plan.dtype))
     h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
     file[plan.name].attrs["unit"] = unit_of(plan.name)

@@ -1,4 +1,4 @@
-"""Arrays of a file, read where they are indexed: by numpy's rules, or through xarray."""
+"""Arrays of a file, read where they are indexed: as h5py's datasets are, or through xarray."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -11,9 +11,9 @@ from msmpetsc.errors import InputError, one_line
 
 
 class LazyArray:
-    """A dataset that is read by indexing, as numpy's arrays are: ``array[-1]``, ``array[:, 17]``, ``np.diff(array)``.
+    """A dataset that is read by indexing, as h5py's are: ``array[-1]``, ``array[:, 17]``, ``np.diff(array)``.
 
-    Frames end with the finished ones. One index may be a list or an array; each takes its rows one by one.
+    Frames end with the finished ones. One index may be a list that goes up, or a mask.
 
     name    : of the dataset in the file, "frames/position"
     planned : shape of the dataset in the file, frames to come included
@@ -23,7 +23,6 @@ class LazyArray:
         """Wrap a dataset; count: its rows that can be read, all if None."""
         self._dataset = dataset
         self._file, self.name = dataset.file.filename, dataset.name.lstrip("/")
-        self._by_row = count is not None
         self.planned: tuple[int, ...] = dataset.shape
         self.shape: tuple[int, ...] = (len(dataset) if count is None else count, *dataset.shape[1:])
         self.dtype = dataset.dtype
@@ -48,43 +47,23 @@ class LazyArray:
         return f"<{self.name} {self.shape} {self.dtype} [{self.unit}]>"
 
     def __getitem__(self, key: Any) -> Array:
-        keys = _key_per_axis(key, self.ndim)
-        arrays = [k for k in keys if not isinstance(k, int | np.integer | slice)]
-        if len(arrays) > 1:
-            raise IndexError(f"{self.name}: a list or an array may stand for one axis only")
-        if not arrays:
-            return self._read(keys)
-        if not self._by_row:
-            whole: Array = self[:][keys]
-            return whole
-        return self._read_rows(keys)
-
-    def _read_rows(self, keys: tuple[Any, ...]) -> Array:
-        """Read with a list or an array among the keys: row by row, for all together may be more than fits."""
-        first, rest = keys[0], keys[1:]
-        rows = np.arange(len(self))[first]
-        if not rows.size:
-            empty: Array = np.broadcast_to(np.zeros((), self.dtype), self.shape)[keys]  # its shape alone
-            return empty
-        if np.ndim(first):
-            values = np.array([self._read((row, *rest)) for row in rows.flat])
-        else:
-            values = np.array([self[int(row)][rest] for row in rows.flat])
-        return values.reshape(*rows.shape, *values.shape[1:])
-
-    def _read(self, keys: tuple[Any, ...]) -> Array:
-        """Read with numbers and slices for keys."""
-        parts: list[int | range] = [
-            range(size)[int(k) if isinstance(k, np.integer) else k] for k, size in zip(keys, self.shape, strict=True)
-        ]
         if not self._dataset:
             raise InputError(f"{self._file} is closed")
+        keys = key if isinstance(key, tuple) else (key,)
+        first, *rest = keys or (...,)
+        if first is Ellipsis:
+            first, rest = slice(None), [..., *rest]
         try:
-            values: Array = self._dataset[tuple(map(_forward, parts))]
+            if isinstance(first, slice):
+                rows: Any = slice(*first.indices(len(self)))
+            else:
+                rows = np.arange(len(self))[first]
+            values: Array = self._dataset[(rows, *rest)]
+        except (TypeError, ValueError) as error:
+            raise IndexError(f"{self.name} cannot be indexed with {key!r}: {one_line(error)}") from error
         except (OSError, RuntimeError, MemoryError) as error:
             raise InputError(f"{self._file}: {self.name} cannot be read: {one_line(error)}") from error
-        turned = [axis for axis, part in enumerate(part for part in parts if isinstance(part, range)) if part.step < 0]
-        return np.flip(values, turned) if turned else values
+        return values
 
 
 class Arrays(Mapping[str, LazyArray]):
@@ -114,27 +93,8 @@ class Arrays(Mapping[str, LazyArray]):
         return "\n".join([self._group, *map("  {!r}".format, self._arrays.values())])
 
 
-def _key_per_axis(key: Any, ndim: int) -> tuple[Any, ...]:
-    """Return the key with its ... and what is left out written as slices."""
-    keys = list(key) if isinstance(key, tuple) else [key]
-    dots = [axis for axis, k in enumerate(keys) if k is Ellipsis]
-    missing = ndim - len(keys) + len(dots)
-    if missing < 0 or len(dots) > 1 or any(k is None for k in keys):
-        raise IndexError(f"{ndim} axes cannot be indexed with {key!r}")
-    axis = dots[0] if dots else len(keys)
-    return (*keys[:axis], *[slice(None)] * missing, *keys[axis + len(dots) :])
-
-
-def _forward(part: int | range) -> int | slice:
-    """Return the index for h5py, whose slices only go up."""
-    if isinstance(part, int):
-        return part
-    part = part if part.step > 0 else part[::-1]
-    return slice(part.start, part.stop, part.step) if len(part) else slice(0, 0)
-
-
 def xarray_variable(dimensions: Sequence[str], array: LazyArray, long_name: str) -> Any:
-    """Return an xarray.Variable that reads the array where it is used, as xarray's own readers of files do it."""
+    """Return an xarray.Variable that reads the array where it is used, as xarray's own do."""
     import xarray
     from xarray.backends import BackendArray
     from xarray.core import indexing

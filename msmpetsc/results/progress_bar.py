@@ -44,11 +44,12 @@ class Progress:
             self._bar.update(frame.index - self._bar.n)
             return
         now = time.monotonic()
-        is_first, self._begun = self._begun is None, self._begun or (now, frame.index)
-        if is_first or frame.index == self._total or now - self._printed >= LINE_EVERY:
-            self._print(frame, now, *self._begun)
+        begun = self._begun or (now, frame.index)
+        if self._begun is None or frame.index == self._total or now - self._printed >= LINE_EVERY:
+            self._print(frame, now, *begun)
         else:
             self._unprinted = frame
+        self._begun = begun
 
     def close(self) -> None:
         """Leave the bar as it is, or print the last frame if that had no line."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -43,14 +43,6 @@ DEFLATE_MOST = 1032  # zlib packs no better than this
 AXES: dict[int | str, str] = {"T": "time", "n": "node", "v": "point", 3: "axis"}  # xarray's names of dimensions
 
 
-class StoredState(NamedTuple):
-    """The positions of a checkpoint, q_n and q_(n-1), (n, 3) [m] each, after `step` steps."""
-
-    step: int
-    q: Positions
-    q_previous: Positions
-
-
 class Result:
     """A result file, opened to be read; also one that is being written, up to the frames finished by now.
 
@@ -72,7 +64,7 @@ class Result:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
-        self.frames, self._checkpoint = map(self._group, ("frames", "checkpoint"))
+        self.frames = self._group("frames")
 
     def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
         count = finished(self.file)
@@ -114,13 +106,13 @@ class Result:
         return name in self._datasets
 
     def __getitem__(self, name: str) -> LazyArray:
-        """Return the array of a dataset by its name in the file, "lattice/nodes"; InputError where it has none."""
+        """Return the array of a dataset, "lattice/nodes". Raises InputError where there is none."""
         if name not in self._datasets:
             raise InputError(f"{self.path} is damaged: it has no {name}")
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return all of a dataset that names nodes or points. Raises InputError where there are no such ones."""
+        """Return a dataset that names nodes or points. Raises InputError where it names others."""
         rows, count = self[name][:].astype(np.int64), len(self[NAMED[name]])
         plural = NAMED[name].partition("/")[2]
         if rows.size and not 0 <= rows.min() <= rows.max() < count:
@@ -170,22 +162,8 @@ class Result:
             return self[f"{group}/body"][:].astype(np.int64)
         return np.zeros(len(self["lattice/nodes" if group == "lattice" else "surface/points"]), np.int64)
 
-    @property
-    def checkpoint(self) -> StoredState | None:
-        """The newest checkpoint by now, or None."""
-        if not {"step", "q", "q_previous"} <= self._checkpoint.keys():
-            return None
-        while True:
-            slot = newest_slot(self._checkpoint.step[:])
-            if slot is None:
-                return None
-            step = int(self._checkpoint.step[slot])
-            state = StoredState(step, self._checkpoint.q[slot], self._checkpoint.q_previous[slot])
-            if step >= 0 and self._checkpoint.step[slot] == step:  # or a running process has begun to replace it
-                return state
-
     def to_xarray(self) -> "Dataset":
-        """Return the frames, read where they are used: with coordinates, the lattice at rest, units and long names."""
+        """Return the frames, read where they are used, with coordinates, units and long names."""
         try:
             import xarray
         except ImportError as error:  # also of what xarray itself needs
@@ -301,7 +279,7 @@ def as_python(value: Any) -> Any:
 
 
 def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return all that belong to a result, "frames/time" and the like; InputError if one is not what it should be."""
+    """Return all that belong to a result by their names. Raises InputError for a wrong one."""
     path = Path(file.filename)
     for name in NEEDED:
         if object_at(path, file, name) is None:
@@ -313,7 +291,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
-    """Raise InputError where one letter of the table stands for two numbers, or frames for fewer than `count`."""
+    """Raise InputError where a letter of the table is two numbers, or frames are too few."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):
@@ -327,7 +305,7 @@ def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> N
 
 
 def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
-    """Return what the file has under a name, None for nothing; InputError if a link on the way leads elsewhere."""
+    """Return what the file has under a name, None for nothing. Raises InputError for links."""
     node = file
     for part in name.split("/"):
         # the lower layer: h5py's own `in` and `get` follow a link to say whether it leads anywhere
@@ -339,17 +317,12 @@ def object_at(path: Path, file: h5py.File, name: str) -> h5py.HLObject | None:
     return node
 
 
-def _is_external(dataset: h5py.Dataset) -> bool:
-    """Tell whether its numbers are in other files. To be asked before its shape, which HDF5 may look up there."""
-    return dataset.is_virtual or bool(dataset.external)
-
-
 def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """Return the dataset, if it holds numbers as it should, of as many axes, and no more than the file can hold."""
+    """Return the dataset, if it holds numbers as it should, no more than the file can hold."""
     dataset = object_at(path, file, name)
     if not isinstance(dataset, h5py.Dataset):
         raise InputError(f"{path} is damaged: it has no dataset {name}")
-    if _is_external(dataset):
+    if dataset.is_virtual or dataset.external:  # to be asked before its shape, which HDF5 may look up there
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
     field = FIELDS.get(name)
     kinds = "f" if field is None or field.dtype.startswith("f") else "iu"

@@ -1,7 +1,8 @@
-"""Restart: what a result file says of the run that wrote it, its last checkpoint, whether a lattice is its own."""
+"""Restart: what a result file says of its run, its last checkpoint, its lattice."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,9 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
-from msmpetsc.checkpoint import AT_REST, ROWS, Checkpoint
-from msmpetsc.comm import together
+from msmpetsc.checkpoint import AT_REST, Checkpoint
+from msmpetsc.comm import on_root, together
 from msmpetsc.errors import InputError, printable
-from msmpetsc.fields import FRAME_FIELDS
 from msmpetsc.results.comparison import rows_agree
 from msmpetsc.results.reader import (
     Result,
@@ -39,7 +39,6 @@ class Earlier:
     step       : of the last checkpoint, 0 if it has none
     finished   : frames that it has
     planned    : frames that it has room for
-    exact      : whether its checkpoints are laid out as those of today
     at_rest    : whether it ended there (time.until)
     """
 
@@ -49,7 +48,6 @@ class Earlier:
     step: int
     finished: int
     planned: int
-    exact: bool
     at_rest: bool
 
     @classmethod
@@ -59,28 +57,17 @@ class Earlier:
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
             names = _checked_numbers(path, result.file)
-            _refuse_foreign_series(result)
-            is_of_now = names is not None and set(result.file["checkpoint"]) <= {"step", "numbers", *ROWS}
             count, planned = len(result.frames.time), result.frames.time.planned[0]
             at_rest = bool(count) and _is_at_rest(result, names or [])
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0
         true_error = true_error if isinstance(true_error, int) and true_error > 0 else 0
-        return cls(path, texts, true_error, step, count, planned, bool(names) and is_of_now, at_rest)
+        return cls(path, texts, true_error, step, count, planned, at_rest)
 
 
 def _is_at_rest(result: Result, names: list[str]) -> bool:
     """Return whether the newest checkpoint, with numbers of these names, is of a run at rest."""
     slot = newest_slot(result["checkpoint/step"][:]) if AT_REST in names else None
     return slot is not None and bool(result["checkpoint/numbers"][slot][names.index(AT_REST)] == 1)
-
-
-def _refuse_foreign_series(result: Result) -> None:
-    """Raise InputError where the numbers of frames are not stored as a run stores them; an older one may lack some."""
-    for name, array in result.frames.items():
-        if name not in ("position", "surface"):
-            field = FRAME_FIELDS[name]
-            if array.dtype != field.dtype or array.shape[1:] != field.shape[1:]:
-                raise InputError(f"{result.path} is damaged: frames/{name} has type {array.dtype}")
 
 
 def _checked_numbers(path: Path, file: h5py.File) -> list[str] | None:
@@ -116,18 +103,28 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
     owned : nodes of this rank; the ranks' follow each other
     """
-    with RootFile(comm, path) as file:
-        slot = file.ask(lambda stored: newest_slot(stored["checkpoint/step"][:]) if "checkpoint" in stored else None)
+    with opened_on_root(comm, path) as file:
+        newest = comm.bcast(on_root(comm, lambda: _newest(path, file)))
+        if newest is None:
+            return None
+        slot, names, empty = newest
+        rows = {name: _own_rows(comm, path, file, (f"checkpoint/{name}", slot), owned) for name in names}
+        return replace(empty, rows=rows)
+
+
+def _newest(path: Path, file: h5py.File) -> tuple[int, list[str], Checkpoint] | None:
+    """Return slot, names of rows, step and numbers of the newest checkpoint; None if there is none."""
+    numbers = _checked_numbers(path, file)
+    if numbers is None:
+        return None
+    with plain_damage(path):
+        group = file["checkpoint"]
+        slot = newest_slot(group["step"][:])
         if slot is None:
             return None
-        step = file.ask(lambda stored: int(stored["checkpoint/step"][slot]))
-        names = file.ask(lambda stored: _checked_numbers(path, stored)) or []
-        values = file.ask(lambda stored: stored["checkpoint/numbers"][slot].tolist() if names else [])
-        stored_rows = file.ask(
-            lambda stored: [name for name in stored["checkpoint"] if name not in ("step", "numbers")]
-        )
-        rows = {name: file.rows(f"checkpoint/{name}", owned, slot) for name in stored_rows}
-        return Checkpoint(step, rows, dict(zip(names, values, strict=True)))
+        values = group["numbers"][slot].tolist() if numbers else []
+        rows = [name for name in group if name not in ("step", "numbers")]
+        return slot, rows, Checkpoint(int(group["step"][slot]), numbers=dict(zip(numbers, values, strict=True)))
 
 
 def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
@@ -160,14 +157,13 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
 
     lattice : this rank's rows by dataset, "lattice/nodes"
     """
-    with RootFile(comm, path) as file:
-        for name, rows in lattice.items():
-            stored_count = file.length(name)
-            if stored_count is None:
-                continue
-            same = stored_count == comm.allreduce(len(rows))
+    with opened_on_root(comm, path) as file:
+        counts = comm.bcast(on_root(comm, lambda: {name: len(file[name]) for name in lattice if name in file}))
+        for name, count in (counts or {}).items():
+            rows = lattice[name]
+            same = count == comm.allreduce(len(rows))
             if same:
-                stored = file.rows(name, len(rows)).astype(float)
+                stored = _own_rows(comm, path, file, (name,), len(rows)).astype(float)
                 greatest = max(comm.allgather(np.abs(stored).max(initial=0)))
                 agree = rows_agree(np.asarray(rows, float), stored, SAME * greatest).all()
                 same = all(comm.allgather(bool(agree)))
@@ -175,50 +171,25 @@ def refuse_changed_lattice(comm: MPI.Comm, path: Path, lattice: dict[str, Array]
                 raise InputError(f"{path}: the mesh has changed: {name} is not what this run makes of it")
 
 
-class RootFile:
-    """A result file, open on rank 0, from which the ranks take their rows (all methods are collective)."""
+@contextmanager
+def opened_on_root(comm: MPI.Comm, path: Path) -> Iterator[Any]:
+    """Open a result file on rank 0 alone, None elsewhere (collective). Raises InputError."""
+    file = on_root(comm, lambda: open_result(path))
+    try:
+        yield file
+    finally:
+        if file is not None:
+            file.close()
 
-    def __init__(self, comm: MPI.Comm, path: Path):
-        """Open the file. Raises InputError where it is no result."""
-        self._comm, self._path = comm, path
-        self._file: h5py.File | None = None
-        with together(comm):
-            if comm.rank == 0:
-                self._file = open_result(path)
 
-    def __enter__(self) -> "RootFile":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def length(self, name: str) -> int | None:
-        """Return the rows of a dataset; None if the file does not have it."""
-        count: int | None = self.ask(lambda file: len(file[name]) if name in file else None)
-        return count
-
-    def rows(self, name: str, count: int, index: int | None = None) -> Array:
-        """Return this rank's `count` rows of a dataset, or of its row `index`: (count, ...)."""
-        counts: Sequence[int] = self._comm.allgather(count)
-        dtype, shape = self.ask(lambda file: (file[name].dtype, file[name].shape[1 if index is None else 2 :]))
-        own = np.empty((count, *shape), dtype)
-        file: Any = self._file
-        failure = scatter_rows(
-            self._comm, own, counts, lambda part: file[name][part if index is None else (index, part)]
-        )
-        with together(self._comm):
-            if failure is not None:
-                raise InputError(f"{self._path} cannot be read: {failure}")
-        return own
-
-    def ask(self, question: Callable[[h5py.File], Any]) -> Any:
-        """Return on every rank what rank 0 reads from the file."""
-        answer = None
-        with together(self._comm):
-            if self._file is not None:
-                try:
-                    answer = question(self._file)
-                except (OSError, KeyError) as error:
-                    raise InputError(f"{self._path} is damaged: {error}") from None
-        return self._comm.bcast(answer)
+def _own_rows(comm: MPI.Comm, path: Path, file: Any, place: tuple[str] | tuple[str, int], count: int) -> Array:
+    """Return this rank's `count` rows of a dataset, or of its row of a number: (count, ...) (collective)."""
+    name, *index = place
+    counts = comm.allgather(count)
+    dtype, shape = comm.bcast(on_root(comm, lambda: (file[name].dtype, file[name].shape[1 + len(index) :])))
+    own = np.empty((count, *shape), dtype)
+    failure = scatter_rows(comm, own, counts, lambda part: file[name][(*index, part)])
+    with together(comm):
+        if failure is not None:
+            raise InputError(f"{path} cannot be read: {failure}")
+    return own

@@ -5,11 +5,10 @@ point counts by the area around it, a third of its triangles'.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Indices
+from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import (
     LEAST_STRAIN,
@@ -27,34 +26,13 @@ NEEDED = ("frames/surface", "surface/points", "surface/triangles")
 MEAN = "surface, rms"  # name of the field
 
 
-@dataclass(frozen=True)
-class SurfaceDistance:
-    """How far the surface of a run is from that of a reference run.
-
-    pairs    : (p, 2) frames of equal time in the run and the reference
-    times    : (p,) [s]
-    rms      : (p,) distance of the points [m], root mean square over the area
-    greatest : (p,) greatest distance of a point [m]
-    worst    : (p,) the point that is so far
-    moved    : greatest distance of a point of the reference from its place at rest, [m]; 0 if none moves
-    """
-
-    pairs: Indices
-    times: Floats
-    rms: Floats
-    greatest: Floats
-    worst: Indices
-    moved: float
-
-    @property
-    def overall(self) -> float:
-        """Distance [m], root mean square over the surface and the times."""
-        return float(np.sqrt(np.mean(self.rms**2)))
-
-
 @np.errstate(over="ignore", invalid="ignore")  # what overflows is far apart, and is reported as that
-def surface_distance(run: Result, reference: Result, until: float = math.inf) -> SurfaceDistance:
-    """Return the distance of a run's surface from that of a reference run, at the times that both have.
+def compare_surfaces(run: Result, reference: Result, until: float = math.inf) -> Comparison:
+    """Return how far the surface of a run is from that of a reference run, at the times that both have.
+
+    Its fields are the greatest distance of a point, and the root mean square over the area (MEAN).
+    Both are relative to the largest displacement of a point in the reference, their scale [m]; if
+    that is 0, as none moves, they are in metres.
 
     until : times after it do not count [s]
 
@@ -69,7 +47,9 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
         pairs = pairs[times[pairs[:, 0]] > 0]  # when it is in its rest shape, which is no state of equilibrium
     if not len(pairs):
         raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
-    rms, greatest, worst, moved = np.empty(len(pairs)), np.empty(len(pairs)), np.empty(len(pairs), int), 0.0
+    worst = np.empty(len(pairs), int)
+    greatest, rms = np.empty((2, len(pairs)))
+    moved = 0.0
     for number, (of_run, of_reference) in enumerate(pairs):
         true = np.asarray(reference.frames.surface[of_reference], float)
         apart = np.linalg.norm(run.frames.surface[of_run] - true, axis=1)
@@ -77,11 +57,13 @@ def surface_distance(run: Result, reference: Result, until: float = math.inf) ->
         rms[number] = np.sqrt(area @ apart**2 / area.sum())
         worst[number] = np.argmax(apart)
         greatest[number] = apart[worst[number]]
-        moved = max(moved, np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0))
-    moved = (
-        moved if moved > LEAST_STRAIN * longest_side(rest, reference.body_of("surface")) else 0.0
-    )  # less is rounding
-    return SurfaceDistance(pairs, times[pairs[:, 0]], rms, greatest, worst, float(moved))
+        moved = max(moved, float(np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)))
+    if moved <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
+        moved = 0.0  # less is rounding
+    scale = moved or 1.0
+    surface = FieldError("surface", "m", moved, greatest / scale, worst)
+    mean = FieldError(MEAN, "m", moved, rms / scale, worst)
+    return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
 
 
 def point_areas(run: Result) -> Array:
@@ -114,17 +96,3 @@ def refuse_different_meshes(a: Result, b: Result) -> None:
         )
     if not np.array_equal(a["surface/triangles"][:], b["surface/triangles"][:]):
         refuse("their triangles join other points")
-
-
-def compare_surfaces(a: Result, b: Result) -> Comparison:
-    """Return the surfaces of two runs compared as fields of the greatest distance and of its mean over the surface.
-
-    Errors are relative to the largest displacement in `b`. Raises InputError as ``surface_distance`` does.
-    """
-    distance = surface_distance(a, b)
-    scale = distance.moved or 1.0
-    fields = [
-        FieldError(name, "m", scale, values / scale, distance.worst)
-        for name, values in (("surface", distance.greatest), (MEAN, distance.rms))
-    ]
-    return Comparison(distance.pairs, distance.times, fields, [])

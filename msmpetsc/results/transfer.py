@@ -85,7 +85,7 @@ def scatter_rows(comm: MPI.Comm, rows: Array, counts: Sequence[int], load: Calla
 
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
-    """Return a descriptor of the file on each rank, or None on all if they do not see the same file (collective)."""
+    """Return a descriptor of the file on each rank, None where they see others (collective)."""
     descriptor, identity = None, None
     try:
         descriptor = os.open(path, os.O_WRONLY)

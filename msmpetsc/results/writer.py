@@ -38,7 +38,7 @@ from msmpetsc.results.disk import (
     refuse_no_file,
     refuse_small_disk,
 )
-from msmpetsc.results.layout import Layout, open_again, open_new
+from msmpetsc.results.layout import Layout, open_to_write
 from msmpetsc.results.reader import (
     FORMAT,
     FORMAT_VERSION,
@@ -226,10 +226,10 @@ class ResultFile:
             if self._begin is Begin.IN_PLACE:
                 open_result(self.path).close()
                 self._storage = Storage(self.path, "r+")
-                self._file = open_again(self._storage)
+                self._file = open_to_write(self._storage, "r+")
             else:
                 self._storage = Storage(self._part, "w+")
-                self._file = open_new(self._storage)
+                self._file = open_to_write(self._storage, "w")
                 self._file.attrs.update(attributes | {"format": FORMAT, "format_version": FORMAT_VERSION})
         except Exception:
             self._part.unlink(missing_ok=True)

@@ -48,7 +48,7 @@ def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements:
 
 
 def _frame_slab(run: Result, points: str, index: int) -> ET.Element:
-    """Return frame `index` of points (T, n, 3): start, stride and count along each axis, and where to take it from."""
+    """Return frame `index` of points (T, n, 3): start, stride, count, and the dataset."""
     _, rows, axes = run[points].shape
     item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=f"{rows} {axes}", Type="HyperSlab")
     item.append(ET.Comment(f"frame {index}"))  # VTK takes the first thing in it for its name, and caches points by that

@@ -84,8 +84,8 @@ class Effort:
         self.true_error, self.energy_error = np.fmax((self.true_error, self.energy_error), errors)
 
 
-class Simulation:
-    """Steps a model from its start. Use as a context manager: its PETSc objects are destroyed on leaving.
+class TimeLoop:
+    """The loop over the steps of a run, from its start. A context manager, which destroys its PETSc objects on leaving.
 
     state         : that goes with the last frame, or the last step
     step          : steps taken
@@ -250,7 +250,7 @@ class Simulation:
             **vars(effort.work),
         )
 
-    def __enter__(self) -> "Simulation":
+    def __enter__(self) -> "TimeLoop":
         try:
             self.integrator.set_up()
             self._saved = self._save()

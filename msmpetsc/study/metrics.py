@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import common_times, refuse_different_lattices
 from msmpetsc.results.reader import Result
-from msmpetsc.results.surfaces import surface_distance
+from msmpetsc.results.surfaces import compare_surfaces
 from msmpetsc.study.table import Row
 
 COUNTS = ("cells", "nodes", "unknowns", "springs")
@@ -253,7 +253,7 @@ def surface_error(result: Path, reference: Path, until: float = math.inf) -> flo
     Raises InputError if the meshes differ, a surface was not stored, there is no common time, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
-        distance = surface_distance(run, true, until)
-    if distance.moved == 0:
+        _, mean = compare_surfaces(run, true, until).fields
+    if mean.scale == 0:
         raise InputError(f"{reference}: nothing moves in it")
-    return distance.overall / distance.moved
+    return float(np.sqrt(np.mean(mean.errors**2)))

@@ -7,7 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import msmpetsc
+from msmpetsc.backend.kernel import cache_is_empty
 
 PACKAGE = Path(msmpetsc.__file__).parent
 
@@ -33,3 +36,10 @@ def test_the_users_own_folder_is_taken(tmp_path: Path):
         code = "import msmpetsc, numba; print(numba.config.CACHE_DIR)"
         done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
         assert done.stdout.startswith(seen)
+
+
+def test_an_empty_cache_is_told_from_a_filled_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert cache_is_empty()
+    (tmp_path / "kernel.nbi").touch()
+    assert not cache_is_empty()

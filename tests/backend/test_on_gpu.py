@@ -33,7 +33,7 @@ from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.petsc import device
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 PACKAGE = Path(msmpetsc.__file__).parent
 T = 0.01
@@ -106,7 +106,7 @@ on_a_gpu = pytest.mark.parametrize("on_gpu", [pretended, pytest.param(real, mark
 
 def play(path: Path, measured: Probes | None = None) -> list[Frame]:
     scene = load_scene(path)
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), measured or Probes()) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), measured or Probes()) as simulation:
         return list(simulation.frames())
 
 
@@ -145,7 +145,7 @@ def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
 def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(tmp_path: Path, case: str):
     """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has come to."""
     scene = load_scene(block_scene(tmp_path, **CASES[case], output={"surface": False, "every": 4}))
-    with pretended() as counted, Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    with pretended() as counted, TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         frame = None
         for frame in simulation.advance():  # noqa: B007  # the last one is asked for
             if simulation.step == 4:
@@ -160,14 +160,14 @@ def test_a_run_goes_on_from_what_was_saved_to_the_last_bit(tmp_path: Path, case:
     scene = load_scene(block_scene(tmp_path, **CASES[case]))
     model = build_model(MPI.COMM_SELF, scene)
     with pretended():
-        with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+        with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
             frames = simulation.frames()
             for _ in range(5):  # of them one at the start
                 next(frames)
             saved = simulation.saved()
             assert all(isinstance(rows, np.ndarray) for rows in saved.rows.values())
             whole = [frame.position for frame in frames]
-        with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+        with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
             simulation.restore(saved)
             np.testing.assert_array_equal([frame.position for frame in simulation.frames()], whole)
 

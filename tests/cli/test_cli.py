@@ -279,23 +279,3 @@ def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
         assert finished(file) == len(file["frames/position"]) == 3
         assert np.isfinite(file["frames/position"][:]).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]
-
-
-BUG_ON_RANK_1 = """
-import sys
-from mpi4py import MPI
-from msmpetsc.cli.main import main
-from msmpetsc import build
-def broken(body, scene):
-    raise ValueError("planted")
-if MPI.COMM_WORLD.rank == 1:
-    build.fill_cages = broken
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def test_a_bug_on_one_rank_ends_all(scene: Path, tmp_path: Path):
-    done = run(2, "-c", BUG_ON_RANK_1, "run", scene, "-o", tmp_path / "o.h5", timeout=30)
-    assert done.returncode == 1
-    assert "msmpetsc: rank 1: Traceback" in done.stderr and "ValueError: planted" in done.stderr
-    assert not (tmp_path / "o.h5").exists()

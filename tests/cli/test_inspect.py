@@ -1,7 +1,6 @@
 """What inspect says of R ranks, against what R ranks hold; and where integers end."""
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -107,20 +106,6 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
 # The command
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--ranks", "0"], "--ranks must be at least 1"),
-        (["--set", "cages.cuont=3"], "did you mean 'count'"),
-        (["--ranks", "many"], "--ranks must be at least 1, not many"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(scene: Path, capsys, words: list[str], said: str):
-    assert main(["inspect", str(scene), *words]) == 2
-    told = capsys.readouterr()
-    assert said in told.err and told.err.count("\n") == 1 and told.out == ""
-
-
 def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
     found = counted(scene, 300, 3)
     assert main(["inspect", str(scene), "--ranks", "3"]) == 0
@@ -128,17 +113,6 @@ def test_counts_and_limits_are_told_without_a_run(scene: Path, capsys):
     assert told["nodes"] == [f"{found.nodes.sum()}", f"{found.nodes.mean():.1f}", f"{found.nodes.max()}"]
     assert told["ghosts"][2] == str(found.ghosts.max()) and told["messages an exchange"][2] == "2"
     assert 3 * 0.29 < float(told["memory [GB]"][0]) < 3 * 0.31
-
-
-def test_the_budget_of_a_plan_is_told_and_whether_it_is_of_this_scene(scene: Path, capsys):
-    budget = "budget={target = 0.1, cells = 0.05, time = 0.02, step = 0.001, count = 300, time_step = 0.01}"
-    words = ["inspect", str(scene), "--set", budget]
-    assert main(words) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"surface error expected +0.071, asked for 0.1\n +of the cells +0.05\n", out)
-    assert "not of" not in out
-    assert main([*words, "--set", "cages.count=200"]) == 0
-    assert "expected of 300 cells and steps of 0.01 s, not of what the scene has now" in capsys.readouterr().out
 
 
 def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, monkeypatch):

@@ -42,12 +42,6 @@ def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, cap
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["x.h5", "x.HDF5", "x.2.h5"])
-def test_names_of_results_are_taken(folder, tmp_path, name):
-    assert main(["run", str(folder / "scene.toml"), "-o", str(tmp_path / name)]) == 0
-    assert (tmp_path / name).is_file()
-
-
 ALONE = {
     "compare": (["bar.h5", "bar.h5"], "compare is started without mpiexec: it reads two files"),
     "plan": (["scene.toml", "--surface-error", "0.1"], "plan is started without mpiexec: it starts its runs"),

@@ -15,7 +15,7 @@ from one_process import IN_ONE_PROCESS, errors
 from msmpetsc.build import build_model, read_bodies
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
@@ -99,7 +99,7 @@ def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path:
     database = PETSc.Options()
     database.setValue("ksp_rtol", "1e-8")
     try:
-        with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
             first = simulation.integrator.stepper
             assert len(list(simulation.frames())) == 4
             second = simulation.integrator.stepper

@@ -2,20 +2,17 @@
 
 import json
 import logging
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import trimesh
 from block_scene import CELL, block_scene
-from conftest import ENVIRONMENT, run
+from conftest import run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
 
-from msmpetsc.app.summary import log_model, taken
+from msmpetsc.app.summary import log_model
 from msmpetsc.build import Model, build_model, read_bodies
-from msmpetsc.constraints.coverage import Reach
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.toml import toml_value
@@ -205,12 +202,6 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
         assert heard()[0] == ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}")
 
 
-def test_of_many_tables_the_first_are_named():
-    reaches = [Reach(f"force.{number}", 5, 0, "force") for number in range(20)]
-    assert taken(reaches)[-2:] == ["force.11 pulls 5 nodes", "and 8 more"] and len(taken(reaches)) == 13
-    assert len(taken(reaches[:13])) == 13
-
-
 def test_an_open_mesh_has_no_volume_to_say(tmp_path):
     scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.01})
     box = trimesh.load(tmp_path / "scene.ply")
@@ -218,31 +209,6 @@ def test_an_open_mesh_has_no_volume_to_say(tmp_path):
     done = run(1, "-m", "msmpetsc.cli.main", "run", scene, "-o", tmp_path / "x.h5")
     mesh = "open mesh (3 boundary edges), its volume unknown"
     assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
-
-
-COMPILES = """
-import logging, sys
-import numpy as np
-from msmpetsc.backend.compiling import compilation_logged
-from msmpetsc.contact.obstacles.solids import depth
-from msmpetsc.comm import log
-log.addHandler(logging.StreamHandler(sys.stdout))
-log.setLevel(logging.INFO)
-with compilation_logged():
-    for kind in sys.argv[1:]:
-        depth(np.zeros(3, kind), np.ones((1, 3)), np.eye(3)[:1], 0)
-"""
-
-
-def test_a_wait_for_the_compiler_is_told_once_and_only_where_there_is_one(tmp_path):
-    def said(*kinds: str) -> str:
-        environment = {**ENVIRONMENT, "NUMBA_CACHE_DIR": str(tmp_path)}
-        command = [sys.executable, "-c", COMPILES, *kinds]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=True).stdout
-
-    assert said("f8") == "compiling kernels, once, about a minute\n"
-    assert said("f8") == ""
-    assert said("f8", "f4", "i4") == "compiling kernels, once\n"  # for other types
 
 
 def test_ranks_refuse_and_warn_as_one(tmp_path):

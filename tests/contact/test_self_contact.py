@@ -21,7 +21,7 @@ from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.instrumentation import Probes
-from msmpetsc.solve.simulate import Simulation, refuse_bad_options
+from msmpetsc.solve.simulate import TimeLoop, refuse_bad_options
 
 COMM = MPI.COMM_SELF
 GAP = 4e-4  # [m] between the arms, of a distance of 1e-3 m
@@ -168,10 +168,10 @@ def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_pa
     friction = {"friction": 0.3, "distance": 1e-3}
     scene = load_scene(pinch_scene(tmp_path, material=STIFFENING, self_contact=friction), ("time.duration=0.1",))
     model = build_model(COMM, scene)
-    with Simulation(COMM, scene, model) as simulation:
+    with TimeLoop(COMM, scene, model) as simulation:
         frames = [copy.deepcopy(simulation.saved()) if frame.index == 8 else frame for frame in simulation.frames()]
     saved, whole = frames[8], frames[9:]
-    with Simulation(COMM, scene, model) as simulation:
+    with TimeLoop(COMM, scene, model) as simulation:
         simulation.restore(saved)
         resumed = list(simulation.frames())
     assert whole[0].self_contacts > 0 and len(resumed) == 2

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from msmpetsc.build import Model, build_model
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 CELL = 1 / 8  # [m]: a binary fraction, so that the block is a whole number of cells long
 SIDES = np.array([0.5, 0.5, 0.25])
@@ -37,5 +37,5 @@ def play(path: Path, *overrides: str) -> tuple[Model, list[Frame]]:
     """The frames of a scene, on one rank."""
     scene = load_scene(path, overrides)
     model = build_model(MPI.COMM_SELF, scene)
-    with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
         return model, list(simulation.frames())

@@ -53,9 +53,9 @@ def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
 
 def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
     """This process gets the signal when the run has taken that step."""
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
-    advance = Simulation.advance
+    advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -63,7 +63,7 @@ def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Sign
                 os.kill(os.getpid(), number)
             yield frame
 
-    monkeypatch.setattr(Simulation, "advance", watched)
+    monkeypatch.setattr(TimeLoop, "advance", watched)
 
 
 def ranks_of(mpiexec: subprocess.Popen) -> list[int]:

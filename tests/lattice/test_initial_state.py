@@ -13,7 +13,7 @@ from msmpetsc.build import Model, build_model
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 T = 1 / 128
 MIDDLE, MASS = SIDES / 2, DENSITY * SIDES.prod()
@@ -29,7 +29,7 @@ def at_start(folder: Path, start: dict) -> tuple[Model, Frame]:
     """Its start alone: what a step makes of a body that is a line is for rounding to say."""
     scene = load_scene(block_scene(folder, time={"step": T, "duration": T}, start=start))
     model = build_model(MPI.COMM_SELF, scene)
-    with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
         return model, next(simulation.frames())
 
 

@@ -18,7 +18,7 @@ from msmpetsc.constraints.clamp import LEAST
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 CASES = ROOT / "tests" / "cases"
 TIME = {"step": 0.01, "duration": 0.1}
@@ -80,7 +80,7 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is():
     """Work of the weight: of 4,000 to 30,000 cells 1.23e-4 to 1.31e-4 J. It was 2.4e-5 J, and 3.7e-5 J of 8,000."""
     scene = load_scene(CASES / "bunny_grazing_pin.toml")
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         first, *_, last = simulation.frames()
     assert 0.9 < (first.potential - last.potential) / 1.25e-4 < 1.6
 

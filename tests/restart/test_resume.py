@@ -27,7 +27,7 @@ from msmpetsc.results.restart import Earlier
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve import simulate
 from msmpetsc.solve.presets import PRESETS
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 COMM = MPI.COMM_SELF
 GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
@@ -115,14 +115,14 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path, case, m
     monkeypatch.setattr(simulate, "REMEMBERED", 2)
     scene = load_scene(block_scene(tmp_path, **CASES[case]))
     model, frames, saved = build_model(COMM, scene), [], []
-    with Simulation(COMM, scene, model) as simulation:
+    with TimeLoop(COMM, scene, model) as simulation:
         for frame in simulation.advance():
             frames.append(frame)
             saved.append(copy.deepcopy(simulation.saved()))
     if case.startswith(("substep", "fallback")):
         assert sum(frame.substeps + frame.fallbacks for frame in frames) > 0
     for begin in {2, 4, 8, len(saved) // 4 * 2, len(saved) // 2 * 2 - 2}:
-        with Simulation(COMM, scene, model) as simulation:
+        with TimeLoop(COMM, scene, model) as simulation:
             simulation.restore(saved[begin])
             steps = zip(simulation.advance(), range(begin + 1, begin + 3), strict=False)
             for frame, index in steps:
@@ -138,7 +138,7 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path, case, m
 def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
     def rows(scene: dict) -> set[str]:
         read = load_scene(block_scene(tmp_path, **scene))
-        with Simulation(COMM, read, build_model(COMM, read)) as simulation:
+        with TimeLoop(COMM, read, build_model(COMM, read)) as simulation:
             return simulation.saved().rows.keys() - {"q", "q_previous"}
 
     followed = {"lowest_mode"}  # whether a step is at a minimum is asked of every implicit one
@@ -179,7 +179,7 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
     """A checkpoint at the start alone, and a failure later: not one frame is written again."""
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
-        advance = Simulation.advance
+        advance = TimeLoop.advance
 
         def killed(simulation):
             for frame in advance(simulation):
@@ -187,7 +187,7 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
                 if simulation.step == 21:
                     raise InterruptedError
 
-        patch.setattr(Simulation, "advance", killed)
+        patch.setattr(TimeLoop, "advance", killed)
         arguments = ["-o", str(path), "--true-error", "3", "--checkpoint-every", "1h"]
         assert main(["run", str(whole.parent / "scene.toml"), *arguments]) == 1
     with h5py.File(path) as file:
@@ -197,29 +197,6 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
     assert_same(path, whole)
     with h5py.File(path) as file:
         assert np.array_equal(file["frames/wall_time"][:8], times)
-
-
-def test_steps_since_the_last_checkpoint_are_taken_again(tmp_path, monkeypatch):
-    """Of every fourth step, of a run that is stopped after its tenth."""
-    monkeypatch.setattr(simulate, "REMEMBERED", 4)
-    scene, path, whole = hanging(tmp_path, 14), tmp_path / "x.h5", tmp_path / "whole.h5"
-    assert main(["run", str(scene), "-o", str(whole)]) == 0
-    with monkeypatch.context() as patch:
-        signal_after(patch, 10, signal.SIGUSR1)
-        assert main(["run", str(scene), "-o", str(path)]) == 0
-    with h5py.File(path) as file:
-        assert max(file["checkpoint/step"]) == 8 and finished(file) == 4
-    assert main(["run", "--resume", str(path)]) == 0
-    assert_same(path, whole)
-
-
-def test_a_file_with_more_in_its_checkpoints_as_older_ones_have_goes_on_from_their_state(whole: Path, stopped: Path):
-    with h5py.File(stopped, "r+") as file:
-        file["checkpoint/correction"] = file["checkpoint/q"][...]
-    assert main(["run", "--resume", str(stopped)]) == 0
-    with h5py.File(stopped) as file:
-        assert "correction" not in file["checkpoint"]
-    assert_same(stopped, whole)
 
 
 @pytest.mark.parametrize(("every", "steps"), [("1", {39, 40}), ("4", {24, 36, 40}), ("1h", {0, 40})])
@@ -279,7 +256,7 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
 
 def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]) -> None:
     """The run's file as a kill after that step would leave it."""
-    advance = Simulation.advance
+    advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -289,7 +266,7 @@ def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, argum
 
     left: list[bytes] = []
     with monkeypatch.context() as patch:
-        patch.setattr(Simulation, "advance", watched)
+        patch.setattr(TimeLoop, "advance", watched)
         assert main(arguments) == 0
     path.write_bytes(left[0])
 
@@ -451,7 +428,7 @@ def test_a_file_that_is_removed_while_it_is_written(
 ):
     """The run stops at its next checkpoint, and what it had is there to go on from."""
     folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
-    path, advance = folder / "x.h5", Simulation.advance
+    path, advance = folder / "x.h5", TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -463,7 +440,7 @@ def test_a_file_that_is_removed_while_it_is_written(
                     path.write_text("another")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Simulation, "advance", watched)
+        patch.setattr(TimeLoop, "advance", watched)
         assert main(["run", scene, "-o", str(path), "--true-error", "3", "--checkpoint-every", "3"]) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     kept = folder / f"x.{os.getpid()}.h5" if another else path

@@ -1,7 +1,6 @@
 """A disk that is full, or may not be written: one line, exit status 2, and the run goes on when there is room."""
 
 import os
-import resource
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ from stopped_runs import assert_same, every_step_forgets, hanging  # noqa: F401 
 
 from msmpetsc.cli.main import main
 from msmpetsc.results.reader import finished
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 STEPS, BEFORE = 12, 5  # steps; the one after which there is no room
 FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}  # 2,601 nodes, 62 kB a frame
@@ -40,7 +39,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def at_step(monkeypatch: pytest.MonkeyPatch, action) -> None:
     """`action` happens after step BEFORE."""
-    advance = Simulation.advance
+    advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -48,7 +47,7 @@ def at_step(monkeypatch: pytest.MonkeyPatch, action) -> None:
             if simulation.step == BEFORE:
                 action()
 
-    monkeypatch.setattr(Simulation, "advance", watched)
+    monkeypatch.setattr(TimeLoop, "advance", watched)
 
 
 def assert_stops_in_one_line(arguments: list[str], capsys, *words: str) -> None:
@@ -78,22 +77,6 @@ def test_a_disk_that_fills_up(whole: Path, small_disk: Path, monkeypatch, capsys
     with h5py.File(path) as file:
         assert finished(file) == 1 + BEFORE
     ballast.unlink()
-    assert main(["run", "--resume", str(path)]) == 0
-    assert_same(path, whole)
-
-
-def test_writes_that_fail(whole: Path, tmp_path, monkeypatch, capsys):
-    """By the limit on the size of files, of which HDF5 learns as of a full disk."""
-    path, limits = tmp_path / "x.h5", resource.getrlimit(resource.RLIMIT_FSIZE)
-    with monkeypatch.context() as patch:
-        at_step(patch, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1])))
-        try:
-            arguments = ["run", str(whole.parent / "scene.toml"), "-o", str(path), "--checkpoint-every", "1"]
-            assert_stops_in_one_line(arguments, capsys, f"{path} cannot be written", "File too large")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with h5py.File(path) as file:
-        assert finished(file) == 1 + BEFORE and max(file["checkpoint/step"]) == BEFORE
     assert main(["run", "--resume", str(path)]) == 0
     assert_same(path, whole)
 

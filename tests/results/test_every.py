@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene, play
@@ -35,20 +34,3 @@ def test_frames_are_those_of_every_third_step_and_the_last(scene: Path):
         assert frame.ksp_its == sum(step.ksp_its for step in steps) > 0
         assert frame.products == sum(step.products for step in steps)
         assert frame.step_error == max(step.step_error for step in steps) > 0
-
-
-def test_the_file_and_the_log_hold_every_third_step(scene: Path, msmpetsc):
-    path = scene.with_suffix(".h5")
-    done = msmpetsc(1, "run", scene, "-o", path, "--set", "output.every=3")
-    assert done.returncode == 0, done.stderr
-    assert "frame 7/7" in done.stderr
-    with h5py.File(path) as file:
-        np.testing.assert_allclose(file["frames/time"], T * np.array([0, 3, 6, 7]))
-        assert file["frames/surface"].shape[0] == 4
-        step = file["checkpoint/step"][:]
-        assert max(step) == 0  # the next would be that of the twentieth
-        np.testing.assert_array_equal(file["checkpoint/q"][int(np.argmax(step))], file["frames/position"][0])
-
-
-def test_more_than_all_steps_leaves_the_last(scene: Path):
-    assert [frame.index for frame in play(scene, "output.every=100")[1]] == [0, 7]

@@ -64,15 +64,6 @@ def test_a_resumed_run_counts_its_own_frames_for_the_rate(clock):
     assert "1 frames/s  40 s left" in log.getvalue()
 
 
-def test_long_times_are_told_in_minutes_and_hours(clock):
-    log = io.StringIO()
-    run(clock, log, steps=1, seconds_a_step=600, total=16)
-    assert "2.5 h left" in log.getvalue()
-    log.truncate(0)
-    run(clock, log, steps=1, seconds_a_step=100, total=7)
-    assert "10 min left" in log.getvalue()
-
-
 def test_bar_on_a_terminal(clock):
     terminal = Terminal()
     run(clock, terminal, steps=100, seconds_a_step=0.25, total=100)

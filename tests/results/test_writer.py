@@ -92,10 +92,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
     disk = Disk()
     path = tmp_path / "x.h5"
 
-    def open_new(_):
-        return h5py.File(disk, "w", libver="earliest", rdcc_nbytes=0)
-
-    monkeypatch.setattr(writer, "open_new", open_new)
+    monkeypatch.setattr(writer, "open_to_write", disk.opened)
     marks = {}  # number of writes made -> (frames, newest checkpoint) that were then finished
     file = ResultFile(path, MPI.COMM_SELF, {})
     file.start_frames(40, NODES, POINTS)
@@ -133,7 +130,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
         file.close(trim=False)
     before = path.read_bytes()
     io.BytesIO.write(disk, before)
-    monkeypatch.setattr(writer, "open_again", lambda _: h5py.File(disk, "r+", libver="earliest", rdcc_nbytes=0))
+    monkeypatch.setattr(writer, "open_to_write", disk.opened)
     file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
     file.start_frames(9, NODES, POINTS)
     assert file.finished == 3
@@ -174,6 +171,9 @@ class Disk(io.BytesIO):
     def __init__(self):
         super().__init__()
         self.log = []  # (offset, bytes), or a length it was cut or stretched to
+
+    def opened(self, _, mode):
+        return h5py.File(self, mode, libver="earliest", rdcc_nbytes=0)
 
     def write(self, data):
         self.log.append((self.tell(), bytes(data)))

@@ -184,7 +184,6 @@ ALLOWED = {
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",
-    "app/profile.py": "asks before a run whether it could write",
     "view/renderer.py": "/dev/null",
 }
 

@@ -21,7 +21,7 @@ from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
 from msmpetsc.solve.nonlinear.reference import Reference
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import PRESETS, find_preset
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 FLOOR = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
 GRAVITY = {"acceleration": [0, 0, -9.81]}
@@ -57,7 +57,7 @@ def test_the_estimate_is_within_three_of_the_true_error(
     )
     model = build_model(MPI.COMM_SELF, scene)
     ratios, estimated = [], []
-    with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
         stepper = simulation.integrator.stepper
         for frame in simulation.frames():
             if frame.index and frame.true_error > 1e-9:
@@ -89,7 +89,7 @@ def test_an_estimate_that_ends_early_is_a_bound(
         return length
 
     monkeypatch.setattr(ErrorEstimate, "__call__", both)
-    with Simulation(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, model, Probes(true_error=1)) as simulation:
         for frame in simulation.frames():
             if frame.index and frame.true_error > 1e-9:
                 ratios.append(frame.step_error / frame.true_error)

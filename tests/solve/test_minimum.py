@@ -30,7 +30,7 @@ from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 BEAM, CUBE = [1, 0.2, 0.2], [1, 1, 1]
 GRAVITY = {"acceleration": [0, 0, -9.81]}
@@ -71,7 +71,7 @@ def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
     scene, frames = load_scene(path, overrides), []
     model, probes = build_model(MPI.COMM_SELF, scene), Probes(true_error=1)
-    with Simulation(MPI.COMM_SELF, scene, model, probes) as simulation, suppress(StepFailed):
+    with TimeLoop(MPI.COMM_SELF, scene, model, probes) as simulation, suppress(StepFailed):
         frames.extend(simulation.frames())
     return frames[1:]
 
@@ -114,7 +114,7 @@ def test_a_saddle_is_left_the_same_way_on_any_ranks(tmp_path: Path, msmpetsc):
 def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
     path = write_case(tmp_path, "crushed")
     scene = load_scene(path, [f"start.scale=[1, 1, {share}]"])
-    simulation = Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene))
+    simulation = TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene))
     return simulation, simulation.state.q
 
 

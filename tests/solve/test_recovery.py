@@ -17,7 +17,7 @@ from msmpetsc.fields import Frame
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.solve.nonlinear.error_control import REASON
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 from msmpetsc.study.metrics import distance_of_shapes
 
 STUDIES = ROOT / "scenes" / "studies"
@@ -67,7 +67,7 @@ def play(name: str, *changes: str) -> Played:
         changes.append(f"time.duration={case['steps'] * load_scene(path, changes).time.step!r}")
     scene, frames, words = load_scene(path, changes), [], ""
     model = build_model(MPI.COMM_SELF, scene)
-    with np.errstate(all="ignore"), Simulation(MPI.COMM_SELF, scene, model) as simulation:
+    with np.errstate(all="ignore"), TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
         try:
             frames.extend(simulation.frames())
         except StepFailed as failed:
@@ -280,7 +280,7 @@ def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path
     """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
     path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]})
     scene = load_scene(path)
-    with Simulation(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
         saved = simulation.saved()
         saved.numbers |= {"Recovery.level": 3, "Recovery.recovered": 2}
         simulation.restore(saved)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
@@ -24,7 +24,7 @@ def test_none_crosses(name: str):
     case = CASES[name]
     scene = load_scene(STUDIES / case["file"], [*case.get("set", ()), "output.surface=true"])
     model = build_model(MPI.COMM_SELF, scene)
-    with Simulation(MPI.COMM_SELF, scene, model) as simulation:
+    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
         frames = list(simulation.frames())
     assert len(frames) == 1 + scene.time.steps and np.isfinite(frames[-1].position).all()
     assert max(frame.self_contacts for frame in frames) > 5

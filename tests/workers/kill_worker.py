@@ -26,7 +26,7 @@ from msmpetsc.cli.main import main  # noqa: E402
 from msmpetsc.results.reader import finished  # noqa: E402
 from msmpetsc.results.writer import ResultFile  # noqa: E402
 from msmpetsc.scene.reading import load_scene  # noqa: E402
-from msmpetsc.solve.simulate import Simulation  # noqa: E402, F401
+from msmpetsc.solve.simulate import TimeLoop  # noqa: E402, F401
 
 stored = Value("i", 0, lock=False)  # frames that the child's file had when `append` returned
 append = ResultFile.append

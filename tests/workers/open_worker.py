@@ -26,7 +26,7 @@ def read_all(path: Path) -> None:
         for group in (run.lattice, run.surface, run.frames):
             for array in group.values():
                 array[:]
-        for name in ("embedding", "checkpoint", "scene"):
+        for name in ("embedding", "scene"):
             getattr(run, name)
 
 

@@ -15,10 +15,10 @@ def stop_after(step: int) -> None:
 
     petsc4py.init(["msmpetsc"])
     from msmpetsc.solve import simulate
-    from msmpetsc.solve.simulate import Simulation
+    from msmpetsc.solve.simulate import TimeLoop
 
     simulate.REMEMBERED = 2
-    advance = Simulation.advance
+    advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
@@ -26,7 +26,7 @@ def stop_after(step: int) -> None:
                 os.kill(os.getpid(), signal.SIGUSR1)
             yield frame
 
-    Simulation.advance = watched
+    TimeLoop.advance = watched
 
 
 if __name__ == "__main__":

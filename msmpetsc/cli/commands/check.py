@@ -128,7 +128,7 @@ def checked(scene: Path, stored: Numbers, ranks: int) -> Checked:
 
 
 def write_junit(path: Path, outcomes: list[Checked]) -> None:
-    """Write a suite for each scene, a case for each number, as continuous integration reads. Raises InputError."""
+    """Write a suite for each scene, a case for each number. Raises InputError."""
     root = ElementTree.Element("testsuites", name="msmpetsc check")
     for outcome in outcomes:
         counts = {"tests": str(len(outcome.lines)), "failures": str(len(outcome.wrong))}

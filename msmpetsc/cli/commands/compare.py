@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import Comparison, DifferentLattices, FieldError, compare, point_text, rest_of
 from msmpetsc.results.reader import Result, refuse_deadly
-from msmpetsc.results.surfaces import MEAN, compare_surfaces
+from msmpetsc.results.surfaces import compare_surfaces
 
 SAME, DIFFERENT = 0, 1
 HEAD = f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
@@ -20,40 +20,37 @@ def run(args: argparse.Namespace) -> int:
     """Compare two results; return the exit status."""
     if not 0 <= args.rtol < np.inf:
         raise InputError(f"--rtol must be a number from 0 on, not {args.rtol:g}")
-    names = None if args.fields is None else [name.strip() for name in args.fields.split(",")]
     refuse_deadly(args.first)
     refuse_deadly(args.second)
     with Result(args.first) as first, Result(args.second) as second:
-        comparison, notes = compared(first, second, names)
-        differs = any(field.first_above(args.rtol) is not None for field in comparison.fields)
+        comparison, notes = compared(first, second)
+        fields = {field.name: record(field, comparison, args.rtol) for field in comparison.fields}
         most = max(len(first.frames.time), len(second.frames.time))
-        apart = len(comparison.pairs) < most and not args.shared
+        apart = len(comparison.pairs) < most
+        agree = not apart and all(field["first_above"] is None for field in fields.values())
         if args.json:
-            print(
-                json.dumps({"agree": not (differs or apart), **record(comparison, args.rtol), "notes": notes}, indent=1)
-            )
+            shown = {"agree": agree, "rtol": args.rtol, "frames": len(comparison.pairs), "fields": fields}
+            print(json.dumps(shown | {"left_out": list(comparison.left_out), "notes": notes}, indent=1))
         else:
             print("\n".join([*notes, *not_shared(first, second, comparison), HEAD]))
-            print("\n".join(row(field, comparison, args.rtol) for field in comparison.fields))
+            print("\n".join(row(name, field) for name, field in fields.items()))
             print("\n".join(first_difference(first, comparison, args.rtol)))
-        if apart and not args.json:
-            print("they have not the same times, which counts as different without --shared")
-    return DIFFERENT if differs or apart else SAME
+            if apart:
+                print("they have not the same times, which counts as different")
+    return SAME if agree else DIFFERENT
 
 
-def compared(first: Result, second: Result, names: list[str] | None) -> tuple[Comparison, list[str]]:
-    """Compare two results, of different lattices by their surfaces alone; return what is to be said of that, too."""
+def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
+    """Compare two results, of different lattices by their surfaces alone; say so in notes."""
     try:
-        return compare(first, second, names), []
+        return compare(first, second), []
     except DifferentLattices as error:
         differ = str(error)
-    if names not in (None, ["surface"]):
-        raise InputError(f"{differ}: only their surfaces can be compared")
     try:
         comparison = compare_surfaces(first, second)
     except InputError as error:
         raise InputError(f"{differ}; {error}") from None
-    mean = next(field for field in comparison.fields if field.name == MEAN)
+    _, mean = comparison.fields
     overall = np.sqrt(np.mean(mean.errors**2))
     return comparison, [
         f"{differ}: their surfaces alone are compared",
@@ -61,17 +58,24 @@ def compared(first: Result, second: Result, names: list[str] | None) -> tuple[Co
     ]
 
 
-def record(comparison: Comparison, rtol: float) -> dict[str, Any]:
-    """Return what the table says, for a program: frames are numbered as in the first file."""
-    fields = {}
-    for field in comparison.fields:
-        index, first = int(np.argmax(field.errors)), field.first_above(rtol)
-        fields[field.name] = {
-            "error": float(field.errors[index]), "frame": int(comparison.pairs[index, 0]),
-            "first_above": None if first is None else int(comparison.pairs[first, 0]),
-            "scale": float(field.scale), "unit": field.unit,
-        }  # fmt: skip
-    return {"rtol": rtol, "frames": len(comparison.pairs), "fields": fields, "left_out": list(comparison.left_out)}
+def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, Any]:
+    """Return what is said of a field: frames are numbered as in the first file."""
+    greatest = int(np.argmax(field.errors))
+    first = field.first_above(rtol)
+    return {
+        "error": float(field.errors[greatest]),
+        "frame": int(comparison.pairs[greatest, 0]),
+        "first_above": None if first is None else int(comparison.pairs[first, 0]),
+        "scale": float(field.scale),
+        "unit": field.unit,
+    }
+
+
+def row(name: str, field: dict[str, Any]) -> str:
+    """Return the line of the table of a field's record."""
+    since = "-" if field["first_above"] is None else field["first_above"]
+    scale = f"{field['scale']:.3g} {field['unit']}"
+    return f"{name:16} {field['error']:14.3g} {field['frame']:8} {since:>11} {scale:>11}"
 
 
 def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterator[str]:
@@ -85,16 +89,8 @@ def not_shared(first: Result, second: Result, comparison: Comparison) -> Iterato
         yield f"{name} is in {first.path if name in first.frames else second.path} only: not compared"
 
 
-def row(field: FieldError, comparison: Comparison, rtol: float) -> str:
-    """Return a line of the table; frames are numbered as in the first file."""
-    index, first = int(np.argmax(field.errors)), field.first_above(rtol)
-    since = "-" if first is None else comparison.pairs[first, 0]
-    scale = f"{field.scale:.3g} {field.unit if field.unit != '1' else ''}".rstrip()
-    return f"{field.name:16} {field.errors[index]:14.3g} {comparison.pairs[index, 0]:8} {since:>11} {scale:>11}"
-
-
 def first_difference(result: Result, comparison: Comparison, rtol: float) -> Iterator[str]:
-    """Yield the first frame at which anything differs, and the node that is farthest off when positions first do."""
+    """Yield the first frame that differs, and the node that is farthest off there."""
     firsts = {field.name: first for field in comparison.fields if (first := field.first_above(rtol)) is not None}
     if not firsts:
         yield f"they agree to {rtol:g} at these {len(comparison.pairs)} frames"
@@ -113,5 +109,5 @@ def farthest(result: Result, comparison: Comparison, field: FieldError, first: i
     number, rest_rows = field.worst[first], rest_of(result, field.name)
     rest = f", at rest at {point_text(rest_rows[number])}" if rest_rows is not None else ""
     kind = "node" if field.name == "position" else "surface point"
-    off = f"{field.errors[first] * field.scale:.3g} m off at frame {comparison.pairs[first, 0]}"
+    off = f"{field.errors[first] * (field.scale or 1.0):.3g} m off at frame {comparison.pairs[first, 0]}"
     return f"{kind} {number}{rest}, is {off}, farther than any other"

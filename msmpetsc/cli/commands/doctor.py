@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import msmpetsc
 from msmpetsc.cli.ranks import world
@@ -27,7 +26,7 @@ from petsc4py import PETSc
 has = lambda package: bool(PETSc.Sys.hasExternalPackage(package)) if hasattr(PETSc.Sys, "hasExternalPackage") else None
 print(json.dumps({
     "version": ".".join(map(str, PETSc.Sys.getVersion())), "bits": 8 * numpy.dtype(PETSc.IntType).itemsize,
-    "scalar": numpy.dtype(PETSc.ScalarType).name, **{name: has(name) for name in ("mumps", "hypre", "cuda")}}))
+    "scalar": numpy.dtype(PETSc.ScalarType).name, **{name: has(name) for name in ("MUMPS", "hypre", "CUDA")}}))
 """
 RANKS = """
 from mpi4py import MPI
@@ -35,19 +34,19 @@ if MPI.COMM_WORLD.rank == 0:  # two ranks' lines may come as one
     print(MPI.COMM_WORLD.size, MPI.Get_library_version().splitlines()[0].strip(chr(0)))
 """
 DEVICE = """
-import json, cupy
-print(json.dumps([cupy.cuda.runtime.getDeviceProperties(i)["name"].decode()
-                  for i in range(cupy.cuda.runtime.getDeviceCount())]))
+import cupy
+for number in range(cupy.cuda.runtime.getDeviceCount()):
+    print(cupy.cuda.runtime.getDeviceProperties(number)["name"].decode())
 """
 HDF5 = "import h5py; print(h5py.version.hdf5_version)"
 CACHE = """
 import os
-from msmpetsc.backend.compiling import cache_is_empty
+from msmpetsc.backend.kernel import cache_is_empty
 print("empty" if cache_is_empty() else "filled", os.environ["NUMBA_CACHE_DIR"])
 """
 MESHES = """
 from msmpetsc.geometry.registry import MODELS, find
-print(*(name for name in MODELS if find(name)))
+print(", ".join(name for name in MODELS if find(name)))
 """
 IMPORTS = """
 import importlib, json
@@ -59,38 +58,47 @@ for name in {names}:
         reasons[name] = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
 print(json.dumps(reasons))
 """
+USES = {  # of packages that PETSc may be configured with
+    "MUMPS": ("the presets fast-msm", "configure PETSc with --download-mumps"),
+    "hypre": ("-pc_type hypre alone, which no preset has", "configure PETSc with --download-hypre"),
+    "CUDA": ("--device cuda alone", "scripts/build_petsc_cuda builds one"),
+}
+BRINGS = {  # where an extra alone does not
+    "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
+    "mpi4py": "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'",
+    "h5py": "pip install h5py",
+}
 NO_INSTALL = {"cuda", "peers"}  # extras for few machines: what lacks them lacks nothing
-OPTIONAL = {f"extra {name}" for name in EXTRAS if name != "run"}
+NEEDED = {"PETSc", "MPI", "HDF5", "packages", "extra run"}  # by every run
 
 Finding = tuple[str, str, str]  # what, its state, and in words
 
 
 class Unsound(Exception):
-    """Raised by what examines a thing that is missing or broken: its state, and in words what brings or ails it."""
+    """Raised of a thing that is missing or broken: its state, and what brings or ails it."""
 
 
 def run(_: argparse.Namespace) -> int:
     """Print a line for each thing; return 1 where a run lacks something that it needs."""
     if world().rank != 0:
         return 0
-    needed = (petsc, ranks, results, packages)
-    states = set()
-    for examine in (petsc, ranks, solvers, device, results, kernels, packages, meshes):
-        for what, state, words in examined(examine):
+    lacking = False
+    for name, examine in EXAMINATIONS.items():
+        for what, state, words in examined(name, examine):
             print(f"{state:8} {what:16} {words}", flush=True)
-            states |= {state} if examine in needed and what not in OPTIONAL else set()
-    return int(states != {OK})
+            lacking |= state != OK and what in NEEDED
+    return int(lacking)
 
 
-def examined(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def examined(name: str, examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """Yield the findings of an examination, whatever happens in it."""
     try:
         yield from examine()
     except Unsound as error:
         state, words = error.args
-        yield examine.__name__, state, words
+        yield name, state, words
     except Exception as error:  # whatever is broken in an installation: it must be named, not end this
-        yield examine.__name__, BROKEN, one_line(error)
+        yield name, BROKEN, one_line(error)
 
 
 def installed(package: str) -> bool:
@@ -105,98 +113,73 @@ def said(code: str, *launcher: str) -> str:
     """Return what a Python of its own prints. Raises Unsound."""
     command = [*launcher, sys.executable, "-c", code]
     alone = {name: value for name, value in os.environ.items() if not name.startswith(("OMPI_COMM", "PMIX_", "PMI_"))}
-    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
     try:
-        done = subprocess.run(command, env=alone, timeout=PATIENCE, **pipes)
+        done = subprocess.run(
+            command, env=alone, timeout=PATIENCE, stdin=subprocess.DEVNULL, capture_output=True, text=True
+        )
     except FileNotFoundError:
         remedy = "apt install openmpi-bin, or load the module of the cluster's MPI"
         raise Unsound(BROKEN, f"there is no {command[0]}: {remedy}") from None
     except subprocess.TimeoutExpired:
         raise Unsound(BROKEN, f"does not answer within {PATIENCE} s: {' '.join(launcher)}") from None
     if done.returncode == 0:
-        return done.stdout
+        return done.stdout.strip()
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     last = [f"ends with status {done.returncode}", *lines][-1][:160]
-    gone = re.fullmatch(r"ModuleNotFoundError: No module named '([\w.]+)'", last)
-    if gone and (extra := extra_of(gone[1])) and not installed(gone[1].partition(".")[0]):
-        raise Unsound(MISSING, f"{gone[1]}: pip install 'msmpetsc[{extra}]'")
+    gone = re.fullmatch(r"ModuleNotFoundError: No module named '(\w+)[\w.]*'", last)
+    if gone and not installed(gone[1]):
+        remedy = BRINGS.get(gone[1], f"pip install 'msmpetsc[{extra_of(gone[1])}]'")
+        raise Unsound(MISSING, f"{gone[1]}: {remedy}")
     raise Unsound(BROKEN, last)
 
 
-def petsc_facts() -> dict[str, Any]:
-    """Return what PETSc says of itself. Raises Unsound."""
-    return json.loads(said(PETSC).splitlines()[-1])
-
-
 def petsc() -> Iterator[Finding]:
-    """PETSc, its integers and its numbers."""
-    if not installed("petsc4py"):
-        yield "PETSc", MISSING, "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'"
-        return
-    facts = petsc_facts()
+    """PETSc, its integers and its numbers, and the packages that it was configured with."""
+    facts = json.loads(said(PETSC).splitlines()[-1])
     words = f"{facts['version']}, {facts['bits']}-bit integers, {facts['scalar']}"
-    if facts["scalar"] == "float64":
-        yield "PETSc", OK, words
-    else:
-        yield "PETSc", BROKEN, f"{words}: a PETSc of real double numbers is needed (--with-scalar-type=real)"
+    if facts["scalar"] != "float64":
+        raise Unsound(BROKEN, f"{words}: a PETSc of real double numbers is needed (--with-scalar-type=real)")
+    yield "PETSc", OK, words
+    for name, (use, remedy) in USES.items():
+        if facts[name]:
+            yield f"PETSc with {name}", OK, f"for {use}"
+        else:
+            yield f"PETSc with {name}", MISSING, f"for {use}: {remedy}"
 
 
 def ranks() -> Iterator[Finding]:
     """MPI: whether two ranks meet."""
-    if not installed("mpi4py"):
-        yield "MPI", MISSING, "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'"
-        return
     oversubscribed = ("--oversubscribe",) if "Open MPI" in said(RANKS) else ()
     size, _, library = said(RANKS, "mpiexec", *oversubscribed, "-n", "2").splitlines()[-1].partition(" ")
-    if size == "2":
-        yield "MPI", OK, f"{library.partition(',')[0]}, mpiexec starts ranks that meet"
-    else:
-        yield "MPI", BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI than mpiexec's"
-
-
-def solvers() -> Iterator[Finding]:
-    """Packages that PETSc was configured with: those of some presets."""
-    facts = petsc_facts()
-    uses = {"MUMPS": "the presets fast-msm", "hypre": "-pc_type hypre alone, which no preset has"}
-    for name, use in uses.items():
-        if facts[name.lower()]:
-            yield name, OK, f"for {use}"
-        else:
-            yield name, MISSING, f"for {use}: configure PETSc with --download-{name.lower()}"
+    if size != "2":
+        raise Unsound(BROKEN, "mpiexec -n 2 starts two runs of one rank: mpi4py was built for another MPI")
+    yield "MPI", OK, f"{library.partition(',')[0]}, mpiexec starts ranks that meet"
 
 
 def device() -> Iterator[Finding]:
-    """A CUDA GPU, and a PETSc that uses it."""
-    if petsc_facts()["cuda"]:
-        yield "PETSc with CUDA", OK, "for --device cuda"
-    else:
-        yield "PETSc with CUDA", MISSING, "only for --device cuda: scripts/build_petsc_cuda builds one"
+    """A CUDA GPU."""
     if not installed("cupy"):
-        yield "GPU", MISSING, "only for --device cuda: pip install 'msmpetsc[cuda]'"
-    elif names := json.loads(said(DEVICE)):
-        yield "GPU", OK, ", ".join(names)
-    else:
-        yield "GPU", MISSING, "no CUDA device on this machine"
+        raise Unsound(MISSING, "for --device cuda alone: pip install 'msmpetsc[cuda]'")
+    names = said(DEVICE).splitlines()
+    if not names:
+        raise Unsound(MISSING, "no CUDA device on this machine")
+    yield "GPU", OK, ", ".join(names)
 
 
 def results() -> Iterator[Finding]:
     """HDF5, as h5py has it."""
-    if installed("h5py"):
-        yield "HDF5", OK, said(HDF5).strip()
-    else:
-        yield "HDF5", MISSING, "pip install h5py"
+    yield "HDF5", OK, said(HDF5)
 
 
 def kernels() -> Iterator[Finding]:
     """The cache of compiled kernels."""
-    state, folder = said(CACHE).strip().split(" ", 1)
+    state, folder = said(CACHE).split(" ", 1)
     nearest = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
     if not os.access(nearest, os.W_OK):
-        yield "kernels", MISSING, f"{nearest} cannot be written, each run compiles anew: export NUMBA_CACHE_DIR=FOLDER"
-    elif state == "filled":
-        yield "kernels", OK, "compiled"
-    else:
-        yield "kernels", OK, "not yet compiled: the first run takes a minute more"
+        remedy = "export NUMBA_CACHE_DIR=FOLDER"
+        raise Unsound(MISSING, f"{nearest} cannot be written, each run compiles anew: {remedy}")
+    words = {"filled": "compiled", "empty": "not yet compiled: the first run takes a minute more"}
+    yield "kernels", OK, words[state]
 
 
 def packages() -> Iterator[Finding]:
@@ -206,7 +189,7 @@ def packages() -> Iterator[Finding]:
     found = sorted({name for names in EXTRAS.values() for name in names if installed(name)})
     reasons = json.loads(said(IMPORTS.format(names=found)).splitlines()[-1])
     for extra, names in EXTRAS.items():
-        gone = [name for name in names if not installed(name)]
+        gone = [name for name in names if name not in found]
         if broken := [f"{name}: {reasons[name]}" for name in names if name in reasons]:
             yield f"extra {extra}", BROKEN, "; ".join(broken)
         elif gone and not (extra in NO_INSTALL and len(gone) == len(names)):
@@ -217,7 +200,18 @@ def packages() -> Iterator[Finding]:
 
 def meshes() -> Iterator[Finding]:
     """Models of the registry that lie on this machine."""
-    if names := said(MESHES).split():
-        yield "meshes", OK, f"{len(names)} named models: {', '.join(names)}"
-    else:
-        yield "meshes", MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list"
+    names = said(MESHES)
+    if not names:
+        raise Unsound(MISSING, "no named model, for the shipped scenes only: msmpetsc fetch --list")
+    yield "meshes", OK, names
+
+
+EXAMINATIONS: dict[str, Callable[[], Iterator[Finding]]] = {
+    "PETSc": petsc,
+    "MPI": ranks,
+    "GPU": device,
+    "HDF5": results,
+    "kernels": kernels,
+    "packages": packages,
+    "meshes": meshes,
+}

@@ -56,7 +56,6 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(report, indent=1))
         return 0
     print_counts(report)
-    print_budget(scene)
     return 0
 
 
@@ -95,19 +94,6 @@ def print_counts(report: dict[str, Any]) -> None:
         else:
             columns = f"{row['all']:15.0f}{row['mean']:15.1f}{row['most']:15.0f}"
         print(f"{name.replace('byte', 'GB'):{WIDTH}}{columns}")
-
-
-def print_budget(scene: Scene) -> None:
-    """Print the surface error that a plan expects, where the scene says it, and whether it is of this scene."""
-    budget = scene.budget
-    if budget is None:
-        return
-    parts = {"cells": budget.cells, "time step": budget.time, "solution of the steps": budget.step}
-    print(f"\n{'surface error expected':{WIDTH}}{sum(parts.values()):15.2g}, asked for {budget.target:g}")
-    for name, error in parts.items():
-        print(f"{f'  of the {name}':{WIDTH}}{error:15.2g}")
-    if (budget.count, budget.time_step) != (scene.cages.count, scene.time.step):
-        print(f"  expected of {budget.count} cells and steps of {budget.time_step:g} s, not of what the scene has now")
 
 
 def memory_of(partition: "Partition", surfaces: Sequence["Surface"], mesh: float) -> np.ndarray:

@@ -66,7 +66,7 @@ def log_findings(mesh: Path, measures: MeshMeasures, warnings: list[str]) -> Non
 
 
 def beside(mesh: Path, scene: Path) -> str:
-    """Return the path of a mesh from the folder of its scene, in or below which it must be. Raises InputError."""
+    """Return the path of a mesh from the folder of its scene. Raises InputError for one elsewhere."""
     folder = scene.parent
     if not mesh.exists():
         locate(str(mesh), Path())  # says what it is not
@@ -86,7 +86,7 @@ def write(path: Path, text: str) -> None:
 
 
 def shipped_titles() -> dict[str, str]:
-    """Return the title of each scene that comes with the package. Raises InputError where the package lacks them."""
+    """Return the title of each scene that comes with the package. Raises InputError for none."""
     files = sorted(SHIPPED.glob("*.toml"))
     if not files:
         raise InputError(f"{SHIPPED} has no scenes: this msmpetsc was installed without them")

@@ -16,7 +16,7 @@ from msmpetsc.solve import simulate
 from msmpetsc.solve.multigrid import cycle
 from msmpetsc.solve.nonlinear import preconditioning
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner, StepPreconditioner
-from msmpetsc.solve.simulate import Simulation
+from msmpetsc.solve.simulate import TimeLoop
 
 COMM = MPI.COMM_SELF
 STEPS = 10
@@ -84,7 +84,7 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
     monkeypatch.setattr(StepPreconditioner, "_choose", lambda *given: (chosen.append(1), choose(*given))[1])
     read = load_scene(block_scene(tmp_path, **CASES[case]))
     model, frames, saved, counts = build_model(COMM, read), [], [], []
-    with Simulation(COMM, read, model) as simulation:
+    with TimeLoop(COMM, read, model) as simulation:
         for frame in simulation.advance():
             frames.append(frame)
             counts.append(len(built))
@@ -95,7 +95,7 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
         assert sum(frame.fallbacks for frame in frames) > 0
     assert counts[-1] > 0
     for begin in range(3, len(saved) - 1, 3):
-        with Simulation(COMM, read, model) as simulation:
+        with TimeLoop(COMM, read, model) as simulation:
             simulation.restore(saved[begin])
             for frame, index in zip(simulation.advance(), range(begin + 1, begin + 3), strict=False):
                 after = simulation.saved()

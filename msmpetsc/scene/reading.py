@@ -104,7 +104,7 @@ def scene_of(
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, presets, file_text, keys)
+    checked = _checked(path, data, presets, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
     text = tomli_w.dumps(data) if overrides else file_text
@@ -125,7 +125,7 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     """
     path, data = folder / "scene", plain(tables)
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, None, "", keys)
+    checked = _checked(path, data, None, keys)
     try:
         return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
     except TypeError as error:
@@ -133,19 +133,18 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
 
 
 def _checked(
-    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[tuple[str | int, ...], str]
+    path: Path, data: dict[str, Any], presets: Collection[str] | None, keys: dict[tuple[str | int, ...], str]
 ) -> SceneFile:
-    """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
+    """Return the tables checked; of a problem InputError names the override of these keys."""
     try:
         return SceneFile.model_validate(data, context={"presets": presets})
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
+        raise InputError("\n".join(problem_lines(path, error, keys))) from None
 
 
-def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
-    text = _read(path, kind)
-    return text, _parse(path, text)
+def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
+    """Return the data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    return _parse(path, _read(path, kind))
 
 
 def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]] | None) -> None:

@@ -7,15 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-import trimesh
 from block_scene import CELL, block_scene
 from conftest import ENVIRONMENT, run
 from mpi4py import MPI
 from one_process import IN_ONE_PROCESS
 
-from msmpetsc.app.summary import log_model, taken
+from msmpetsc.app.summary import log_model
 from msmpetsc.build import Model, build_model, read_bodies
-from msmpetsc.constraints.coverage import Reach
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.toml import toml_value
@@ -203,21 +201,6 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
         scene = load_scene(path, [f'cages.boundary="{boundary}"'])
         log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
         assert heard()[0] == ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}")
-
-
-def test_of_many_tables_the_first_are_named():
-    reaches = [Reach(f"force.{number}", 5, 0, "force") for number in range(20)]
-    assert taken(reaches)[-2:] == ["force.11 pulls 5 nodes", "and 8 more"] and len(taken(reaches)) == 13
-    assert len(taken(reaches[:13])) == 13
-
-
-def test_an_open_mesh_has_no_volume_to_say(tmp_path):
-    scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.01})
-    box = trimesh.load(tmp_path / "scene.ply")
-    trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "scene.ply")
-    done = run(1, "-m", "msmpetsc.cli.main", "run", scene, "-o", tmp_path / "x.h5")
-    mesh = "open mesh (3 boundary edges), its volume unknown"
-    assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
 
 
 COMPILES = """

@@ -87,7 +87,7 @@ def install(folder: Path, content: bytes) -> Path:
 def test_the_copy_goes_before_what_was_fetched_or_lies_in_a_package(toy):
     with pytest.raises(InputError, match=r"^mesh 'toybox' is not here: msmpetsc fetch toybox$"):
         locate("toybox", toy)
-    with pytest.raises(InputError, match="'toyscan' is not here: it comes with a package, pip .* toypackage$"):
+    with pytest.raises(InputError, match=r"'toyscan' is not here: it comes with a package, pip .* toypackage$"):
         fetch("toyscan")
     packaged = install(toy, ORIGINAL)
     assert locate("toyscan", toy) == packaged and "toypackage" not in sys.modules

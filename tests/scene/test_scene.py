@@ -230,13 +230,9 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("old", "new", "expected"), MISTAKES, ids=[m[2].split(" ")[0] + m[1] for m in MISTAKES])
 def test_a_mistake_is_named(tmp_path, old, new, expected):
-    assert f"scene.toml: {expected}" in "\n".join(problems(tmp_path, changed(old, new)))
-
-
-def test_one_mistake_is_one_line(tmp_path):
-    alone = [m for m in MISTAKES if "angle" not in m[1]]  # that one is a missing and an unknown key
-    for old, new, _ in alone:
-        assert len(problems(tmp_path, changed(old, new))) == 1, new
+    told = problems(tmp_path, changed(old, new))
+    assert f"scene.toml: {expected}" in "\n".join(told)
+    assert len(told) == 1 or "angle" in new  # that one is a missing and an unknown key
 
 
 def test_all_problems_at_once_each_with_its_line(tmp_path):
@@ -401,12 +397,6 @@ def only_input_errors(text: str, *overrides: str) -> None:
                 assert "Input should" not in line and "pydantic" not in line and "is not valid" not in line
         else:
             assert load(Path(folder), scene.text) == scene
-
-
-@given(st.dictionaries(KEYS, VALUES, max_size=5))
-@settings(max_examples=100, deadline=None)
-def test_any_table_loads_or_is_an_input_error(data):
-    only_input_errors(tomli_w.dumps(data))
 
 
 PATHS = [

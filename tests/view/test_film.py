@@ -154,6 +154,11 @@ def test_the_legend_names_what_is_drawn(result, tmp_path):
 @pytest.mark.parametrize(
     "words, line",
     [
+        (["--frames", "0,11"], "has frames 0 to 10, not 11"),
+        (["--count", "0"], "--count must be at least 1"),
+        (["--eye", "0,0,0"], "--eye takes three numbers"),
+        (["--eye", "north"], "--eye takes numbers"),
+        (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
         (["--frames", "0:x"], "--frames takes numbers like 0,10,20 or slices"),
         (["--frames", "20:"], "of which --frames names none"),
         (["--frames", "0:5:0"], "--frames takes numbers"),

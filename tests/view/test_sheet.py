@@ -11,10 +11,8 @@ import pytest
 import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
 from conftest import ROOT
-from PIL import Image, ImageDraw
+from PIL import Image
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.bodies import OfBody
@@ -254,23 +252,6 @@ def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
     assert fallen[1] < last_ground < ink.min()  # whole ball, ground, then captions (below the ball, dark itself)
 
 
-@pytest.mark.parametrize(
-    "options, told",
-    [
-        (["--frames", "0,11"], "has frames 0 to 10, not 11"),
-        (["--frames", "first"], "--frames takes numbers"),
-        (["--count", "0"], "--count must be at least 1"),
-        (["--eye", "1,2"], "--eye takes three numbers"),
-        (["--eye", "0,0,0"], "--eye takes three numbers"),
-        (["--eye", "north"], "--eye takes numbers"),
-        (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
-    ],
-)
-def test_what_cannot_be_drawn_is_told(result, options, told):
-    with pytest.raises(InputError, match=told):
-        command.run(parsed(["render", str(result), *options]))
-
-
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
     path = write_ball(tmp_path / "x.h5", surface=True)
     for key, told in ("embedding", "no surface to draw"), ("scene", "another version"):
@@ -300,20 +281,6 @@ def test_many_panels_stand_in_rows_and_each_is_shown(result, tmp_path):
     each = [part for row in np.split(drawn, 3) for part in np.split(row, 4, axis=1)]
     assert all(is_body(panel).any() for panel in each[:11]) and (each[11] == 255).all()
     assert body_rows(each[3])[0] > body_rows(each[2])[0] > body_rows(each[0])[0] > 0
-
-
-def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
-    """Captions and the lengths of axes too, which VTK wrote in its own."""
-    written, draw = {}, ImageDraw.ImageDraw.text
-
-    def recorded(self, at, text, fill=None, font=None, **options):
-        written[text] = font.getname()[0]
-        draw(self, at, text, fill, font, **options)
-
-    monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
-    sheet.contact_sheet(result, tmp_path / "x.png", frames=[0], style=Style(axes=True, colour="displacement"))
-    assert set(written.values()) == {"DejaVu Sans"}
-    assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
 def test_a_picture_too_high_is_refused(result, tmp_path, monkeypatch):

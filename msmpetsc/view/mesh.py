@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
-from scipy.spatial import KDTree
 from trimesh.triangles import points_to_barycentric
 
 from msmpetsc.errors import InputError
@@ -75,12 +74,7 @@ def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tup
 
 def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_array:
     """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
-    of_cell = rest.body_of_node[rest.cells[:, 0]]
-    around = np.empty(len(points), int)
-    for number in np.unique(body):
-        own, inside = np.flatnonzero(of_cell == number), body == number
-        around[inside] = own[KDTree(rest.middles[own]).query(points[inside], p=np.inf)[1]]  # cubes: the nearest
-    corners = rest.cells[around]
+    corners = rest.cells[rest.cells_around(points, body)]
     low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
     weights = np.where(CORNERS, u, 1 - u).prod(axis=2)

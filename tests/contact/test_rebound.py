@@ -35,6 +35,15 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
     assert frames[-1].momentum[2] > 0  # it leaves
 
 
+def test_an_exchange_gains_and_a_reflection_does_not(tmp_path: Path):
+    time = {"step": 0.001, "duration": 0.1}
+    rises = [
+        rise(play(ball(tmp_path, time=time, obstacle=[PLANE | {"response": response}], **FALL))[1])
+        for response in ("exchange", "reflect")
+    ]
+    assert rises[0] > 0.005 and rises[1] == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bunny_fall", "brain_fall"])
 def test_the_falls_that_are_shipped_gain_nothing(name: str):

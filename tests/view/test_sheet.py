@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
 from conftest import ROOT
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
@@ -281,6 +281,20 @@ def test_many_panels_stand_in_rows_and_each_is_shown(result, tmp_path):
     each = [part for row in np.split(drawn, 3) for part in np.split(row, 4, axis=1)]
     assert all(is_body(panel).any() for panel in each[:11]) and (each[11] == 255).all()
     assert body_rows(each[3])[0] > body_rows(each[2])[0] > body_rows(each[0])[0] > 0
+
+
+def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
+    """Captions and the lengths of axes too, which VTK wrote in its own."""
+    written, draw = {}, ImageDraw.ImageDraw.text
+
+    def recorded(self, at, text, fill=None, font=None, **options):
+        written[text] = font.getname()[0]
+        draw(self, at, text, fill, font, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
+    sheet.contact_sheet(result, tmp_path / "x.png", frames=[0], style=Style(axes=True, colour="displacement"))
+    assert set(written.values()) == {"DejaVu Sans"}
+    assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
 def test_a_picture_too_high_is_refused(result, tmp_path, monkeypatch):

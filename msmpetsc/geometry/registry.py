@@ -112,11 +112,10 @@ def find(name: str) -> MeshFile | None:
         copy = Path(os.environ[MESH_DIR]) / model.copy
         if os.path.isfile(copy):  # which a name too long does not raise in
             return MeshFile(_checked(name, copy, model.copy_sha256), (), f"${MESH_DIR}")
-    fetched = [_originals(name).path / download.file for download in model.downloads]
+    fetched = {_originals(name).path / download.file: download.sha256 for download in model.downloads}
     if fetched and all(path.is_file() for path in fetched):
-        for path, download in zip(fetched, model.downloads, strict=True):
-            _checked(name, path, download.sha256)
-        return MeshFile(fetched[0], model.steps, "fetched")
+        first, *_ = (_checked(name, path, sha256) for path, sha256 in fetched.items())
+        return MeshFile(first, model.steps, "fetched")
     packaged = model.packaged
     file = packaged and _inside_package(packaged)
     if packaged and file and pooch.file_hash(str(file)) == packaged.sha256:  # other versions ship others

@@ -83,7 +83,7 @@ def load_scene(
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
-    if path.name.lower().removesuffix(".gz").endswith(MESHES) and path.is_file():
+    if path.name.lower().endswith(MESHES) and path.is_file():
         raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
     return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
 

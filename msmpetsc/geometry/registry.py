@@ -18,7 +18,7 @@ import pooch
 from pydantic import TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from msmpetsc.errors import InputError, nearest, printable
+from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.surface import Surface
 
@@ -89,7 +89,7 @@ def locate(source: str, folder: str | Path) -> Path:
         return _require(source).path
     path = Path(folder) / source
     if not os.path.exists(path):  # which a name too long does not raise in
-        raise InputError(f"mesh '{source}' is no model{_nearest(source)} and no file: {path}")
+        raise InputError(f"mesh '{source}' is no model and no file: {path}{did_you_mean(source, MODELS)}")
     return path
 
 
@@ -130,7 +130,7 @@ def fetch(name: str, progress: bool = False) -> Path:
     or a file that is not the one the registry knows.
     """
     if name not in MODELS:
-        raise InputError(f"mesh {printable(name)!r} is no model{_nearest(name)}: msmpetsc fetch --list")
+        raise InputError(f"mesh {printable(name)!r} is none of fetch --list{did_you_mean(name, MODELS)}")
     downloads = MODELS[name].downloads
     if not downloads:
         return _require(name).path
@@ -167,11 +167,6 @@ def _checked(name: str, path: Path, sha256: str) -> Path:
             f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); remove it, or name it by its path"
         )
     return path
-
-
-def _nearest(name: str) -> str:
-    near = nearest(name, MODELS)
-    return f" (did you mean '{near}'?)" if near else ""
 
 
 def _originals(name: str) -> pooch.Pooch:

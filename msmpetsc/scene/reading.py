@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import Field, ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.problems import as_given, problem_lines
+from msmpetsc.scene.problems import KeyPath, as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
@@ -132,9 +132,7 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
 
-def _checked(
-    path: Path, data: dict[str, Any], presets: Collection[str] | None, keys: dict[tuple[str | int, ...], str]
-) -> SceneFile:
+def _checked(path: Path, data: dict[str, Any], presets: Collection[str] | None, keys: dict[KeyPath, str]) -> SceneFile:
     """Return the tables checked; of a problem InputError names the override of these keys."""
     try:
         return SceneFile.model_validate(data, context={"presets": presets})
@@ -147,7 +145,7 @@ def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
     return _parse(path, _read(path, kind))
 
 
-def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]] | None) -> None:
+def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:
     """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name.
 
     given : keys of the user's own words; None where a user cannot give any
@@ -205,7 +203,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: has an integer of too many digits") from None
 
 
-def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
+def _override(data: dict[str, Any], override: str) -> KeyPath:
     """Carry out a "key.path=value" in ``data``; returns the key path."""
     try:
         if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text

@@ -1,7 +1,6 @@
 """The prepare steps, scaling and placing."""
 
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,12 +76,6 @@ def test_repair_that_loses_the_body_is_refused():
     pytest.importorskip("pymeshfix")
     with pytest.raises(InputError, match=r"'repair'.*area was left"):
         prepare(real("lung_parts.ply"), ["repair"])
-
-
-def test_repair_without_its_package_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymeshfix", None)
-    with pytest.raises(InputError, match=r"pip install 'msmpetsc\[repair\]'"):
-        prepare(box(), ["repair"])
 
 
 def test_simplify_reduces_and_stays_closed():

@@ -364,12 +364,6 @@ def test_an_innocent_override_is_not_blamed(tmp_path):
     assert line.endswith("has none")
 
 
-@pytest.mark.parametrize("overrides", [(), ("cages.count=7", "mesh.prepare.4=merge", "mesh.base=[0,0,1e-17]")])
-def test_the_text_of_a_scene_loads_to_the_same_scene(tmp_path, overrides):
-    scene = load(tmp_path, EXAMPLE, *overrides)
-    assert load(tmp_path, scene.text) == scene
-
-
 # --- anything at all
 
 KEYS = st.sampled_from(sorted({word for word in EXAMPLE.split() if word.isidentifier()})) | st.text(max_size=4)

@@ -1,15 +1,24 @@
-"""Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands."""
+"""Preparing a surface: named steps that mend, reduce, join or turn it, then its size and where it stands.
 
+The same step of the same mesh makes the same mesh: of a large one, that takes seconds to repair, it is kept on disk.
+"""
+
+import hashlib
+import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib.metadata import distributions
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
+import pooch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Indices, Mask
 from msmpetsc.errors import InputError, as_expected
-from msmpetsc.geometry.step_cache import cached
 from msmpetsc.geometry.surface import Surface, bounds_of, compact, edge_use, examine, first_of_equal, merged_triangles
 
 if TYPE_CHECKING:
@@ -19,6 +28,9 @@ if TYPE_CHECKING:
 # overlapping parts or double-walled tubes MeshFix keeps a few per cent.
 LEAST_AREA_KEPT = 0.5
 FARTHEST = 1e12  # in the file's own unit
+LARGE = 20_000  # triangles
+MOST_FILES = 32  # of some megabytes each; the oldest go first
+LIBRARIES = ("fast-simplification", "manifold3d", "pymeshfix")
 
 
 def prepare(
@@ -164,6 +176,27 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
+    return result
+
+
+def cached(step: Callable[..., Surface], surface: Surface, *values: object) -> Surface:
+    """Return what a step makes of a surface and values, of a large one from the disk where it was computed before."""
+    if len(surface.triangles) < LARGE:
+        return step(surface, *values)
+    versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
+    digest = hashlib.sha256(Path(__file__).read_bytes() + repr((step.__name__, values, versions)).encode())
+    digest.update(surface.points.tobytes() + surface.triangles.tobytes())
+    path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
+    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:  # there, and whole
+        return Surface(arrays["points"], arrays["triangles"])
+    result = step(surface, *values)
+    with suppress(OSError):  # a full disk, a home that cannot be written
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f"{path.name}.{os.getpid()}.part.npz")
+        np.savez(part, points=result.points, triangles=result.triangles)
+        part.replace(path)  # a process that reads meanwhile finds all or nothing
+        for old in sorted(path.parent.glob("*.npz"), key=os.path.getmtime)[:-MOST_FILES]:
+            old.unlink(missing_ok=True)
     return result
 
 

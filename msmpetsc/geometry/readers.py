@@ -1,6 +1,5 @@
-"""Surface meshes read from files: formats, decompression, and limits on what a damaged or hostile file may claim."""
+"""Surface meshes read from files: formats, and limits on what a damaged or hostile file may claim."""
 
-import gzip
 import json
 import lzma
 import re
@@ -37,7 +36,7 @@ def read_surface(path: str | Path) -> Surface:
     """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU or VTK as triangles, in the file's own unit.
 
     Polygons are cut into triangles, the parts of a GLB are joined, of tetrahedra the outer
-    surface is taken. All but glTF, VTU and VTK may be compressed (``.gz``).
+    surface is taken.
 
     Raises InputError, one line naming the file, if it holds no usable mesh.
     """
@@ -74,43 +73,29 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 
 
 def _kind(path: Path) -> str:
-    """Return the format by the file's name, '.gz' aside; raise InputError if it is not one we read."""
-    name = path.name.lower()
-    kind = Path(name.removesuffix(".gz")).suffix.removeprefix(".")
+    """Return the format by the file's name; raise InputError if it is not one we read."""
+    kind = path.suffix.lower().removeprefix(".")
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a mesh file")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: is a pipe or a device, not a mesh file")
     if kind not in _READERS:
         raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
-    if name.endswith(".gz") and kind in _NEED_PATH:
-        raise InputError(f"{path}: {kind.upper()} is not read compressed: gunzip it first")
     return kind
 
 
 def _content(path: Path) -> bytes:
-    """Return the file's bytes, decompressed."""
+    """Return the file's bytes."""
     try:
         data = path.read_bytes()
-        data = _decompressed(data) if data.startswith(b"\x1f\x8b") else data
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except (OSError, EOFError, MemoryError, zlib.error) as error:
+    except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or error or "too large for the memory"
         raise InputError(f"{path}: cannot be read ({reason})") from error
     if not data:
         raise InputError(f"{path}: is empty")
     return data
-
-
-def _decompressed(data: bytes) -> bytes:
-    """Decompress, but not to more than a mesh can shrink from: gzip packs zeros a thousandfold."""
-    most = max(LEAST_LIMIT, MOST_PACKED * len(data))
-    with gzip.open(BytesIO(data)) as file:
-        content = file.read(most + 1)
-    if len(content) > most:
-        raise OSError(f"decompressed it is more than {MOST_PACKED} times as long")
-    return content
 
 
 @contextmanager
@@ -309,4 +294,3 @@ _READERS = {
     "vtk": _read_meshio,
     **dict.fromkeys(("obj", "stl", "off", "glb", "gltf"), _read_trimesh),
 }
-_NEED_PATH = ("gltf", "vtu", "vtk")  # the one names files beside it, the others' readers open it themselves

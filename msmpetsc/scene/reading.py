@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import Field, ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.problems import as_given, problem_lines
+from msmpetsc.scene.problems import KeyPath, as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import DEEPEST, overrides_of, plain, toml_of
 
@@ -83,7 +83,7 @@ def load_scene(
     Raises InputError naming every problem of the file, one a line.
     """
     path = Path(path)
-    if path.name.lower().removesuffix(".gz").endswith(MESHES) and path.is_file():
+    if path.name.lower().endswith(MESHES) and path.is_file():
         raise InputError(f"{path}: is a mesh, no scene: msmpetsc new {path.with_suffix('.toml')} --mesh {path}")
     return scene_of(path, _read(path, "scene"), overrides, presets, by_user)
 
@@ -104,7 +104,7 @@ def scene_of(
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, presets, file_text, keys)
+    checked = _checked(path, data, presets, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
     text = tomli_w.dumps(data) if overrides else file_text
@@ -125,30 +125,27 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     """
     path, data = folder / "scene", plain(tables)
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, None, "", keys)
+    checked = _checked(path, data, None, keys)
     try:
         return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
 
-def _checked(
-    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[tuple[str | int, ...], str]
-) -> SceneFile:
-    """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
+def _checked(path: Path, data: dict[str, Any], presets: Collection[str] | None, keys: dict[KeyPath, str]) -> SceneFile:
+    """Return the tables checked; of a problem InputError names the override of these keys."""
     try:
         return SceneFile.model_validate(data, context={"presets": presets})
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
+        raise InputError("\n".join(problem_lines(path, error, keys))) from None
 
 
-def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
-    text = _read(path, kind)
-    return text, _parse(path, text)
+def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
+    """Return the data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    return _parse(path, _read(path, kind))
 
 
-def _refuse_outside(path: Path, scene: SceneFile, given: Collection[tuple[str | int, ...]] | None) -> None:
+def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:
     """Raise InputError if the scene names a file outside its folder, links followed, that the user did not name.
 
     given : keys of the user's own words; None where a user cannot give any
@@ -206,7 +203,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: has an integer of too many digits") from None
 
 
-def _override(data: dict[str, Any], override: str) -> tuple[str | int, ...]:
+def _override(data: dict[str, Any], override: str) -> KeyPath:
     """Carry out a "key.path=value" in ``data``; returns the key path."""
     try:
         if any("\ud800" <= letter <= "\udfff" for letter in override):  # bytes that are no text

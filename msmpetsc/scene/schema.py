@@ -121,7 +121,7 @@ class SceneFile(Table):
         """Yield the tables of a kind that take a region: those of all bodies, then those of each."""
         return tables_of(self, kind)
 
-    def named_files(self) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    def named_files(self) -> Iterator[tuple[KeyPath, str]]:
         """Key path and name of each file that it names; a mesh's name may be one of the registry's too."""
         solids = {("obstacle", number, "mesh"): o.mesh for number, o in enumerate(self.obstacle) if o.mesh is not None}
         for path, mesh in (self.meshes | solids).items():

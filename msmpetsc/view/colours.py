@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.results.comparison import common_times
@@ -172,7 +171,7 @@ def _part(subject: Drawable, _: Result | None) -> Colouring:
     number = np.zeros(len(rest.cells))
     for index, part in enumerate(parts):
         number[rest.find_cells(part)] = index + 1
-    of_points = number[KDTree(rest.middles).query(rest.points, p=np.inf)[1]]
+    of_points = number[rest.cells_around(rest.points, rest.body_of_point)]
     return Colouring("part", "", lambda _: of_points, 1.0, ("material", *(part.key for part in parts)))
 
 

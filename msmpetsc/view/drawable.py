@@ -74,9 +74,16 @@ class BodiesAtRest:
         painted, number = table.table.region.painted, table.body or 0
         if not isinstance(painted, tuple):  # listed in a file, which the result does not hold
             return np.empty(0, int)
-        own = np.flatnonzero(self.body_of_node[self.cells[:, 0]] == number)
         points = self.points[self.body_of_point == number][list(painted)]
-        return own[KDTree(self.middles[own]).query(points, p=np.inf)[1]]  # cubes: the nearest is around it
+        return self.cells_around(points, np.full(len(points), number))
+
+    def cells_around(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """Return the numbers (k,) of the cells of bodies (k,) that points (k, 3) lie in."""
+        of_cell, around = self.body_of_node[self.cells[:, 0]], np.empty(len(points), int)
+        for number in np.unique(body):
+            own, inside = np.flatnonzero(of_cell == number), body == number
+            around[inside] = own[KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]]  # cubes: the nearest
+        return around
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyvista as pv
 from scipy.sparse import csr_array, eye_array, vstack
-from scipy.spatial import KDTree
+from trimesh.triangles import points_to_barycentric
 
 from msmpetsc.errors import InputError
 from msmpetsc.view.camera import Camera
@@ -55,51 +55,26 @@ def _refined(subject: Drawable) -> Drawable:
 
 
 def subdivided(points: np.ndarray, triangles: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, csr_array]:
-    """Return a surface whose edges longer than `longest` [m] are halved, again and again: points (p, 3), of which the
-    first are those given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
-    carry = csr_array(eye_array(len(points)))
-    while True:
-        half_edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, number = np.unique(half_edges, axis=0, return_inverse=True)
-        long = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) > longest
-        if not long.any():
-            return points, triangles, carry
-        middle = np.where(long, len(points) + np.cumsum(long) - 1, -1)[number].reshape(-1, 3)
-        ends = edges[long]
-        points = np.concatenate([points, points[ends].mean(axis=1)])
-        halves = csr_array(
-            (np.full(ends.size, 0.5), ends.ravel(), 2 * np.arange(len(ends) + 1)), (len(ends), carry.shape[0])
-        )
-        carry = csr_array(vstack([carry, halves @ carry]))
-        triangles = _divided(triangles, middle)
-
-
-def _divided(triangles: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return the pieces of triangles (f, 3); middle (f, 3): the points in their edges 01, 12, 20, -1 for none."""
-    pieces = [triangles[(middle < 0).all(axis=1)]]
-    for turn in range(3):  # each kind of division begins at one edge or corner
-        t, m = (np.roll(part, -turn, axis=1) for part in (triangles, middle))
-        cut = m >= 0
-        one = cut[:, 0] & ~cut[:, 1] & ~cut[:, 2]
-        (a, b, c), (ab, _, _) = t[one].T, m[one].T
-        pieces += [np.stack([a, ab, c], axis=1), np.stack([ab, b, c], axis=1)]
-        two = cut[:, 0] & cut[:, 1] & ~cut[:, 2]
-        (a, b, c), (ab, bc, _) = t[two].T, m[two].T
-        pieces += [np.stack(piece, axis=1) for piece in ((ab, b, bc), (a, ab, bc), (a, bc, c))]
-    three = (middle >= 0).all(axis=1)
-    (a, b, c), (ab, bc, ca) = triangles[three].T, middle[three].T
-    pieces += [np.stack(piece, axis=1) for piece in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    return np.concatenate(pieces)
+    """Return a surface whose edges longer than `longest` [m] are divided: points (p, 3), of which the first are those
+    given, triangles (f, 3), and the matrix (p, v) that carries numbers at the given points to these."""
+    surface = pv.PolyData.from_regular_faces(points, triangles)
+    surface.cell_data["triangle"] = np.arange(len(triangles))
+    fine = surface.subdivide_adaptive(max_edge_len=longest)
+    around = np.zeros(fine.n_points, int)
+    largest_last = np.argsort(fine.compute_cell_sizes()["Area"])
+    around[fine.regular_faces[largest_last]] = fine.cell_data["triangle"][largest_last, None]
+    corners = triangles[around[len(points) :]]
+    with np.errstate(all="ignore"):  # a triangle without an area has no such weights
+        weights = points_to_barycentric(points[corners], fine.points[len(points) :])
+    weights[~np.isfinite(weights).all(axis=1)] = 1 / 3
+    shape = (len(corners), len(points))
+    new = csr_array((weights.ravel(), corners.ravel(), 3 * np.arange(len(corners) + 1)), shape)
+    return fine.points, fine.regular_faces, csr_array(vstack([eye_array(len(points)), new]))
 
 
 def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_array:
     """Return the matrix (p, n) that carries points (p, 3) of bodies (p,) by the corners of the cells around them."""
-    of_cell = rest.body_of_node[rest.cells[:, 0]]
-    around = np.empty(len(points), int)
-    for number in np.unique(body):
-        own, inside = np.flatnonzero(of_cell == number), body == number
-        around[inside] = own[KDTree(rest.middles[own]).query(points[inside], p=np.inf)[1]]  # cubes: the nearest
-    corners = rest.cells[around]
+    corners = rest.cells[rest.cells_around(points, body)]
     low, high = rest.nodes[corners[:, 0]], rest.nodes[corners[:, 6]]
     u = np.clip((points - low) / (high - low), 0, 1)[:, None]
     weights = np.where(CORNERS, u, 1 - u).prod(axis=2)

@@ -88,7 +88,8 @@ def draw_moments(
     entries = entries_of(composition, stills)
     if style.scale_bar:
         entries.append(scale_bar(renderer.scale, LONGEST_BAR * width))
-    _save(np.concatenate([sheet, legend_picture(entries, columns * width)]), path)
+    with whole_file(path) as part:
+        Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(part)
 
 
 def _moments(run: Result, subject: Drawable, frames: Frames | None, count: int | None) -> dict[int, str]:
@@ -112,14 +113,6 @@ def _rows_of(panels: int, size: tuple[int, int]) -> int:
             f"at most {HIGHEST // height * in_row} fit into {in_row * width} by {HIGHEST}"
         )
     return rows
-
-
-def _save(picture: np.ndarray, path: Path) -> None:
-    try:
-        with whole_file(path) as part:
-            Image.fromarray(picture).save(part)
-    except ValueError as error:  # of a format that Pillow does not know
-        raise InputError(f"{path} cannot be written: {error}") from error
 
 
 # The moments, where none are asked for

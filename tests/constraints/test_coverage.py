@@ -5,7 +5,6 @@ import logging
 from pathlib import Path
 
 import pytest
-import trimesh
 from block_scene import CELL, block_scene
 from conftest import run
 from mpi4py import MPI
@@ -200,15 +199,6 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
         scene = load_scene(path, [f'cages.boundary="{boundary}"'])
         log_model(MPI.COMM_SELF, build_model(MPI.COMM_SELF, scene))
         assert heard()[0] == ("INFO", f"body of 0.45 x 0.45 x 0.2 m; {told}")
-
-
-def test_an_open_mesh_has_no_volume_to_say(tmp_path):
-    scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.01})
-    box = trimesh.load(tmp_path / "scene.ply")
-    trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "scene.ply")
-    done = run(1, "-m", "msmpetsc.cli.main", "run", scene, "-o", tmp_path / "x.h5")
-    mesh = "open mesh (3 boundary edges), its volume unknown"
-    assert f"body of 0.5 x 0.5 x 0.25 m; {mesh}; lattice of 0.0625 m^3, 62.5 kg" in done.stderr
 
 
 def test_ranks_refuse_and_warn_as_one(tmp_path):

@@ -347,7 +347,8 @@ def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
     cube = box([0, 0, 0], [1, 1, 1])
     q = np.array([[0.1, 0.5, 0.4], [0.5, 0.95, 0.5], [0.5, 0.5, -0.1]])
     before = q + np.array([[-0.2, 0.05, 0], [0, 0.1, 0.1], [0, 0, -0.1]])
-    after, after_before = Exchange(cube, 1.0).exchanged(q, before, StepTaken(1.0, T))
+    step = StepTaken(1.0, T, cube.sides(before, q, 1.0, T))
+    after, after_before = Exchange(cube, 1.0).exchanged(q, before, step)
     v = q - before
     np.testing.assert_allclose(after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15)
 

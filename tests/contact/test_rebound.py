@@ -21,12 +21,11 @@ def rise(frames) -> float:
     return float((total - np.minimum.accumulate(total)).max() / has)
 
 
-@pytest.mark.parametrize("step", [0.001, 0.004])
 @pytest.mark.parametrize("restitution", [1.0, 0.5])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
-def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: float, step: float):
+def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: float):
     """Verlet's energy swings, at the limit of its substeps by 0.7% here, and comes back."""
-    time = {"step": step, "duration": 0.2, "integrator": integrator}
+    time = {"step": 0.004, "duration": 0.2, "integrator": integrator}
     _, frames = play(ball(tmp_path, time=time, obstacle=[PLANE | {"restitution": restitution}], **FALL))
     share = 1e-2 if integrator == "verlet" else 1e-3
     assert rise(frames) < share

@@ -99,13 +99,6 @@ def test_a_node_on_the_surface_has_its_triangles_normal_and_one_far_off_no_depth
     assert cube.depths(np.empty((0, 3)))[0].shape == (0,)
 
 
-def test_a_surface_wound_inwards_is_the_same_solid():
-    inward = TORUS.copy()
-    inward.invert()
-    x = np.random.default_rng(3).uniform(-1.4, 1.4, (500, 3))
-    np.testing.assert_array_equal(solid_of(inward).depths(x)[0], solid_of(TORUS).depths(x)[0])
-
-
 # ---- runs
 
 

@@ -90,7 +90,8 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
 
 def test_a_node_that_jumps_over_a_thin_plate_is_reflected_to_where_it_came_from():
     q, before = np.array([[0.1, 0, -0.4], [6.0, 0, -0.4]]), np.array([[0.0, 0, 0.1], [6.0, 0, 0.1]])
-    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, StepTaken(1.0, 0.1))
+    step = StepTaken(1.0, 0.1, THIN.sides(before, q, 1.0, 0.1))
+    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, step)
     np.testing.assert_allclose(after, [[0.1, 0, 0.1], [6, 0, -0.4]])
     np.testing.assert_allclose(after - after_before, [[0.1, 0, 0.25], [0, 0, -0.5]])
 
@@ -240,17 +241,16 @@ def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
     assert min(lowest) > -0.005 and abs(lowest[-1] - lowest[100]) < 1e-3
 
 
-@pytest.mark.parametrize("speed", [2.0, 20.0])
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str, speed: float):
+def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str):
     """A plane that strikes a ball at rest: verlet with ``reflect`` used to end at once, having "gained" it all."""
     floor = {"shape": "plane", "point": [0, 0, -0.53], "normal": [0, 0, 1], "response": response}
-    floor["path"] = [{"time": 1.0, "by": [0, 0, speed]}]
+    floor["path"] = [{"time": 1.0, "by": [0, 0, 20.0]}]
     time = {"step": 0.001, "duration": 0.08, "integrator": integrator}
     _, frames = play(ball(tmp_path, time=time, obstacle=[floor]))
     total = totals(frames)
-    assert total[-1] > 100 * speed**2
+    assert total[-1] > 100 * 20.0**2
     gained = sum(frame.energy_gained for frame in frames)
     assert gained < 0.02 * total.max()
 

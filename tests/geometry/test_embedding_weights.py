@@ -115,12 +115,6 @@ def test_affine_agrees_with_least_squares_at_each_corner():
         assert weights("affine", u, mask) @ x == pytest.approx(expected, abs=1e-12)
 
 
-def test_mvc_interpolates_at_corners():
-    corners = np.array(list(np.ndindex(2, 2, 2)))
-    found = stencil_weights("mvc", corners + 1e-13, np.ones((8, 27), bool))  # rounding beyond the cell is taken
-    np.testing.assert_allclose(found, (corners[:, None] == NODES).all(-1), atol=1e-12)
-
-
 # ---- properties of all kinds
 
 
@@ -274,14 +268,6 @@ def test_error_on_a_bent_bar_falls_with_the_square_of_the_cell_size(kind):
 
 
 # ---- single cells, smoothing, misuse
-
-
-def test_a_cell_without_neighbours_keeps_its_own_coordinates():
-    rng = np.random.default_rng(6)
-    u, alone = rng.random((50, 3)), np.arange(27)[None] == np.full((50, 1), 13)
-    np.testing.assert_array_equal(stencil_weights("cages", u, alone), stencil_weights("mvc", u, alone))
-    # 8 nodes fix F_v; at a corner the affine map gives the corner itself
-    np.testing.assert_allclose(weights("affine", (1, 0, 1), alone[0])[NODES.tolist().index([1, 0, 1])], 1.0)
 
 
 def test_misuse_is_named():

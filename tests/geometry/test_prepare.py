@@ -1,7 +1,6 @@
 """The prepare steps, scaling and placing."""
 
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -73,22 +72,10 @@ def test_repair_closes_a_hole_and_keeps_every_part():
     assert report.closed and report.volume == pytest.approx(2)
 
 
-def test_repair_and_orient_make_the_bunny_of_holes_solid():
-    pytest.importorskip("pymeshfix")
-    report = examine(prepare(real("nasty_bunny_holes.ply"), ["repair", "orient"]))
-    assert report.closed and report.volume > 7e-4 and report.unused_points == 0
-
-
 def test_repair_that_loses_the_body_is_refused():
     pytest.importorskip("pymeshfix")
     with pytest.raises(InputError, match=r"'repair'.*area was left"):
         prepare(real("lung_parts.ply"), ["repair"])
-
-
-def test_repair_without_its_package_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pymeshfix", None)
-    with pytest.raises(InputError, match=r"pip install 'msmpetsc\[repair\]'"):
-        prepare(box(), ["repair"])
 
 
 def test_simplify_reduces_and_stays_closed():
@@ -166,18 +153,6 @@ def test_steps_run_in_the_order_given_and_leave_the_input_alone():
     assert np.array_equal(surface.points, points)
 
 
-@pytest.mark.parametrize(
-    ("step", "message"),
-    [
-        ({"rotate": {"degrees": 9}}, "'rotate' failed"),
-        ({"simplify": 0}, "'simplify'"),
-    ],
-)
-def test_bad_steps_name_themselves(step, message):
-    with pytest.raises(InputError, match=message):
-        prepare(box(), [step])
-
-
 def test_a_step_that_leaves_nothing_is_an_error():
     point = Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     for step in ("merge", "union", "repair", {"simplify": 10}):
@@ -186,3 +161,5 @@ def test_a_step_that_leaves_nothing_is_an_error():
             prepare(point, [step])
     with pytest.raises(InputError, match="size"):
         prepare(point, [], size=1.0)
+    with pytest.raises(InputError, match="'rotate' failed"):
+        prepare(box(), [{"rotate": {"degrees": 9}}])

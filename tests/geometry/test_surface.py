@@ -1,8 +1,5 @@
 """Measuring and checking surfaces."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -11,41 +8,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, check_encloses, examine, first_of_equal
 
 # name: points, triangles, boundary edges, non-manifold edges (from the notes that come with them)
-REAL = {
-    "lung_parts.ply": (31997, 63974, 0, 0),
-    "nasty_bunny_holes.ply": (35947, 69451, 223, 0),
-    "nasty_bunny_nonmanifold.ply": (50000, 99785, 353, 132),
-}
-
 SIDES = (1.0, 2.0, 3.0)
 
 
 def box(sides=SIDES) -> Surface:
     mesh = trimesh.creation.box(sides)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_meshes_have_the_counts_of_their_notes(name):
-    folder = os.environ.get("MSMPETSC_MESH_DIR")
-    if not folder:
-        pytest.skip("MSMPETSC_MESH_DIR is not set")
-    surface = read_surface(Path(folder) / name)
-    report = examine(surface)
-    v, f, boundary, nonmanifold = REAL[name]
-    assert surface.points.shape == (v, 3) and surface.triangles.shape == (f, 3)
-    assert surface.points.dtype == np.float64 and surface.triangles.dtype == np.int64
-    assert (report.boundary_edges, report.nonmanifold_edges) == (boundary, nonmanifold)
-    assert report.closed == (boundary == 0)
-    assert report.inconsistent_edges == 0
-    assert report.unused_points == (1113 if name == "nasty_bunny_holes.ply" else 0)
-    assert report.degenerate_triangles == 0
-    assert (report.volume < 0) == (name == "nasty_bunny_holes.ply")
-    assert bool(check_encloses(surface, report)) == (boundary > 0)
 
 
 def test_edges_of_an_open_flipped_and_finned_box():

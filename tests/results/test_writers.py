@@ -180,7 +180,6 @@ ALLOWED = {
     "cli/commands/new.py": "under the name that the one way gave",
     "export/gltf.py": "the same",
     "study/table.py": "into memory",
-    "geometry/step_cache.py": "a cache: what fails is not kept",
     "backend/launcher.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",

@@ -129,10 +129,6 @@ DEEP = {
     "in a table that is a value": b"x = [{ y = 1, a" + b".a" * 20_000 + b" = 1 }]\n",
     "brackets": b"x = " + b"[" * 20_000 + b"\n",
 }
-MANY = {
-    "unknown keys": (b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
-    "unknown keys of a table": (b"[cages]\n" + b"".join(b"x%d = 1\n" % i for i in range(20_000)), "and 19"),
-}
 
 
 @pytest.mark.parametrize("name", DEEP)
@@ -146,10 +142,9 @@ def test_a_key_of_many_parts_takes_no_time(tmp_path, name):
     assert "is nested too deeply" in refusal(lambda: load_scene(block_scene(tmp_path), ["a" + ".a" * 20_000 + "=1"]))
 
 
-@pytest.mark.parametrize("name", MANY)
-def test_many_mistakes_take_no_time(tmp_path, name):
-    path, (content, words) = tmp_path / "x.toml", MANY[name]
-    path.write_bytes(content)
+def test_many_mistakes_take_no_time(tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_text("[cages]\n" + "".join(f"x{i} = 1\n" for i in range(20_000)))
     begun = time.process_time()
     said = refusal(lambda: load_scene(path), lines=True)
-    assert words in said and said.count("\n") < 110 and time.process_time() - begun < 5
+    assert "and 19" in said and said.count("\n") < 110 and time.process_time() - begun < 5

@@ -13,8 +13,6 @@ from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
 from conftest import ROOT
 from PIL import Image, ImageDraw
 
-from msmpetsc.cli.arguments import parsed
-from msmpetsc.cli.commands import render as command
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.bodies import OfBody
@@ -252,23 +250,6 @@ def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
     last_ground = np.flatnonzero(ground)[-1]
     ink = bottom + 9 + np.flatnonzero((panels[0][bottom + 9 :, :, :3] < 90).all(axis=2).any(axis=1))
     assert fallen[1] < last_ground < ink.min()  # whole ball, ground, then captions (below the ball, dark itself)
-
-
-@pytest.mark.parametrize(
-    "options, told",
-    [
-        (["--frames", "0,11"], "has frames 0 to 10, not 11"),
-        (["--frames", "first"], "--frames takes numbers"),
-        (["--count", "0"], "--count must be at least 1"),
-        (["--eye", "1,2"], "--eye takes three numbers"),
-        (["--eye", "0,0,0"], "--eye takes three numbers"),
-        (["--eye", "north"], "--eye takes numbers"),
-        (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
-    ],
-)
-def test_what_cannot_be_drawn_is_told(result, options, told):
-    with pytest.raises(InputError, match=told):
-        command.run(parsed(["render", str(result), *options]))
 
 
 def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):

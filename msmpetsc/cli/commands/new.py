@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 def drafted(mesh: Path, scene: Path) -> str:
     """Return the text of a scene for a mesh, a file or a registry name. Raises InputError."""
     is_named = str(mesh) in MODELS
-    source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), Path(mesh.name.removesuffix(".gz")).suffix)
+    source, suffix = (str(mesh), "") if is_named else (beside(mesh, scene), mesh.suffix)
     surface = load(source, scene.parent)
     warnings = check_encloses(surface, examine(surface))
     measures = measured(surface, suffix)

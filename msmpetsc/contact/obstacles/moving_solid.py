@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
-from msmpetsc.constraints.loads import Motion, within
+from msmpetsc.constraints.loads import Motion, Timed
 from msmpetsc.contact.obstacles.solids import Faces, Send, Solid, no_sides
 from msmpetsc.elasticity.locate import node_of_greatest
 from msmpetsc.lattice.lattice import Lattice
@@ -15,7 +15,7 @@ TOUCHING = 1e-6  # cells: no depth, but what was rounded
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Timed):
     """A solid that may move, and may be there for a while only.
 
     solid       : at its place at time 0
@@ -32,10 +32,6 @@ class Obstacle:
     stop: float | None = None
     key: str = "obstacle"
     outside: Floats | None = None
-
-    def acts_at(self, time: float) -> bool:
-        """Return whether the obstacle is there at a time [s]."""
-        return within(time, self.start, self.stop)
 
     def seen_from(self, q: Positions, time: float) -> Positions:
         """Return where positions (n, 3) [m] at a time [s] are as seen from the solid."""

@@ -19,8 +19,8 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 
 @dataclass(frozen=True)
 class StepTaken:
-    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in
-    contact (Obstacle.sides), of several obstacles (o, n); None: as the way of each tells."""
+    """The time [s] that a step ended at, its length [s], and by which faces (n,) nodes are in contact
+    (Obstacle.sides), of several obstacles (o, n); None: by none."""
 
     time: float
     length: float
@@ -68,13 +68,10 @@ def striking(obstacle: Obstacle, q: Positions, q_previous: Positions, step: Step
     time, path = step.time, obstacle.path
     if not obstacle.acts_at(time):
         return np.zeros(0, np.int64), np.zeros((0, 3))
-    sides = step.sides
-    if sides is None and obstacle.solid.has_sides:
-        sides = obstacle.sides(q_previous, q, time, step.length)
-    inside, face = obstacle.depths(q, time, sides)
+    inside, face = obstacle.depths(q, time, step.sides)
     behind = inside >= 0
-    if sides is not None and obstacle.solid.has_sides:
-        behind &= sides > 0
+    if step.sides is not None and obstacle.solid.has_sides:
+        behind &= step.sides > 0
     rows = np.flatnonzero(behind)
     normal = obstacle.normals_at(q[rows], time, face[rows])
     v = q[rows] - q_previous[rows]

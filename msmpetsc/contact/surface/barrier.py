@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows
-from msmpetsc.contact.surface.creases import creases, neighbours, together
+from msmpetsc.contact.surface.creases import creases, neighbours
 from msmpetsc.geometry.surface import Surface
 
 if TYPE_CHECKING:
@@ -81,7 +81,6 @@ class Barrier:
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
         self.creases: list[ipctk.Candidates] = []  # pairs of each distance after the first
-        self.folded: ipctk.Candidates = ipctk.Candidates()  # all of them
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return a barrier from ``distance`` [m] on, as stiff over a depth as the law's own."""
@@ -95,10 +94,10 @@ class Barrier:
         if pairs:
             self.mesh.can_collide = self.ipctk.make_sparse_filter(pairs, True)
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
-        self.creases, self.folded = list(sets.values()), together(list(sets.values()))
+        self.creases = list(sets.values())
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
-        return len(self.folded), dropped
+        return sum(map(len, self.creases)), dropped
 
     def candidates(self, points: Positions, reach: float) -> "ipctk.Candidates":
         """Return all pairs that may be nearer than dhat once each point has moved by no more than
@@ -164,7 +163,7 @@ class Barrier:
         candidates : pairs that may meet on it, besides those in creases
         """
         end = start + moved - moved.mean(axis=0)
-        return _kept(self._share(start, end, candidates, self.folded))
+        return _kept(self._share(start, end, candidates, *self.creases))
 
     def sweep(self, start: Positions, moved: Rows, aside: float) -> tuple[float, "SweptPairs"]:
         """Return the free share of any way, as ``free_share`` does, and the pairs near it, up to where points meet.
@@ -177,8 +176,8 @@ class Barrier:
         for piece in range(min(whole, PIECES)):
             begin, end = (start + i / whole * moved for i in (piece, piece + 1))
             pieces.append(self._near_way(begin, end, 0.5 * self.law.distance + aside))
-            if self._share(begin, end, pieces[-1], self.folded) < 1:  # or a tenth as far apart: pairs that pass
-                share = self._share(begin, end, self._near_way(begin, end, 0.0), self.folded)
+            if self._share(begin, end, pieces[-1], *self.creases) < 1:  # or a tenth as far apart: pairs that pass
+                share = self._share(begin, end, self._near_way(begin, end, 0.0), *self.creases)
                 if share < 1:
                     return KEPT * (piece + share) / whole, SweptPairs(whole, pieces)
         return (1.0 if whole <= PIECES else PIECES / whole), SweptPairs(whole, pieces)
@@ -191,7 +190,7 @@ class Barrier:
 
     def free_share_in_creases(self, start: Positions, moved: Rows) -> float:
         """Return the free share of a way on which only pairs in creases can meet."""
-        return _kept(self._share(start, start + moved, self.folded))
+        return _kept(self._share(start, start + moved, *self.creases))
 
     def _share(self, start: Positions, end: Positions, *candidates: "ipctk.Candidates") -> float:
         ways = self.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, self.ccd

@@ -84,16 +84,6 @@ def creases(
     return sets, int((finer < 0).sum())
 
 
-def together(sets: list["ipctk.Candidates"]) -> "ipctk.Candidates":
-    """Return all pairs of some sets."""
-    import ipctk
-
-    candidates = ipctk.Candidates()
-    candidates.fv_candidates = [pair for kept in sets for pair in kept.fv_candidates]
-    candidates.ee_candidates = [pair for kept in sets for pair in kept.ee_candidates]
-    return candidates
-
-
 def _left_out(
     apart: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:

@@ -1,7 +1,8 @@
-"""Problems of a scene file in plain words: key path, what is wrong, the value, the nearest valid name."""
+"""Problems of a scene file in plain words: key path, what is wrong, the value, the nearest valid name, the line."""
 
 import json
 import re
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from msmpetsc.errors import nearest, printable
 KeyPath = tuple[str | int, ...]
 Broken = tuple[str, PydanticCustomError]  # a key of a table, and the rule that it breaks
 
+SEARCHED_LINES, SEARCHED = 300, 30_000  # lines, characters: finding a line parses every prefix of the file: 0.2 s
 MOST_REPORTED = 100  # problems of a file
 
 WORDS = {  # pydantic's error types: {gt} and the like are its own figures
@@ -89,16 +91,18 @@ def restated(error: ValidationError, known: list[str]) -> list[InitErrorDetails]
     return list(problems.values())
 
 
-def problem_lines(path: Path, error: ValidationError, overrides: dict[KeyPath, str]) -> list[str]:
-    """Return a line for each problem: file, key, what is wrong, and the override at fault."""
+def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict[KeyPath, str]) -> list[str]:
+    """Return a line for each problem: file, key, what is wrong, and the line of ``text`` or the override at fault."""
+    prefixes = _prefixes(text)
     lines = []
     problems = error.errors(include_url=False)
     for e in problems[:MOST_REPORTED]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
-        what = _words(e)
-        if culprit:
-            what += f" (--set {as_given(culprit)}{_in_place(e, culprit)})"
-        lines.append(": ".join(filter(None, [str(path), _key(e["loc"]), what])))
+        number = _line(e["loc"], prefixes)
+        where = (
+            f" (--set {as_given(culprit)}{_in_place(e, culprit)})" if culprit else f" (line {number})" if number else ""
+        )
+        lines.append(": ".join(filter(None, [str(path), _key(e["loc"]), f"{_words(e)}{where}"])))
     more = len(problems) - MOST_REPORTED
     return [*lines, f"{path}: and {more} more"] if more > 0 else lines
 
@@ -168,3 +172,39 @@ def _concerns(e: ErrorDetails, keys: KeyPath) -> bool:
     else:
         suspects = [loc, *((*loc[:-1], name) for name in context.get("others", ()))]
     return any(all(a == b for a, b in zip(suspect, keys, strict=False)) for suspect in suspects)
+
+
+def _prefixes(text: str) -> list[tuple[int, dict[str, Any]]]:
+    """Return for each statement of a TOML text the line it starts on, and what the text holds up to its end.
+
+    A statement ends where the text up to there parses.
+    """
+    lines = text.split("\n")
+    if len(lines) > SEARCHED_LINES or len(text) > SEARCHED:
+        return []
+    statements, start = [], 1
+    for end in range(1, len(lines) + 1):
+        try:
+            data = tomllib.loads("\n".join(lines[:end]) + "\n")
+        except tomllib.TOMLDecodeError:
+            continue
+        statements.append((start, data))
+        start = end + 1
+    return statements
+
+
+def _line(loc: KeyPath, prefixes: list[tuple[int, dict[str, Any]]]) -> int | None:
+    """Return the line on which the key first stands, or else the innermost table around it that the file has."""
+    depths = [_depth(data, loc) for _, data in prefixes]
+    deepest = max(depths, default=0)
+    return prefixes[depths.index(deepest)][0] if deepest else None
+
+
+def _depth(data: Any, loc: KeyPath) -> int:
+    """Return how many keys of ``loc`` lead somewhere in ``data``."""
+    for depth, key in enumerate(loc):
+        inside = (isinstance(data, dict) and key in data) or (isinstance(data, list) and key in range(len(data)))
+        if not inside:
+            return depth
+        data = data[key]
+    return len(loc)

@@ -104,7 +104,7 @@ def scene_of(
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {path}")
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, presets, keys)
+    checked = _checked(path, data, presets, file_text, keys)
     if to_read:
         _refuse_outside(path, checked, keys if by_user else None)
     text = tomli_w.dumps(data) if overrides else file_text
@@ -125,24 +125,27 @@ def scene_in(folder: Path, tables: Mapping[str, Any], overrides: Iterable[str] =
     """
     path, data = folder / "scene", plain(tables)
     keys = {_override(data, override): override for override in overrides}
-    checked = _checked(path, data, None, keys)
+    checked = _checked(path, data, None, "", keys)
     try:
         return Scene(**_given(checked), text=tomli_w.dumps(data), folder=folder)
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
 
-def _checked(path: Path, data: dict[str, Any], presets: Collection[str] | None, keys: dict[KeyPath, str]) -> SceneFile:
-    """Return the tables checked; of a problem InputError names the override of these keys."""
+def _checked(
+    path: Path, data: dict[str, Any], presets: Collection[str] | None, text: str, keys: dict[KeyPath, str]
+) -> SceneFile:
+    """Return the tables checked; of a problem InputError names the line of ``text`` or the override of these keys."""
     try:
         return SceneFile.model_validate(data, context={"presets": presets})
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, keys))) from None
+        raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
 
 
-def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
-    """Return the data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
-    return _parse(path, _read(path, kind))
+def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
+    """Return text and data of a TOML file. Raises InputError, which calls it a ``kind`` file."""
+    text = _read(path, kind)
+    return text, _parse(path, text)
 
 
 def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:

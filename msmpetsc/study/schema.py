@@ -248,10 +248,10 @@ def load_study(path: Path, presets: Collection[str] | None = None) -> Study:
 
     Raises InputError naming every problem, one a line.
     """
-    data = read_toml(path, "study")
+    text, data = read_toml(path, "study")
     if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a scene, no study: msmpetsc run {path}")
     try:
         return Study.model_validate(data, context={"presets": presets})
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, {}))) from None
+        raise InputError("\n".join(problem_lines(path, error, text, {}))) from None

@@ -126,7 +126,7 @@ def test_defaults(tmp_path):
 def test_line_ends_and_byte_order_mark_of_windows_editors(tmp_path):
     text = "\ufeff" + EXAMPLE.replace("\n", "\r\n")
     assert load(tmp_path, text).cages.count == 9946
-    assert problems(tmp_path, text.replace("9946", "0")) == ["scene.toml: cages.count: must be > 0, got 0"]
+    assert problems(tmp_path, text.replace("9946", "0")) == ["scene.toml: cages.count: must be > 0, got 0 (line 9)"]
 
 
 @given(st.tuples(*3 * [st.floats(allow_nan=False, allow_infinity=False)]).filter(any))
@@ -154,36 +154,36 @@ def test_every_key_is_described_with_its_unit():
 # --- one mistake, one line
 
 MISTAKES = [
-    ("count = 9946", "count = -3", "cages.count: must be > 0, got -3"),
-    ("count = 9946", "count = 1e4", "cages.count: must be a whole number, got 10000.0"),
-    ("count = 9946", "cout = 9946", "cages.cout: unknown key, did you mean 'count'?"),
-    ("count = 9946", "", "cages: must give exactly one of count, cell_size; has none"),
+    ("count = 9946", "count = -3", "cages.count: must be > 0, got -3 (line 9)"),
+    ("count = 9946", "count = 1e4", "cages.count: must be a whole number, got 10000.0 (line 9)"),
+    ("count = 9946", "cout = 9946", "cages.cout: unknown key, did you mean 'count'? (line 9)"),
+    ("count = 9946", "", "cages: must give exactly one of count, cell_size; has none (line 8)"),
     (
         "count = 9946",
         "count = 9946\ncell_size = 1",
-        "cages: must give exactly one of count, cell_size; has count and cell_size",
+        "cages: must give exactly one of count, cell_size; has count and cell_size (line 8)",
     ),
-    ('"affine"', '"afine"', "cages.embedding: unknown value \"afine\", did you mean 'affine'?"),
-    ('"affine"', '"mvc"\nsmoothing = 0.5', 'cages.smoothing: is for embedding = "cages" only, got 0.5'),
-    ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing: must be <= 1, got 1.5"),
+    ('"affine"', '"afine"', "cages.embedding: unknown value \"afine\", did you mean 'affine'? (line 10)"),
+    ('"affine"', '"mvc"\nsmoothing = 0.5', 'cages.smoothing: is for embedding = "cages" only, got 0.5 (line 11)'),
+    ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing: must be <= 1, got 1.5 (line 11)"),
     (
         "young_modulus = 5e4",
         "young_modulus = 5e4\nstiffness = 1",
-        "material: must give exactly one of young_modulus, stiffness; has young_modulus and stiffness",
+        "material: must give exactly one of young_modulus, stiffness; has young_modulus and stiffness (line 12)",
     ),
-    ("density = 1000", "", "material.density: required, but missing"),
+    ("density = 1000", "", "material.density: required, but missing (line 12)"),
     (
         "density = 1000",
         "density = 1000\npoisson_ratio = 0.3",
-        'material.poisson_ratio: is for law = "neo-hookean" only, got 0.3',
+        'material.poisson_ratio: is for law = "neo-hookean" only, got 0.3 (line 15)',
     ),
-    ("[material]", "[materail]", "materail: unknown key, did you mean 'material'?"),
-    ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3"'),
+    ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
+    ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),
     ("duration = 2.0", "duration = 0.001", "time.duration: must hold at least one step of 0.0166667 s, got 0.001"),
-    ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration: must have 3 items, got [0, -9.81]"),
-    ("[0, 0, -9.81]", "[0,\n 0,\n nan]", "gravity.acceleration.2: must be a finite number, got nan"),
-    ("[0, 0, -9.81]", '"down"', 'gravity.acceleration: must be a list, got "down"'),
-    ("[0, 3, 4]", "[0, 0.0, -0.0]", "obstacle.0.normal: must not be the zero vector, got [0, 0.0, -0.0]"),
+    ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration: must have 3 items, got [0, -9.81] (line 21)"),
+    ("[0, 0, -9.81]", "[0,\n 0,\n nan]", "gravity.acceleration.2: must be a finite number, got nan (line 21)"),
+    ("[0, 0, -9.81]", '"down"', 'gravity.acceleration: must be a list, got "down" (line 21)'),
+    ("[0, 3, 4]", "[0, 0.0, -0.0]", "obstacle.0.normal: must not be the zero vector, got [0, 0.0, -0.0] (line 26)"),
     (
         "0.9], [1, 1, 1]",
         "0.9], [1, 1, 0.9]",
@@ -192,7 +192,7 @@ MISTAKES = [
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
         "{}",
-        "pin.1.region: must give exactly one of box, sphere, half_space, painted; has none",
+        "pin.1.region: must give exactly one of box, sphere, half_space, painted; has none (line 33)",
     ),
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
@@ -203,12 +203,12 @@ MISTAKES = [
     (
         "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
         "{ painted = [1], relative = true }",
-        "pin.1.region.relative: has no meaning for painted points, got true",
+        "pin.1.region.relative: has no meaning for painted points, got true (line 33)",
     ),
     ("density = 1000", "density = 1000\nstiffening = 3", 'material.stiffening: is for law = "stiffening" only, got 3'),
     ("normal = [0, 3, 4]", "", 'obstacle.0: needs normal for shape = "plane"'),
     ('"reflect"', '"reflect"\nfriction = 0.3', "obstacle.0: has friction, which is for 'penalty' only"),
-    ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop: must be > start = 2, got 1.0"),
+    ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop: must be > start = 2, got 1.0 (line 29)"),
     (
         '"reflect"',
         '"reflect"\npath = [{ time = 2.0, by = [0, 0, 1] }, { time = 2.0, by = [0, 0, 0] }]',
@@ -219,12 +219,12 @@ MISTAKES = [
         "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]",
         "anchor.0.path: must have at least 1 item",
     ),
-    ('"anderson"', '""', "solver.preset: must not be empty"),
-    ('"bunny"', '""', "mesh.source: must not be empty"),
-    ('"orient"', '"simplify"', 'mesh.prepare.1: needs a value: { simplify = ... }, got "simplify"'),
-    ('"orient"', "{}", "mesh.prepare.1: must give exactly one of simplify, rotate; has none"),
-    ("simplify = 5000", "simplify = 3", "mesh.prepare.2.simplify: must be >= 4, got 3"),
-    ("degrees = 90", "angle = 90", "mesh.prepare.3.rotate.degrees: required, but missing"),
+    ('"anderson"', '""', "solver.preset: must not be empty (line 41)"),
+    ('"bunny"', '""', "mesh.source: must not be empty (line 4)"),
+    ('"orient"', '"simplify"', 'mesh.prepare.1: needs a value: { simplify = ... }, got "simplify" (line 5)'),
+    ('"orient"', "{}", "mesh.prepare.1: must give exactly one of simplify, rotate; has none (line 5)"),
+    ("simplify = 5000", "simplify = 3", "mesh.prepare.2.simplify: must be >= 4, got 3 (line 5)"),
+    ("degrees = 90", "angle = 90", "mesh.prepare.3.rotate.degrees: required, but missing (line 5)"),
 ]
 
 
@@ -238,12 +238,12 @@ def test_a_mistake_is_named(tmp_path, old, new, expected):
 def test_all_problems_at_once_each_with_its_line(tmp_path):
     text = SMALLEST.replace("100\n", "0\ncages.cell_size = -1\n").replace("time.step = 0.01", "time.setp = 0.01")
     assert problems(tmp_path, text + "colour = 'red'\n") == [
-        "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size",
-        "scene.toml: cages.count: must be > 0, got 0",
-        "scene.toml: cages.cell_size: must be > 0, got -1",
-        "scene.toml: time.setp: unknown key, did you mean 'step'?",
+        "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size (line 2)",
+        "scene.toml: cages.count: must be > 0, got 0 (line 2)",
+        "scene.toml: cages.cell_size: must be > 0, got -1 (line 3)",
+        "scene.toml: time.setp: unknown key, did you mean 'step'? (line 6)",
         "scene.toml: colour: unknown key, valid: title, mesh, cages, material, time, body, part, start, "
-        "gravity, obstacle, self_contact, pin, anchor, force, solver, safety, output, budget, picture",
+        "gravity, obstacle, self_contact, pin, anchor, force, solver, safety, output, budget, picture (line 8)",
     ]
 
 
@@ -265,7 +265,7 @@ def test_presets_are_checked_against_the_list_given(tmp_path):
     assert load(tmp_path, text).solver.preset == "andersen"
     assert load(tmp_path, presets=["paper", "anderson"]).solver.preset == "anderson"
     assert problems(tmp_path, text, presets=["paper", "anderson"]) == [
-        "scene.toml: solver.preset: unknown value \"andersen\", did you mean 'anderson'?"
+        "scene.toml: solver.preset: unknown value \"andersen\", did you mean 'anderson'? (line 41)"
     ]
 
 
@@ -358,10 +358,10 @@ def test_a_bad_override_names_itself(tmp_path, override, expected):
 
 def test_an_innocent_override_is_not_blamed(tmp_path):
     assert problems(tmp_path, changed("9946", "0"), "cages.max_cells=9") == [
-        "scene.toml: cages.count: must be > 0, got 0"
+        "scene.toml: cages.count: must be > 0, got 0 (line 9)"
     ]
     (line,) = problems(tmp_path, changed("count = 9946", ""), "cages.max_cells=9")
-    assert line.endswith("has none")
+    assert line.endswith("has none (line 8)")
 
 
 # --- anything at all
@@ -448,5 +448,5 @@ def test_statics_that_stay_the_same_want_no_step_and_no_duration(tmp_path):
 )
 def test_what_changes_in_time_wants_both(tmp_path, change):
     assert problems(tmp_path, STATE, change) == [
-        f"scene.toml: time.{key}: required, but missing" for key in ("step", "duration")
+        f"scene.toml: time.{key}: required, but missing (line 6)" for key in ("step", "duration")
     ]

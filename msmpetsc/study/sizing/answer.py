@@ -146,7 +146,7 @@ def lines(tables: Tables) -> str:
 
 def overrides(scene: Path, tables: Tables) -> list[str]:
     """Return the same as changes of the scene file, as --set takes them. Raises InputError for a file not TOML."""
-    document, changes = read_toml(scene), []
+    (_, document), changes = read_toml(scene), []
     for name, table in tables.items():
         given = document.get(name, {})
         if any(value is None and key in given for key, value in table.items()):

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The measures of a tree of msmpetsc: rooms, imports, functions, names, density of lines, findings.
+"""The measures of a tree of msmpetsc: rooms, functions, names, density of lines, findings.
 
     scripts/house.py [FOLDER] [--before FOLDER] [--quick] [-o PAGE]
 
@@ -14,30 +14,11 @@ import subprocess
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import lab
 from clone import PYTHON, ROOT
 
-LAYERS = (  # each imports from those before it alone
-    "errors",
-    "scene comm backend extensions fields checkpoint",
-    "geometry",
-    "lattice",
-    "elasticity",
-    "constraints",
-    "contact",
-    "build",
-    "environment",
-    "solve",
-    "results",
-    "view export",
-    "app",
-    "study",
-    "cli __main__",
-)
-HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names.split()}
 WALKS = {"scene": r"\bScene\b", "request": r"\bNamespace\b|Request\b"}  # types of what is handed on
 LONGEST, MOST_ARGUMENTS, WIDE = 35, 6, 100  # lines of a function without its docstring; columns
 Facts = Iterator[tuple[str, object]]
@@ -85,11 +66,11 @@ def listed(names: Iterable[object]) -> str:
     return f"{len(every)} {', '.join(map(str, every[:10]))}".strip()
 
 
-# ---- files and imports
+# ---- files
 
 
 def rooms(tree: Tree) -> Facts:
-    """Yield facts of folders, files and what imports what."""
+    """Yield facts of folders and files."""
     own = [name for name in tree.paths if not name.endswith("__init__")]
     of_rooms: Counter[str] = Counter()
     for name in tree.paths:
@@ -104,14 +85,6 @@ def rooms(tree: Tree) -> Facts:
     yield "files with one user", sum(users[name] == 1 for name in own)
     twice = Counter(tree.paths[name].name for name in own)
     yield "file names that stand twice", listed(name for name, count in twice.items() if count > 1)
-    height = {name: HEIGHT.get(name.partition(".")[0], 0) for name in own}
-    pairs = ((a, b) for a in own for b in sorted(tree.imports[a]) if height.get(b, 0) > height[a])
-    yield "upward imports", listed(f"{a} > {b}" for a, b in pairs)
-    try:
-        TopologicalSorter(tree.imports).prepare()
-        yield "a circle of imports", "none"
-    except CycleError as error:
-        yield "a circle of imports", " - ".join(error.args[1])
 
 
 # ---- functions and names

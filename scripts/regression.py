@@ -7,17 +7,14 @@ Every scene that is stored there, or those named, with few cells and steps, each
 number of ranks nor the way in which a step is solved shows. Counts must be equal, the numbers of the last frame within
 the tolerance. How a scene is run stands under "run" of its file: changes that let few steps show what it is about.
 Exit status 0: all are; 1: something differs, or nothing was compared. --update stores the numbers found.
-
-The numbers and their tolerance are those of `msmpetsc check` (msmpetsc/study/baseline.py).
 """
 
 import sys
-from time import perf_counter
 
 import lab
 from clone import ROOT
 
-from msmpetsc.cli.commands.check import found as measured
+from msmpetsc.cli.commands import check as numbers
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
@@ -28,7 +25,7 @@ STORED = ROOT / "tests" / "regression"
 
 def check(scene: str, ranks: int, update: bool) -> list[str] | None:
     """Run a scene and print its row; what is wrong with it, None if its mesh is not here."""
-    begun, path, file = perf_counter(), lab.SCENES / f"{scene}.toml", STORED / f"{scene}.json"
+    path, file = lab.SCENES / f"{scene}.toml", STORED / f"{scene}.json"
     try:
         for mesh in load_scene(path).meshes.values():
             locate(mesh.source, lab.SCENES)
@@ -36,18 +33,13 @@ def check(scene: str, ranks: int, update: bool) -> list[str] | None:
         print(f"{scene:20} skipped: {error}")
         return None
     try:
-        stored = baseline.read(file)
-        found = measured(path, stored.run, ranks)
+        if update:
+            numbers.update(path, file, None, ranks)
+            return []
+        return [f"{scene}: {line}" for line in numbers.checked(path, baseline.read(file), ranks).wrong]
     except InputError as error:
         print(f"{scene:20} FAILED")
         return [str(error)]
-    wrong = [f"{scene}: {line}" for line in baseline.judged(found, stored).values() if line]
-    verdict = "DIFFERS" if wrong else "same"
-    if update:
-        baseline.write(file, found)
-        verdict = "stored"
-    print(baseline.row(scene, found, stored, perf_counter() - begun, verdict), flush=True)
-    return [] if update else wrong
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Scenes whose surface meets itself: does it cross, and what a frame costs. Needs the meshes.
 
-    scripts/self_contact_study.py [SCENE...] [--cells N] [--frames N] [--shorter N] [--set KEY=VALUE] [-o PAGE]
+    scripts/self_contact_study.py [SCENE...] [--frames N] [--shorter N] [--set KEY=VALUE] [-o PAGE]
 
 crossed: pairs of an edge and a triangle that cross, over all frames, by a test that shares nothing with the contact's
 own, of the surface that meets itself; drawn: of the one that is drawn, over 20 frames. --shorter 16 takes steps, and
@@ -31,7 +31,7 @@ COUNTED = 20  # frames whose crossings of the surface that is drawn are counted
 
 def touching(scene: str, args: argparse.Namespace) -> lab.Row:
     """Return the row of a scene that touches itself."""
-    changes = [*args.set, *([f"cages.count={args.cells}"] if args.cells else [])]
+    changes = [*args.set]
     file = lab.SCENES / f"{scene}.toml"
     if args.shorter > 1:
         changes.append(f"time.step={load_scene(file).time.step / args.shorter!r}")
@@ -65,7 +65,6 @@ def touching(scene: str, args: argparse.Namespace) -> lab.Row:
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("scenes", nargs="*", metavar="SCENE", default=TOUCHING, help=", ".join(TOUCHING))
-    options.add_argument("--cells", type=int, metavar="N", help="of each scene; its own if absent")
     options.add_argument("--frames", type=int, metavar="N", help="of each scene; all if absent")
     options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps")
     options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes of every scene")

@@ -25,7 +25,7 @@ from msmpetsc.scene.bodies import BodyTable
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.solve.presets import PRESETS
-from msmpetsc.study.schema import load_study
+from msmpetsc.study.study_file import load_study
 
 OUTSIDE = {".venv", "out", "build", ".petsc-cuda", ".pytest_cache", ".hypothesis"}
 READMES = sorted(path for path in ROOT.rglob("README.md") if not OUTSIDE & set(path.relative_to(ROOT).parts))

@@ -43,12 +43,12 @@ class _Strict(BaseModel):
 class Recipe(_Strict):
     """How a scene is run for its numbers."""
 
-    cells: Annotated[int, Field(ge=1)] | None = Field(
-        validation_alias="cells asked for", serialization_alias="cells asked for", description="the scene's own if None"
+    cells: Annotated[int, Field(ge=1)] | None = Field(  # the scene's own if None
+        validation_alias="cells asked for", serialization_alias="cells asked for"
     )
     error: float = ERROR
-    steps: int = Field(ge=1, le=MOST_STEPS, description="from the start")
-    changes: list[str] = Field(default=[], description="of the scene, as --set takes them")
+    steps: int = Field(ge=1, le=MOST_STEPS)  # from the start
+    changes: list[str] = []  # of the scene, as --set takes them
 
 
 class Number(_Strict):
@@ -94,29 +94,22 @@ def summary(path: Path, recipe: Recipe) -> Numbers:
         counts = {name: len(lattice[name]) for name in ("cells", "nodes", "springs", "pinned")}
         counts["frames"] = len(frames.time)
         momentum = frames.momentum[-1]
-    potential = energies["potential"]
+    some = np.linspace(0, len(q) - 1, NODES).astype(int)
+    ends: dict[str, tuple[Unit, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
+    ends |= {"momentum": ("kg m/s", momentum), "centre of mass": ("m", mass @ q / mass.sum())}
+    ends |= {"lowest corner": ("m", q.min(axis=0)), "highest corner": ("m", q.max(axis=0))}
+    ends |= {f"node {node}": ("m", q[node]) for node in some}
+    energies["potential"] -= energies["potential"][0]
     scales: dict[Unit, float] = {
-        "m": moved,
-        "J": max(np.abs(values).max() for values in (energies | {"potential": potential - potential[0]}).values()),
-        "kg m/s": np.sqrt(2 * mass.sum() * energies["kinetic"].max()),
+        "m": float(moved),
+        "J": float(max(np.abs(values).max() for values in energies.values())),
+        "kg m/s": float(np.sqrt(2 * mass.sum() * energies["kinetic"].max())),
     }
     numbers = {
         name: Number.model_construct(unit=unit, value=np.asarray(value).tolist())
-        for name, (unit, value) in _numbers(q, mass, energies, momentum).items()
+        for name, (unit, value) in ends.items()
     }
-    sizes = {unit: float(scale) for unit, scale in scales.items()}
-    return Numbers.model_construct(run=recipe, counts=counts, scales=sizes, numbers=numbers)
-
-
-def _numbers(
-    q: np.ndarray, mass: np.ndarray, energies: dict[str, np.ndarray], momentum: np.ndarray
-) -> dict[str, tuple[Unit, Any]]:
-    """Return unit and value of each number of the last frame; q (n, 3) [m], mass (n,) [kg]."""
-    some = np.linspace(0, len(q) - 1, NODES).astype(int)
-    numbers: dict[str, tuple[Unit, Any]] = {name: ("J", values[-1]) for name, values in energies.items()}
-    numbers |= {"momentum": ("kg m/s", momentum), "centre of mass": ("m", mass @ q / mass.sum())}
-    numbers |= {"lowest corner": ("m", q.min(axis=0)), "highest corner": ("m", q.max(axis=0))}
-    return numbers | {f"node {node}": ("m", q[node]) for node in some}
+    return Numbers.model_construct(run=recipe, counts=counts, scales=scales, numbers=numbers)
 
 
 def allowed(steps: int, unit: str) -> float:

@@ -15,7 +15,7 @@ from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.schema import Axis, Length, Map, MapCase, Method, Study, StudyScene, Sweep
+from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
 OVERRIDES = {  # values of a case that stand in tables of its scene
     "integrator": ("time", "integrator"),
@@ -25,7 +25,6 @@ OVERRIDES = {  # values of a case that stand in tables of its scene
     "error": ("solver", "error"),
     "max_iterations": ("solver", "max_iterations"),
 }
-ARGUMENTS = {"true_error": "--true-error", "trace": "--trace"}  # of ``msmpetsc run``
 IN_TABLE = ("scene", "options", "label", "ranks", "repeats", "cells", *OVERRIDES)  # values that are columns
 SURFACE = "output.surface=true"  # the override of a case whose surface is compared
 NOT_ITS_IDENTITY = ("file", "label", "timeout", "reference")
@@ -43,25 +42,15 @@ class MapPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One run, repeated.
-
-    content    : digest of the scene file and of the files that it names
-    set        : all overrides, "key.path=value", as --set takes them; what follows repeats them for the table
-    error, max_iterations, cells, substep : None where the scene or the program decides
-    preset     : "" for verlet
-    true_error : every so many steps the true step error is measured; None for never
-    trace      : the step that is followed; None for none
-    reference  : the run its motion is measured against
-    point      : of a map; None for the case of a sweep
-    """
+    """One run, repeated; what is None is for the scene or the program to decide."""
 
     scene: str
     file: Path
-    content: str
-    set: tuple[str, ...]
+    content: str  # digest of the scene file and of the files that it names
+    set: tuple[str, ...]  # all overrides, "key.path=value"; what follows repeats them for the table
     integrator: str
     time_step: float  # [s]
-    preset: str = ""
+    preset: str = ""  # as for verlet
     options: str = ""
     cells: int | None = None
     substep: float | None = None  # [s]
@@ -69,12 +58,12 @@ class Case:
     max_iterations: int | None = None
     ranks: int = 1
     repeats: int = 1
-    true_error: int | None = None
-    trace: int | None = None
+    true_error: int | None = None  # every so many steps the true step error is measured
+    trace: int | None = None  # the step that is followed
     label: str = ""
     timeout: float = 300.0  # [s]
-    reference: "Case | None" = None
-    point: MapPoint | None = None
+    reference: "Case | None" = None  # the run its motion is measured against
+    point: MapPoint | None = None  # of a map; None for the case of a sweep
 
     @property
     def id(self) -> str:
@@ -96,10 +85,6 @@ class Case:
             row |= {"map": self.point.map, "x": str(self.point.x), "y": str(self.point.y)}
         return row | {"case": self.id}
 
-    def unmeasured(self) -> "Case":
-        """Return the same run without what it measures beside its work."""
-        return replace(self, true_error=None, trace=None)
-
     def changed(self, *changes: str) -> "Case":
         """Return the same run with further overrides of its scene."""
         return replace(self, set=(*self.set, *changes))
@@ -111,9 +96,10 @@ class Case:
 def run_arguments(case: Case) -> list[str]:
     """Return what follows ``msmpetsc``, outputs aside."""
     changes = [word for change in case.set for word in ("--set", change)]
-    given = [(argument, getattr(case, name)) for name, argument in ARGUMENTS.items()]
-    extra = [word for name, value in given if value is not None for word in (name, str(value))]
-    return ["run", os.path.relpath(case.file), *changes, *extra, *shlex.split(case.options)]
+    for argument, step in (("--true-error", case.true_error), ("--trace", case.trace)):
+        if step is not None:
+            changes += [argument, str(step)]
+    return ["run", os.path.relpath(case.file), *changes, *shlex.split(case.options)]
 
 
 def launcher(ranks: int) -> list[str]:
@@ -123,9 +109,8 @@ def launcher(ranks: int) -> list[str]:
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
     """Return the command of one run: its frames go to ``result``, its figures to ``measure``."""
+    name, scene, *rest = run_arguments(case)  # the last of which may be an option of PETSc's without a value
     outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
-    # before PETSc's options: the last of these may be one without a value
-    name, scene, *rest = run_arguments(case)
     return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
 
 
@@ -170,8 +155,8 @@ def with_time(case: Case, duration: float, every: int, scene: Scene, surface: bo
     """Return a case with the overrides of its time and output tables; ``surface``: it is stored."""
     time = scene.time.model_dump(exclude_unset=True) | {"step": case.time_step, "duration": duration}
     time |= scene_tables(vars(case))["time"]
-    output = (SURFACE if surface else "output.surface=false", *((f"output.every={every}",) if every > 1 else ()))
-    return case.changed(f"time={inline(time)}", *output)
+    case = case.changed(f"time={inline(time)}", SURFACE if surface else "output.surface=false")
+    return case.changed(f"output.every={every}") if every > 1 else case
 
 
 def inline(table: Mapping[str, Any]) -> str:
@@ -183,10 +168,7 @@ def inline(table: Mapping[str, Any]) -> str:
 
 
 def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
-    """Return all cases, each once, in the order of the file; ``folder`` is that of the study file.
-
-    Raises InputError for a scene file or a change of it that is wrong.
-    """
+    """Return all cases, each once, in the order of the file, whose folder is given. Raises InputError."""
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
@@ -302,23 +284,27 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
 
 
 def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | None = None) -> Iterator[Case]:
-    """Yield all cases of a map: each method at each point of two axes, or with each named case.
-
-    folder : of the study file
-
-    Raises InputError for a scene that is wrong.
-    """
-    methods = [method for method in study.method if not map.methods or method.label in map.methods]
+    """Yield a map's cases: each method at each point of two axes, or with each named case. Raises InputError."""
     for x, y, run in map_points(map):
         file = folder / run.file
         scene = load_scene(file, run.set, presets, by_user=False)
-        base = Case(
-            scene=map.name, file=file, content=digest(file, scene), set=run.set, integrator="verlet",
-            time_step=scene.time.step, timeout=study.timeout,
-        )  # fmt: skip
-        for method in methods:
-            point = MapPoint(map.name, method.label if x is None else x, y, run.recovers)
-            yield map_case(replace(base, point=point), run, method, scene)
+        step = scene.time.step
+        duration = run.steps * step if run.steps else run.duration or scene.time.duration
+        for method in study.method:
+            if map.methods and method.label not in map.methods:
+                continue
+            options = method.options
+            preset = ""
+            if method.integrator != "verlet":
+                options = f"{options} {run.options}".strip()
+                preset = method.preset
+            case = Case(
+                scene=map.name, file=file, content=digest(file, scene), set=run.set, integrator=method.integrator,
+                time_step=step, preset=preset, options=options, error=method.error, label=method.label,
+                max_iterations=method.max_iterations, timeout=study.timeout,
+                point=MapPoint(map.name, method.label if x is None else x, y, run.recovers),
+            )  # fmt: skip
+            yield with_time(with_solver(case, scene), max(duration, step), 1, scene)
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
@@ -328,10 +314,9 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
         own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
         yield None, case.name, case.model_copy(update=own)
     if map.x and map.y and map.file:
-        whole = MapCase(name=map.name, file=map.file, steps=map.steps, duration=map.duration)
         for y, x in product(map.y.values, map.x.values):
             changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-            yield x, y, whole.model_copy(update={"set": changes})
+            yield x, y, MapCase(name=map.name, file=map.file, steps=map.steps, duration=map.duration, set=changes)
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
@@ -340,18 +325,3 @@ def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
     if axis.key == "time.step":
         duration = length.steps * value if length.steps else max(length.duration or value, value)
         yield f"time.duration={duration!r}"
-
-
-def map_case(base: Case, run: MapCase, method: Method, scene: Scene) -> Case:
-    """Return the run of a method at a point of a map."""
-    options, preset = [method.options], ""
-    if method.integrator != "verlet":
-        options.append(run.options)
-        preset = method.preset
-    case = replace(
-        base, integrator=method.integrator, preset=preset, error=method.error, max_iterations=method.max_iterations,
-        label=method.label, options=" ".join(filter(None, options)),
-    )  # fmt: skip
-    step = scene.time.step
-    duration = run.steps * step if run.steps else run.duration or scene.time.duration
-    return with_time(with_solver(case, scene), max(duration, step), 1, scene)

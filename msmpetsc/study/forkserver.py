@@ -35,18 +35,15 @@ class Forked:
         self.pid = int(self.process.pid or 0)
 
     def poll(self) -> int | None:
-        """Return the exit status; None while it runs."""
         return self.process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return the exit status; negative for a signal. Raises subprocess.TimeoutExpired."""
         self.process.join(timeout)
         if self.process.exitcode is None:
             raise subprocess.TimeoutExpired("msmpetsc", timeout or 0.0)
         return self.process.exitcode
 
     def kill(self) -> None:
-        """End the run at once."""
         self.process.kill()
 
 

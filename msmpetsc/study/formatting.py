@@ -30,11 +30,6 @@ def count(value: float) -> str:
     return f"{value:,.0f}" if value == int(value) else f"{value:,.1f}"
 
 
-def size(value: float) -> str:
-    """Return bytes with their prefix: 2.5e8 -> 250 MB."""
-    return prefixed(value, "B")
-
-
 def plain(value: float | str | None) -> str:
     """Return any entry of the table, numbers to four digits; an empty text for what is missing, None or NaN."""
     if isinstance(value, str):
@@ -54,7 +49,7 @@ def worded(column: str, value: Any) -> str:
     if column.endswith("error"):
         return error(value)
     if column.startswith("memory"):
-        return size(value)
+        return prefixed(value, "B")
     if column.startswith("time_") or column in TIMES:
         return seconds(value)
     return count(value) if value == int(value) else plain(value)
@@ -64,10 +59,3 @@ def entry(row: dict[str, Any], column: str) -> str:
     """Return an entry of a row with the name of its column; empty where it has none."""
     text = worded(column, row[column])
     return f"{column.replace('_', ' ')} {text}" if text else ""
-
-
-def stepping(row: dict[str, Any]) -> str:
-    """Return how the case of a row steps; an explicit one has substeps within its time step, that between frames."""
-    if row["integrator"] == "verlet":
-        return f"substeps of {seconds(row['substep'])}" if row["substep"] else "longest stable substeps"
-    return f"time step {seconds(row['time_step'])}" if row["time_step"] else ""

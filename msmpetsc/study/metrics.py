@@ -18,8 +18,6 @@ from msmpetsc.results.reader import Result
 from msmpetsc.results.surfaces import compare_surfaces
 from msmpetsc.study.table import Row
 
-COUNTS = ("cells", "nodes", "unknowns", "springs")
-PARTS = ("setup", "factor", "local", "ksp", "output")
 COUNTED = ("iterations", "ksp_its", "products")  # of the steps; an older file lacks the last
 
 MEANING = {  # of the outcomes of a run of a map, from the worst to the best
@@ -54,8 +52,10 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def costs(record: dict[str, Any]) -> Row:
     """Return counts, times, memory, machine and versions of a measure file."""
-    row = {name: record.get(name) for name in (*COUNTS, "memory", "explicit_limit")}
-    row |= {f"time_{part}": record.get("time", {}).get(part) for part in PARTS}
+    names = ("cells", "nodes", "unknowns", "springs", "memory", "explicit_limit")
+    row = {name: record.get(name) for name in names}
+    for part in ("setup", "factor", "local", "ksp", "output"):
+        row[f"time_{part}"] = record.get("time", {}).get(part)
     machine = record.get("machine", {})
     parts = [machine.get("cpu"), machine.get("cores") and f"{machine['cores']} cores"]
     parts += [machine.get("memory") and f"{machine['memory'] / 2**30:.0f} GiB", machine.get("system")]
@@ -80,24 +80,21 @@ def of_frames(result: Path, time_step: float) -> Row:
     mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": mean.pop("wall_time"), **mean}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
-    return row | shape | _errors(series) | _soundness(series) | {"energy_left": _energy_left(series)}
+    return row | shape | _errors(series) | _soundness(series)
 
 
 def _soundness(series: dict[str, np.ndarray]) -> Row:
-    """Return what went wrong on the way; inverted cells count in the last frame alone."""
+    """Return what went wrong, inverted cells in the last frame alone; and the energy left where no load acts."""
     row: Row = {name: float(np.nansum(series[name][1:])) for name in ("substeps", "fallbacks", "energy_gained")}
     if series["inverted"][-1] >= 0:
         row["inverted"] = float(series["inverted"][-1])
     if series["self_contacts"].any():
         row["self_contacts"] = float(series["self_contacts"].max())
         row["self_distance"] = float(np.nanmin(series["self_distance"]))
-    return row
-
-
-def _energy_left(series: dict[str, np.ndarray]) -> float | None:
-    """Return the energy at the end over that at the start; None for a body on which a load acts."""
     energy = np.sum([series[name] for name in ("kinetic", "elastic", "contact", "self_contact")], axis=0)
-    return float(energy[-1] / energy[0]) if energy[0] > 0 and not series["potential"].any() else None
+    if energy[0] > 0 and not series["potential"].any():
+        row["energy_left"] = float(energy[-1] / energy[0])
+    return row
 
 
 def _errors(series: dict[str, np.ndarray]) -> Row:
@@ -122,8 +119,7 @@ def _rms(values: np.ndarray) -> float | None:
 def together(runs: Sequence[Row]) -> Row:
     """Return one row of the repeats' figures: medians of times, and the range of a step's.
 
-    What was measured once comes from the run that measured it. Memory is that of the leanest: the
-    first run may have measured errors beside its work.
+    Memory is that of the leanest: the first run may have measured errors beside its work.
     """
     row = dict(runs[0])
     for name in row:
@@ -133,13 +129,9 @@ def together(runs: Sequence[Row]) -> Row:
         elif name == "memory" and known:
             row[name] = min(known)
     times = [run["time_frame"] for run in runs if run.get("time_frame") is not None]
-    return row | ({"time_frame_min": min(times), "time_frame_max": max(times)} if len(times) > 1 else {})
-
-
-def rates(row: Row, time_step: float) -> Row:
-    """Return frames a second, and computing seconds a simulated second."""
-    time = row.get("time_frame")
-    return {"fps": 1 / time, "time_second": time / time_step} if time else {}
+    if len(times) > 1:
+        row |= {"time_frame_min": min(times), "time_frame_max": max(times)}
+    return row
 
 
 # How a run of a map went, in a word
@@ -150,7 +142,6 @@ def outcome(status: int | None, kind: str, row: Row, recovers: bool) -> str:
 
     status   : exit status, None where time ran out
     kind     : of the failure that the run records, "" for none
-    row      : its figures
     recovers : whether it should have ended in its rest shape
     """
     if status is None:
@@ -218,12 +209,9 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
-    Sums over the times that both files have, masses M and rest positions of the lattice. x_ref stands for the limit
-    of the time step to zero, so this is the error of the time step and of unfinished steps together, unlike the
-    step error, which knows the step alone. Nothing else is subtracted: a body that flies as a whole counts its
-    flight as motion, so the same error of its shape is a smaller figure there than of one that only swings.
-
-    Raises InputError if the files have fewer than two times in common or different lattices, or nothing moves.
+    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A body that flies as
+    a whole counts its flight as motion. Raises InputError if the files have fewer than two times in common or different
+    lattices, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)
@@ -246,11 +234,8 @@ def surface_error(result: Path, reference: Path, until: float = math.inf) -> flo
 
         sqrt( mean over times and area of |s - s_ref|^2 ) / greatest |s_ref - s_rest|
 
-    until : times after it do not count [s]
-
-    The reference stands for the body itself: this is the error of cells, time step and unfinished steps together.
-
-    Raises InputError if the meshes differ, a surface was not stored, there is no common time, or nothing moves.
+    Times after ``until`` [s] do not count. The reference stands for the body itself. Raises InputError if the meshes
+    differ, a surface was not stored, there is no common time, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         _, mean = compare_surfaces(run, true, until).fields

@@ -44,21 +44,14 @@ GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 @dataclass(frozen=True)
 class MeshMeasures:
-    """What a first scene rests on.
+    """What a first scene rests on, lengths in the file's unit."""
 
-    sides  : (3,) of the bounding box, in the file's unit
-    report : volume, area and faults, in the file's unit
-    parts  : (p,) share of the area that each connected part has, the largest first
-    unit   : what the file's unit is taken for [m]; None where neither metres nor millimetres give a usual body
-    y_up   : whether y points upwards, not z
-    """
-
-    sides: np.ndarray
+    sides: np.ndarray  # (3,) of the bounding box
     triangles: int
     report: SurfaceReport
-    parts: np.ndarray
-    unit: float | None
-    y_up: bool
+    parts: np.ndarray  # (p,) share of the area that each connected part has, the largest first
+    unit: float | None  # [m]; None where neither metres nor millimetres give a usual body
+    y_up: bool  # whether y points upwards, not z
 
     @property
     def thickness(self) -> float:
@@ -143,7 +136,7 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     head = [
         f"#:schema {SCHEMA_FILE}",
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
-        f"title = {quoted(title)}",
+        f"title = {json.dumps(title, ensure_ascii=False)}",
     ]
     mesh_lines, cages = _mesh(source, mesh, body), _cages(body)
     moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
@@ -155,8 +148,10 @@ def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     report, longest = mesh.report, float(body.sides.max())
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
     state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
-    lines = ["[mesh]", line(f"source = {quoted(source)}", f"{mesh.triangles} triangles, {state}, {parts}")]
-    steps, reasons = [], []
+    name = json.dumps(source, ensure_ascii=False)
+    lines = ["[mesh]", line(f"source = {name}", f"{mesh.triangles} triangles, {state}, {parts}")]
+    steps = []
+    reasons = []
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
         steps.append('"largest_part"')
         reasons.append(f"the other parts have {100 * mesh.parts[1:].sum():.1g}% of the area")
@@ -165,11 +160,9 @@ def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
         reasons.append("faces are wound inwards, or against each other")
     if mesh.y_up:
         steps.append(TURN)
-        reasons.append("y seems to point upwards in the file, and z does here: without rotate z is upwards")
+    lines += [f"# {reason}" for reason in (*reasons, upwards(mesh))]
     if steps:
-        lines += [*(f"# {reason}" for reason in reasons), f"prepare = [{', '.join(steps)}]"]
-    if not mesh.y_up:
-        lines.append(f"# z is taken for upwards; if y is in the file, prepare wants {TURN}")
+        lines.append(f"prepare = [{', '.join(steps)}]")
     if not report.closed:
         lines.append('# open: the winding number decides what is inside; prepare = ["repair"] would close it')
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
@@ -261,8 +254,3 @@ def plain(value: float, digits: int) -> str:
         return f"{rounded:.{max(digits, 4)}g}"
     mantissa, exponent = f"{rounded:e}".split("e")
     return f"{float(mantissa):g}e{int(exponent)}"
-
-
-def quoted(text: str) -> str:
-    """Return a text as a string of TOML."""
-    return json.dumps(text, ensure_ascii=False)

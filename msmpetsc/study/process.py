@@ -28,16 +28,11 @@ OVERSUBSCRIBED = {"OMPI_MCA_rmaps_base_oversubscribe": "1", "PRTE_MCA_rmaps_defa
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a process.
+    """The end of a process."""
 
-    status  : exit status, None where time ran out
-    reason  : the last line of trouble, "" if status is 0
-    seconds : that it took
-    """
-
-    status: int | None
-    reason: str
-    seconds: float
+    status: int | None  # exit status, None where time ran out
+    reason: str  # the last line of trouble, "" if status is 0
+    seconds: float  # that it took
 
     @property
     def word(self) -> str:
@@ -77,7 +72,6 @@ class Processes:
         return Ended(status, reason, perf_counter() - begin)
 
     def stop(self) -> None:
-        """End all processes, for good."""
         with self._lock:
             self.stopped, running = True, list(self._running)
         for process in running:
@@ -100,17 +94,13 @@ class Processes:
 
 
 def environment(alone: bool = False) -> dict[str, str]:
-    """Return the environment that this process was started with: an MPI begun in it since would confuse a child's.
-
-    alone : of a process without mpiexec
-    """
+    """Return the environment that this process was started with: an MPI begun in it since would confuse a child's."""
     ours = {name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)}
     # one thread a rank, or ranks and threads would fight for the cores
     return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | ours
 
 
 def too_long(timeout: float) -> str:
-    """Return the reason of a process that was ended after so many seconds."""
     return f"took longer than {timeout:g} s"
 
 
@@ -136,7 +126,6 @@ def end(process: subprocess.Popen | Forked) -> None:
 
 
 def session(leader: int) -> list[int]:
-    """Return the processes of a session."""
     members = []
     for pid in psutil.pids():
         with suppress(OSError):

@@ -33,19 +33,16 @@ from msmpetsc.study.table import (
     timed,
 )
 
-FIRST, LAST = ["scene", "label", "status"], ["command"]  # columns of the whole table
+FIRST = ["scene", "label", "status"]  # columns of the whole table; the last is the command
 ABOVE = ["study", "machine", "versions"]
 OF_FAILURES = ["scene", "label", "time_step", "error", "status", "reason", "command"]
 
 
 def write_report(folder: Path) -> Path:
-    """Draw everything that table.csv and traces.json in a folder hold: PNG files and report.html beside them.
-
-    Returns the path of report.html. Raises InputError where there is no table.
-    """
-    table, file, study = read_table(folder), folder / "study.toml", {}
-    if file.is_file():
-        study = tomllib.loads(file.read_text(encoding="utf-8"))
+    """Draw a folder's table and traces as PNG files and report.html, whose path is returned. Raises InputError."""
+    table = read_table(folder)
+    file = folder / "study.toml"
+    study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     charts = draw_charts(table, read_traces(folder), study)
     for chart in charts:
         save_png(chart, folder)
@@ -57,17 +54,17 @@ def write_report(folder: Path) -> Path:
 
 
 def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[Chart]:
-    """Return all charts that there are numbers for; a method looks the same in each.
-
-    study : the tables of the study file
-    """
+    """Return all charts that there are numbers for; ``study``: the tables of the study file."""
     styles = curve_styles(table["label"])
-    charts = stability_charts(table, study)
     sweeps = swept(table)
-    for draw in (size_charts, pareto_charts, growth_charts):
-        charts += draw(sweeps, styles)
-    charts += order_charts(sweeps, styles, study)
-    return charts + convergence_charts(sweeps, styles, traces)
+    return [
+        *stability_charts(table, study),
+        *size_charts(sweeps, styles),
+        *pareto_charts(sweeps, styles),
+        *growth_charts(sweeps, styles),
+        *order_charts(sweeps, styles, study),
+        *convergence_charts(sweeps, styles, traces),
+    ]
 
 
 # The page
@@ -76,7 +73,7 @@ def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
-    environment.filters |= {"anchor": anchor, "svg": lambda chart: Markup(svg_text(chart)), "html": html}
+    environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
     tables = {"table": whole_table(table), "failures": failed(swept(table))[OF_FAILURES]}
     template = environment.get_template("report.html.j2")
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
@@ -101,17 +98,12 @@ def repeats_note(rows: DataFrame) -> str:
 
 def whole_table(table: DataFrame) -> DataFrame:
     """Return all columns that some case fills, but for those that stand above all; numbers before texts."""
-    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, *LAST, *ABOVE)]
+    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
     filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
-    return table[[*FIRST, *filled, *LAST]]
+    return table[[*FIRST, *filled, "command"]]
 
 
 def html(table: DataFrame) -> Markup:
     """Return a table whose headings sort it."""
     with option_context("display.max_colwidth", None):
         return Markup(table.map(formatting.plain).to_html(index=False, border=0, classes="sortable"))
-
-
-def anchor(chart: Chart) -> str:
-    """Return the id of a chart's element."""
-    return "chart-" + "".join(letter if letter.isalnum() else "-" for letter in chart.name)

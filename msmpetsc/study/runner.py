@@ -4,10 +4,10 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -21,18 +21,20 @@ from msmpetsc.study.metrics import (
     costs,
     of_frames,
     outcome,
-    rates,
     read_record,
     surface_error,
     together,
     trajectory_error,
 )
 from msmpetsc.study.process import Ended, Processes, too_long
-from msmpetsc.study.schema import Study, load_study
+from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
 
-SETTINGS = ("cells", "time_step", "substep", "error", "max_iterations")  # that tell cases apart
 PARTS = "parts"  # folder of the parts' folders
+TOLD = (  # of a case that is done
+    "cells", "time_step", "substep", "error", "max_iterations", "time_frame", "true_error", "trajectory_error",
+    "surface_error",
+)  # fmt: skip
 
 
 # One case
@@ -48,15 +50,12 @@ class CaseResult:
 
 @dataclass
 class Bench:
-    """Runs cases in a folder: results come and go in it, references stay.
-
-    warm : spare each the start of the program; so it is of points of maps, of which no time is asked
-    """
+    """Runs cases in a folder: results come and go in it, references stay."""
 
     folder: Path
     processes: Processes
     study: str = ""
-    warm: bool = False
+    warm: bool = False  # spare each the start of the program; so it is of points of maps, of which no time is asked
     _locks: dict[str, Lock] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -71,7 +70,9 @@ class Bench:
         known = case.columns | {"study": self.study, "command": shown_command(case)}
         reference, why = self._reference(case)
         for repeat in range(case.repeats):
-            ended = self._run(case if repeat == 0 else case.unmeasured(), path)
+            if repeat == 1:
+                case = replace(case, true_error=None, trace=None)
+            ended = self._run(case, path)
             record = read_record(path.with_suffix(".json"))
             row, problem = _figures(case, path, record)
             if repeat == 0:
@@ -89,13 +90,15 @@ class Bench:
         if case.point:
             kind = (record.get("failure") or {}).get("kind", "")
             row["outcome"] = outcome(ended.status, kind, row, case.point.recovers)
-        return CaseResult(row | rates(row, case.time_step), trace)
+        if time := row.get("time_frame"):
+            row |= {"fps": 1 / time, "time_second": time / case.time_step}
+        return CaseResult(row, trace)
 
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
-        figures, log = path.with_suffix(".json"), path.with_suffix(".log")
+        words = command(case, path, path.with_suffix(".json"))
         warm = self.warm or case.point is not None
-        return self.processes.run(command(case, path, figures), log, case.timeout, warm)
+        return self.processes.run(words, path.with_suffix(".log"), case.timeout, warm)
 
     def _reference(self, case: Case) -> tuple[Path | None, str]:
         """Return the result of the case's reference, made if need be; or why there is none."""
@@ -159,7 +162,6 @@ class StudyResults:
     traces: dict[str, dict] = field(default_factory=dict)
 
     def add(self, result: CaseResult) -> None:
-        """Keep the result of a case."""
         case = result.row["case"]
         self.rows[case] = result.row
         if result.trace:
@@ -175,20 +177,15 @@ class StudyResults:
 
 @dataclass(frozen=True)
 class StudyPart:
-    """The ``index``-th of ``count`` parts of a study, from 1: cases that follow each other, for they share references.
-
-    Its table stands in a folder of its own, so that parts may run at the same time, on any machines.
-    """
+    """The ``index``-th of ``count`` parts of a study, from 1: cases that follow each other."""
 
     index: int
     count: int
 
     def of(self, cases: Sequence[str]) -> Sequence[str]:
-        """Return the part's cases."""
         return cases[len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count]
 
     def folder(self, study: Path) -> Path:
-        """Return the part's folder in that of the study."""
         return study / PARTS / f"{self.index}-of-{self.count}"
 
 
@@ -215,7 +212,10 @@ def run_study(
     own = part.folder(folder) if part else folder
     own.mkdir(parents=True, exist_ok=True)
     if restart:
-        _forget(own)
+        for name in ("table.csv", "table.h5", "traces.json"):
+            (own / name).unlink(missing_ok=True)
+        for name in ("runs", "references", PARTS):
+            shutil.rmtree(own / name, ignore_errors=True)
     known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
     results = _continued(known, {case: every[case] for case in wanted} if part else every)
     write_whole(own / "study.toml", path.read_bytes())
@@ -247,13 +247,18 @@ def _cases(
 def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int) -> None:
     """Run cases, keep their results and show each; ``done`` were before."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
+    pool = ThreadPoolExecutor(jobs)
     try:
-        with bar, closing(measure_all(bench, todo, jobs)) as finished:
-            for count, result in enumerate(finished, done + 1):
+        with bar:
+            futures = [pool.submit(bench.measure, case) for case in todo]
+            for count, future in enumerate(as_completed(futures), done + 1):
+                result = future.result()
                 results.add(result)
                 bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
                 bar.update()
-    finally:
+    finally:  # what ends this early ends the runs under way
+        bench.processes.stop()
+        pool.shutdown(cancel_futures=True)
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()
 
@@ -262,31 +267,18 @@ def described(row: Row) -> str:
     """Return what a case was, and what became of it."""
     if row.get("map"):
         return f"{row['map']} {row['label']} at {row['x']}, {row['y']}: {row['outcome']}"
-    numbers = (*SETTINGS, "time_frame", "true_error", "trajectory_error", "surface_error")
-    known = (f"{name} {row[name]:.3g}" for name in numbers if row.get(name))
+    known = (f"{name} {row[name]:.3g}" for name in TOLD if row.get(name))
     status = row["reason"] if row["status"] == "ok" else f"{row['status']}: {row['reason']}"
     return ", ".join(filter(None, [f"{row['scene']} {row['label']}", *known, status]))
-
-
-def measure_all(bench: Bench, todo: Sequence[Case], jobs: int = 1) -> Generator[CaseResult, None, None]:
-    """Yield each case's result when it is done; what ends this early ends the runs under way."""
-    pool = ThreadPoolExecutor(jobs)
-    try:
-        futures = [pool.submit(bench.measure, case) for case in todo]
-        for future in as_completed(futures):
-            yield future.result()
-    finally:
-        bench.processes.stop()
-        pool.shutdown(cancel_futures=True)
 
 
 # What earlier runs left
 
 
 def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
-    """Return what earlier runs left of these cases, called by their present names.
+    """Return what earlier runs left of these cases, called by their present names, for the first of the folders.
 
-    The first of the folders is continued. Of a case in several of them the first row counts that need not be run again.
+    Of a case in several of them the first row counts that need not be run again.
     """
     results = StudyResults(folders[0], list(by_id))
     for folder in dict.fromkeys(folders):
@@ -298,15 +290,11 @@ def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
 
 
 def _earlier_rows(folder: Path) -> list[Row]:
-    """Return the rows of a table to be continued; none where there is no table."""
     path = folder / "table.csv"
     if not path.is_file():
         return []
-    try:
-        table = read_table(folder)
-    except InputError:
-        table = None
-    if table is None or (table["case"] == "").any() or table[["ranks", "repeats"]].isna().any(axis=None):
+    table = read_table(folder)
+    if (table["case"] == "").any() or table[["ranks", "repeats"]].isna().any(axis=None):
         raise InputError(f"{path} is not the table of a study of this version: --restart begins anew")
     return records(table)
 
@@ -315,10 +303,3 @@ def _is_done(case: Case, rows: dict[str, Row]) -> bool:
     """Return whether a case need not be run: one given up may be worth another try."""
     row = rows.get(case.id)
     return row is not None and not (row["status"] == "timeout" and row["reason"] != too_long(case.timeout))
-
-
-def _forget(folder: Path) -> None:
-    for name in ("table.csv", "table.h5", "traces.json"):
-        (folder / name).unlink(missing_ok=True)
-    for name in ("runs", "references", PARTS):
-        shutil.rmtree(folder / name, ignore_errors=True)

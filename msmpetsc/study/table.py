@@ -32,7 +32,6 @@ class Column(NamedTuple):
 
 
 def _of_frames(name: str, more: str = "") -> Column:
-    """Return the column of a number that every frame has, with its unit and meaning."""
     field = FRAME_FIELDS[name]
     return Column(float, field.unit, field.long_name + more)
 
@@ -96,8 +95,6 @@ COLUMNS = {
     "versions": Column(str, "", "of the programs"),
     "command": Column(str, "", "the line that repeats the case"),
 }
-
-
 TEXT = tuple(name for name, column in COLUMNS.items() if column.kind is str)
 NUMBERS = tuple(name for name in COLUMNS if name not in TEXT)
 ONCE_NOTE = (
@@ -160,10 +157,7 @@ def as_table(rows: Sequence[Row]) -> "DataFrame":
 
 
 def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
-    """Return rows of text as a table with numbers for numbers.
-
-    What is missing, not a number, infinite or unreadable was not measured: NaN.
-    """
+    """Return rows of text as a table; a number that is missing, infinite or unreadable was not measured: NaN."""
     return as_table([{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts])
 
 
@@ -206,12 +200,10 @@ def _fill(file: h5py.File, table: "DataFrame") -> None:
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":
-    """Return the rows of cases that ran to their end."""
     return table[table["status"] == "ok"]
 
 
 def failed(table: "DataFrame") -> "DataFrame":
-    """Return the rows of cases that did not run to their end."""
     return table[table["status"] != "ok"]
 
 
@@ -221,7 +213,6 @@ def swept(table: "DataFrame") -> "DataFrame":
 
 
 def mapped(table: "DataFrame") -> dict[str, "DataFrame"]:
-    """Return the rows of maps, by map."""
     return grouped(table[table["map"] != ""], "map")
 
 
@@ -231,7 +222,6 @@ def measured(table: "DataFrame", *columns: str) -> "DataFrame":
 
 
 def timed(table: "DataFrame") -> "DataFrame":
-    """Return the rows of cases that ran to their end and have a time."""
     return measured(succeeded(table), "time_frame")
 
 
@@ -264,15 +254,4 @@ def reach(table: "DataFrame", cost: str) -> "DataFrame":
 
 
 def is_repeated(table: "DataFrame") -> bool:
-    """Return whether each of these cases was repeated."""
     return bool(table["time_frame_min"].notna().all())
-
-
-def within_noise(table: "DataFrame", first: Any, cost: str) -> "DataFrame":
-    """Return the rows of other methods whose repeats reach those of the row ``first``, the nearest of each method.
-
-    first : index of a row of the table
-    """
-    ends = reach(table, cost)
-    near = table[ends["least"] <= ends.loc[first, "greatest"]].sort_values(cost, kind="stable")
-    return near[near["label"] != table.loc[first, "label"]].drop_duplicates("label")

@@ -13,7 +13,7 @@ from msmpetsc.comm import log
 from msmpetsc.study import runner
 from msmpetsc.study.cases import Case, command, study_cases
 from msmpetsc.study.runner import run_study
-from msmpetsc.study.schema import load_study
+from msmpetsc.study.study_file import load_study
 from msmpetsc.study.table import NUMBERS, TEXT, read_table, records
 
 STAND_IN = ROOT / "tests" / "helpers" / "study_stand_in.py"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import study_cases
-from msmpetsc.study.schema import load_study
+from msmpetsc.study.study_file import load_study
 
 SCENES = [path.read_bytes() for path in sorted((ROOT / "scenes").rglob("*.toml"))]
 ONCE = {"step": 0.01, "duration": 0.02}

@@ -5,8 +5,6 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-import lab
-
 import bench_peers
 import peers
 import pytest
@@ -44,9 +42,3 @@ def test_a_peer_that_is_not_installed_names_the_extra(peer: str, small: bench_pe
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert done.stderr == f"{package} is not installed: pip install 'msmpetsc[peers]' brings it\n"
-
-
-def test_a_program_that_fails_or_hangs_has_a_reason(tmp_path: Path):
-    assert lab.python(["-c", "raise ValueError('no')"], tmp_path / "log").reason == "ValueError: no"
-    slow = lab.python(["-c", "import time; time.sleep(60)"], tmp_path / "log", timeout=0.1)
-    assert slow.status is None and "0.1 s" in slow.reason

@@ -33,17 +33,9 @@ def program(folder: Path, name: str, text: str) -> None:
     (folder / name).chmod(0o755)
 
 
-def test_bash_and_shellcheck_accept_it() -> None:
-    assert subprocess.run(["bash", "-n", SCRIPT]).returncode == 0
-    if shutil.which("shellcheck"):
-        checked = subprocess.run(["shellcheck", SCRIPT], capture_output=True, text=True)
-        assert checked.returncode == 0, checked.stdout
-
-
 @pytest.mark.parametrize(
     "arguments, said",
     [
-        ((), "--arch 90"),
         (("--arch",), "needs a value"),
         (("--arch", "sm_90"), "sm_90"),
         (("--arch", "90", "--jobs", "0"), "--jobs 0"),
@@ -55,13 +47,6 @@ def test_what_is_missing_is_one_line(bare: Path, tmp_path: Path, arguments: tupl
     done = build(bare, tmp_path / "petsc", *arguments)
     assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1, done
     assert done.stdout == "" and not (tmp_path / "petsc").exists()
-
-
-def test_mumps_is_asked_for(bare: Path, tmp_path: Path) -> None:
-    for tool in ("c++", "make", "mpicc"):
-        program(bare, tool, "exit 1")
-    done = build(bare, tmp_path / "petsc", "--arch", "90")
-    assert done.returncode == 2 and "PETSC_MUMPS_DIR" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_who_may_not_install_is_told_what_to_ask_for(bare: Path, tmp_path: Path) -> None:

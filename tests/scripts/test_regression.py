@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(200)
 @pytest.fixture
 def instead(tmp_path: Path, monkeypatch) -> Callable[[dict], int]:
     """instead(stored): the status where these numbers are stored; finds what the repository has, without a run."""
-    monkeypatch.setattr(regression, "measured", lambda *_: Numbers.model_validate(STORED))
+    monkeypatch.setattr(regression.numbers, "found", lambda *_: Numbers.model_validate(STORED))
     monkeypatch.setattr(regression, "STORED", tmp_path)
 
     def status(numbers: dict, *words: str) -> int:

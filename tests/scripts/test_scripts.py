@@ -62,8 +62,6 @@ def test_planted_faults_are_measured(tmp_path: Path):
     )
     rows = house.measures(folder, quick=True)
     assert rows["class names that stand twice"] == "1 Stepper" and rows["file names that stand twice"] == "1 b.py"
-    assert rows["a circle of imports"] in ("model.a - model.b - model.a", "model.b - model.a - model.b")
-    assert rows["upward imports"] == "1 model.b > solve.step"
     assert rows["functions over 35 lines"] == "1 model.a.f" and rows["functions over 6 arguments"] == 1
     assert rows["functions, modules on the walk of scene"] == "1, 1" and rows["imports inside functions"] == 1
     assert rows["files with one user"] == 3 and rows["tuned module constants"] == 1

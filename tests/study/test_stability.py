@@ -12,6 +12,7 @@ import pytest
 from conftest import ROOT
 from study_files import (
     Balance,
+    all_cases,
     carry_out,
     row_of,
     stand_in,  # noqa: F401 (fixtures)
@@ -26,10 +27,10 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError
 from msmpetsc.study.cases import shown_command, study_cases
 from msmpetsc.study.charts.convergence import closed_form, order
-from msmpetsc.study.charts.stability import COLORS, LIMIT, SYMBOLS, Scale, entry, stability_charts
+from msmpetsc.study.charts.stability import COLORS, LIMIT, SYMBOLS, stability_charts
 from msmpetsc.study.metrics import MEANING, OUTCOMES, counted, outcome
 from msmpetsc.study.report import write_report
-from msmpetsc.study.schema import load_study
+from msmpetsc.study.study_file import load_study
 from msmpetsc.study.table import read_table, typed
 
 METHODS = """
@@ -47,10 +48,6 @@ CHANGES = '["material.density={value}", "gravity.acceleration=[0, 0, -{value}]"]
 Y = f'y = {{ name = "density", template = {CHANGES}, values = [10, 20] }}\n'
 GRID = '[[map]]\nname = "g"\nfile = "scene.toml"\nsteps = 4\n'
 NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nsteps = 4\n'
-
-
-def all_cases(folder: Path, text: str) -> list:
-    return study_cases(load_study(study_file(folder, text)), folder, False)
 
 
 # The cases
@@ -84,8 +81,6 @@ def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
         (METHODS + NAMED + '[[map.case]]\nname = "a"\nfile = "x"', ["map.0", "two cases", "'a'"]),
         (METHODS + GRID + 'methods = ["newtom"]\n' + X + Y, ["method", "'newtom'", "'newton'"]),
         (METHODS * 2 + GRID + X + Y, ["method", "two methods", "'newton'"]),
-        (METHODS + GRID + X.replace("key", "kez") + Y, ["map.0.x.kez", "'key'"]),
-        (METHODS + GRID + X + Y + "duration = 1", ["map.0.duration", "beside steps"]),
         (METHODS + GRID + X + Y + '[[order]]\nscene = "b"', ["scene", "'b'"]),
     ],
 )
@@ -110,18 +105,13 @@ FINE = {"frames": 3, "shape_error": 0.0, "iterations": 30.0, "inverted": 0.0, "i
     ("status", "kind", "figures", "recovers", "expected"),
     [
         (0, "", {}, True, "ok"),
-        (0, "", {"inverted": None}, False, "ok"),
         (0, "", {"iterations": 30.1}, False, "slow"),
         (0, "", {"iterations": 300.0, "integrator": "verlet"}, False, "ok"),
         (0, "", {"iterations": 31.0, "inverted": 1.0}, False, "inverted"),
         (0, "", {"shape_error": 0.021, "inverted": 1.0}, True, "not recovered"),
         (0, "", {"shape_error": 0.021}, False, "ok"),
         (0, "", {"shape_error": None}, False, "not finite"),
-        (3, "iterations", {}, False, "diverged"),
         (3, "line search", {}, False, "diverged"),
-        (3, "linear solve", {}, False, "diverged"),
-        (3, "unstable", {}, False, "diverged"),
-        (3, "", {}, False, "diverged"),
         (3, "energy", {}, False, "energy"),
         (3, "not finite", {"inverted": 1.0}, True, "not finite"),
         (3, "refused", {}, False, "refused"),
@@ -137,9 +127,7 @@ def test_the_worst_that_befell_a_run_is_its_outcome(status, kind, figures, recov
 
 
 def test_every_outcome_has_a_meaning_a_colour_and_a_mark():
-    assert len(OUTCOMES) == len(set(COLORS.values())) == 10
     assert set(OUTCOMES) == set(MEANING) == set(COLORS) == {*SYMBOLS, "slow", "ok"}
-    assert len(set(SYMBOLS.values())) == len(SYMBOLS)
 
 
 # What is run and told
@@ -203,20 +191,6 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_number_lies_between_its_neighbours_by_its_logarithm():
-    scale = Scale("t", ("0.0001", "0.01", "1.0"), ("", "", ""))
-    found = [scale.position(value) for value in (1e-3, 1.0, 10 ** (-4.5), 1e-8, 100)]
-    assert found == pytest.approx([0.5, 2, -0.25, math.nan, math.nan], nan_ok=True)
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [("0.2", "%", "20%"), ("1e-5", "s", "10 µs"), ("1e5", "Pa", "100 kPa"), ("3", "", "3"), ("nan", "s", "nan")],
-)
-def test_places_are_worded(value: str, unit: str, text: str):
-    assert entry(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
-
-
 def test_the_explicit_limit_crosses_the_map(folder: Path):
     (chart,) = stability_charts(read_table(folder), tomllib.loads(STUDY))
     *_, lines = (layer["data"]["values"] for layer in chart.panels[0].layers if layer["mark"]["type"] == "rule")
@@ -243,16 +217,10 @@ def timed(step: float, error: float, **given) -> dict:
     return row_of("m", time_step=step, trajectory_error=error, **given)
 
 
-@pytest.mark.parametrize("power", [1, 2])
-def test_the_slope_is_that_of_the_short_steps(power: int):
-    """The two longest steps are off the line."""
-    steps = [0.1, 0.05, 0.02, 0.01]
-    rows = [timed(step, (5 if step > 0.03 else 1) * step**power) for step in steps]
-    assert order(typed(rows)) == pytest.approx(power)
-    assert order(typed(rows[:1])) is None
-
-
-def test_verlet_steps_by_its_substep():
+def test_the_slope_is_that_of_the_short_steps():
+    """The two longest steps are off the line; verlet steps by its substep."""
+    rows = [timed(step, (5 if step > 0.03 else 1) * step) for step in (0.1, 0.05, 0.02, 0.01)]
+    assert order(typed(rows)) == pytest.approx(1) and order(typed(rows[:1])) is None
     rows = [timed(0.1, s**2, integrator="verlet", substep=s) for s in (1e-3, 5e-4)]
     assert order(typed(rows)) == pytest.approx(2)
 

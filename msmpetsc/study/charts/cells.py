@@ -39,28 +39,21 @@ def with_curves(rows: DataFrame) -> DataFrame:
     varied = [name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()]
     words = ([row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows))
     rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
-    reached = {curve: f"{curve}{errors(group)}" for curve, group in grouped(rows, "curve").items()}
-    return rows.assign(curve=rows["curve"].map(reached))
-
-
-def errors(rows: DataFrame) -> str:
-    """Return the range of true step errors that a curve reached; empty where none was measured."""
-    reached = measured(rows, "true_error")["true_error"]
-    if reached.empty:
-        return ""
-    ends = dict.fromkeys(formatting.error(end) for end in (reached.min(), reached.max()))
-    return f" (step error {' to '.join(ends)})"
+    names = {curve: curve for curve in rows["curve"]}
+    for curve, reached in grouped(measured(rows, "true_error"), "curve").items():
+        ends = dict.fromkeys(map(formatting.error, (reached["true_error"].min(), reached["true_error"].max())))
+        names[curve] += f" (step error {' to '.join(ends)})"
+    return rows.assign(curve=rows["curve"].map(names))
 
 
 def styles_of(curves: DataFrame, styles: Styles) -> Styles:
     """Return the style of each curve: those of one label share its colour, and have own markers."""
+    found = {}
     number = curves.groupby("label").cumcount()
-    shapes = [
-        SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
-        for label, more in zip(curves["label"], number, strict=True)
-    ]
-    of_curves = zip(curves["curve"], curves["label"], shapes, strict=True)
-    return {curve: CurveStyle(styles[label].color, shape) for curve, label, shape in of_curves}
+    for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
+        shape = SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
+        found[curve] = CurveStyle(styles[label].color, shape)
+    return found
 
 
 def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pandas import DataFrame, concat
 
 from msmpetsc.study import formatting
@@ -21,7 +20,6 @@ from msmpetsc.study.charts.plot import (
     INK,
     RING,
     SECONDS,
-    Axes,
     Chart,
     CurveStyle,
     Styles,
@@ -41,7 +39,6 @@ from msmpetsc.study.table import (
     records,
     spread,
     succeeded,
-    within_noise,
 )
 
 KIND = "Speed against accuracy"
@@ -56,9 +53,7 @@ CAPTION = (
 )
 
 
-TOLD = (
-    "least", "greatest", "time_step", "substep", "error", "max_iterations", "iterations", "ranks",
-)  # fmt: skip
+TOLD = ("least", "greatest", "time_step", "substep", "error", "max_iterations", "iterations", "ranks")
 
 
 class ErrorMeasure(NamedTuple):
@@ -72,7 +67,6 @@ class ErrorMeasure(NamedTuple):
 
     @property
     def columns(self) -> tuple[str, str]:
-        """The columns of both axes."""
         return self.error, self.cost
 
 
@@ -123,12 +117,13 @@ def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
     reached = reached[reached[measure.error] <= level]
     if reached.empty:
         return []
-    reached = reached.assign(**spread(reached, measure.cost))
-    first = reached[measure.cost].idxmin()
-    best = records(reached.loc[[first]])
-    if is_repeated(reached.loc[[first]]):
-        best += records(within_noise(reached, first, measure.cost))
-    return best
+    reached = reached.assign(**spread(reached, measure.cost)).sort_values(measure.cost, kind="stable")
+    best = reached.iloc[:1]
+    if not is_repeated(best):
+        return records(best)
+    ends = reach(reached, measure.cost)
+    near = reached[ends["least"] <= ends["greatest"].iloc[0]]
+    return records(near.drop_duplicates("label"))
 
 
 # The charts
@@ -143,17 +138,17 @@ def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
         for cells, group in swept.items():
             name = f"pareto_{scene}" if len(swept) == 1 else f"pareto_{scene}_{formatting.plain(cells)}"
             title = f"{KIND}: {scene}, {formatting.count(cells)} cells" if cells > 0 else f"{KIND}: {scene}"
-            chart = pareto_chart(name, title, group, styles)
-            charts += [chart] if chart else []
-    return charts
+            charts.append(pareto_chart(name, title, group, styles))
+    return [chart for chart in charts if chart.panels]
 
 
-def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart | None:
-    """Return the panels that have data; None where neither has."""
-    step, trajectory = common_time_step(measured(rows, *STEP.columns)), measured(rows, *TRAJECTORY.columns)
-    panels = [(measure, shown) for measure, shown in ((STEP, step), (TRAJECTORY, trajectory)) if len(shown)]
-    if not panels:
-        return None
+def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
+    """Return the panels that have data."""
+    step = measured(rows, *STEP.columns)
+    of_steps = grouped(step, "time_step").values()  # only those of one compare by time a frame
+    step = max(of_steps, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step)
+    panels = [(STEP, step), (TRAJECTORY, measured(rows, *TRAJECTORY.columns))]
+    panels = [(measure, shown) for measure, shown in panels if len(shown)]
     labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
     legend = {label: styles[label] for label in labels} | {FRONT: CurveStyle(INK, RING)}
     chart = Chart(name, KIND, title, CAPTION, legend)
@@ -162,12 +157,6 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
         lines = [cheapest_line(measure, level, winners(shown, measure, level)) for level in LEVELS]
         chart.findings[f"The cheapest by {measure.name}"] = lines + ([] if is_repeated(shown) else [ONCE_NOTE])
     return chart
-
-
-def common_time_step(rows: DataFrame) -> DataFrame:
-    """Return the rows of the time step with the most of them: only they compare by time a frame."""
-    groups = grouped(rows, "time_step")
-    return max(groups.values(), key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=rows)
 
 
 def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
@@ -203,11 +192,20 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
     if row["error"]:
         facts.insert(0, f"asked for {formatting.error(row['error'])}")
     if measure is TRAJECTORY:
-        facts.append(formatting.stepping(row))
+        facts.append(stepping(row))
     unit = measure.y_label.removeprefix("computing time ")
     sentence = f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({', '.join(facts)})"
     rivals = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in near)
     return f"{sentence}; within its noise: {rivals}." if near else f"{sentence}."
+
+
+def stepping(row: Row) -> str:
+    """Return how a case steps; an explicit one has substeps within its time step, that between frames."""
+    if row["integrator"] != "verlet":
+        return formatting.entry(row, "time_step")
+    if row["substep"]:
+        return f"substeps of {formatting.seconds(row['substep'])}"
+    return "longest stable substeps"
 
 
 def cost_of(row: Row, measure: ErrorMeasure) -> str:
@@ -235,16 +233,12 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     for scene, rows in grouped(measured(succeeded(table), *SIZE), "scene").items():
         own = {label: styles[label] for label in dict.fromkeys(rows["label"])}
         chart = Chart(f"size_{scene}", SIZES, f"{SIZES}: {scene}", SIZES_CAPTION, own)
-        panel = size_panel(chart, scene, rows["time_second"], rows["surface_error"], SIZE[1].replace("_", " "))
+        x = log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS)
+        panel = chart.panel(scene, x, log_axis("surface error", rows["surface_error"], ERROR))
         panel.curves(rows.sort_values("cells", kind="stable"), SIZE, (*SIZE[::-1], "cells", "time_step", "error"))
         panel.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
         charts.append(chart)
     return charts
-
-
-def size_panel(chart: Chart, title: str, costs: ArrayLike, errors: ArrayLike, label: str) -> Axes:
-    """Return a panel of errors over costs."""
-    return chart.panel(title, log_axis(TRAJECTORY.y_label, costs, SECONDS), log_axis(label, errors, ERROR))
 
 
 def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
@@ -254,9 +248,9 @@ def plan_picture(plan: SizePlan, target: float, path: Path) -> None:
     chosen = DataFrame([(plan.choice.cost, plan.choice.budget.total)], columns=list(SIZE))
     styles = curve_styles(sorted(set(rows["label"]))) | {"asked for": CurveStyle(FAINT, DASH)}
     chart = Chart(path.stem, SIZES, f"{SIZES}: the trials of a plan", "", styles)
-    costs = [*rows["time_second"], *chosen["time_second"]]
-    errors = [*rows["surface_error"], *chosen["surface_error"], target]
-    panel = size_panel(chart, "tried, and ringed what is chosen", costs, errors, "surface error, estimated")
+    costs, errors = (np.append(rows[column], chosen[column]) for column in SIZE)
+    y = log_axis("surface error, estimated", np.append(errors, target), ERROR)
+    panel = chart.panel("tried, and ringed what is chosen", log_axis(TRAJECTORY.y_label, costs, SECONDS), y)
     panel.line(panel.x["scale"]["domain"], [target, target], strokeDash=[6, 4])
     values = points(rows, SIZE, (*SIZE, "cells"))
     panel.mark(values)

@@ -80,10 +80,7 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
 
 def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
-    """Return what the point of each row tells: its curve, its numbers, the command that repeats it.
-
-    told : columns; curve : the one with the name of its curve
-    """
+    """Return what the point of each row tells: its curve, its numbers, the command that repeats it."""
     told = list(dict.fromkeys(told))
     lines = ([row[curve], *(formatting.entry(row, name) for name in told), row["command"]] for row in records(rows))
     return ["\n".join(filter(None, tip)) for tip in lines]
@@ -99,10 +96,7 @@ def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dic
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis around positive values, with margins, of a decade at least.
-
-    Numbers stand at the decades, and at 2 and 5 where there are few decades.
-    """
+    """Return a logarithmic axis around positive values, with margins, of a decade at least."""
     low, high = math.log10(np.min(values)), math.log10(np.max(values))
     middle, half = (low + high) / 2, max(high - low, 0.85) * 0.58
     low, high = middle - half, middle + half
@@ -112,10 +106,7 @@ def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
 
 
 def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str, Any]:
-    """Return an axis with 0 at the left, logarithmic from the least positive value on.
-
-    Methods differ by powers of ten.
-    """
+    """Return an axis with 0 at the left, logarithmic from the least positive value on."""
     positive = [value for value in values if value > 0]
     if not positive:
         return channel(title, words, [0], domain=[0, 1])
@@ -155,11 +146,9 @@ class Axes:
         """Draw the spread of the repeats of each row; the second column is its cost."""
         ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
         values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
-        color = {"color": nominal(self.styles, "color")}
-        self.draw(values, {"type": "rule"}, y2={"field": "high"}, **color)
-        for end in ("y", "high"):
-            tick = {"type": "tick", "orient": "horizontal", "size": 7, "opacity": 1}
-            self.draw(values, tick, **color | {"y": {"field": end} | self.y})
+        part = {"opacity": 1, "aria": False}
+        bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
+        self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))
 
     def curves(self, rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = "label") -> None:
         """Draw the rows of each curve, in their order, as a line with a marker at each point."""
@@ -195,27 +184,23 @@ def points(rows: DataFrame, columns: Columns, told: Iterable[str], curve: str = 
 
 @dataclass
 class Chart:
-    """Panels, and what they say in plain words.
+    """Panels, and what they say in plain words."""
 
-    name     : of its file
-    kind     : the heading it stands under
-    styles   : of all its curves, for the legend
-    columns  : panels side by side, at most
-    gap      : between panels, with their axes [px]
-    height   : of a panel [px]
-    findings : lines in plain words, by their heading
-    """
-
-    name: str
-    kind: str
+    name: str  # of its file
+    kind: str  # the heading it stands under
     title: str
     caption: str
-    styles: Styles
-    columns: int = 3
-    gap: float = 85
-    height: float = HEIGHT
+    styles: Styles  # of all its curves, for the legend
+    columns: int = 3  # panels side by side, at most
+    gap: float = 85  # [px] between panels, with their axes
+    height: float = HEIGHT  # [px] of a panel
     panels: list[Axes] = field(default_factory=list)
-    findings: dict[str, list[str]] = field(default_factory=dict)
+    findings: dict[str, list[str]] = field(default_factory=dict)  # lines by their heading
+
+    @property
+    def anchor(self) -> str:
+        """The id of its element on the page."""
+        return "chart-" + re.sub(r"\W|_", "-", self.name)
 
     def panel(self, title: str, x: dict[str, Any], y: dict[str, Any]) -> Axes:
         """Return a new panel behind the others."""
@@ -256,17 +241,11 @@ def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> 
 # Files
 
 
-def png(chart: Chart) -> bytes:
-    """Return the chart with its title as PNG."""
-    title = {"text": chart.title, "fontWeight": "bold", "fontSize": 15, "offset": 12}
-    return vl_convert.vegalite_to_png({"config": CONFIG, "title": title} | chart.spec(), scale=1.5)
-
-
-def save_png(chart: Chart, folder: Path) -> Path:
+def save_png(chart: Chart, folder: Path) -> None:
     """Write the chart with its title, in a file of its name."""
-    path = folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png"
-    write_whole(path, png(chart))
-    return path
+    title = {"text": chart.title, "fontWeight": "bold", "fontSize": 15, "offset": 12}
+    image = vl_convert.vegalite_to_png({"config": CONFIG, "title": title} | chart.spec(), scale=1.5)
+    write_whole(folder / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', chart.name)}.png", image)
 
 
 def svg_text(chart: Chart) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from pandas import DataFrame
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, Styles, channel, tips
+from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, channel, tips
 from msmpetsc.study.metrics import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
 
@@ -88,7 +88,12 @@ def stability_chart(name: str, rows: DataFrame, settings: dict) -> Chart:
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
     title, height = settings.get("title") or name, CELL * len(y.values)
-    chart = Chart(f"stability_{name}", KIND, title, CAPTION, legend_of(rows), columns=COLUMNS, gap=35, height=height)
+    legend = {
+        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
+        for outcome in reversed(OUTCOMES)
+        if outcome in set(rows["outcome"])
+    }
+    chart = Chart(f"stability_{name}", KIND, title, CAPTION, legend, columns=COLUMNS, gap=35, height=height)
     by_label = grouped(rows, "label")
     if set(x.values) == set(by_label):
         draw_cells(chart.panel("", *axes_of_cases(x, y)), rows, x._replace(name="method"), y._replace(name="case"))
@@ -98,15 +103,6 @@ def stability_chart(name: str, rows: DataFrame, settings: dict) -> Chart:
         panel = chart.panel(label, axis(x, shown=is_low, labelAngle=-90), axis(y, shown=index % COLUMNS == 0))
         draw_cells(panel, group, x, y)
     return chart
-
-
-def legend_of(rows: DataFrame) -> Styles:
-    """Return the colour and the symbol of each outcome there is, best first."""
-    return {
-        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(COLORS[outcome], "square")
-        for outcome in reversed(OUTCOMES)
-        if outcome in set(rows["outcome"])
-    }
 
 
 def axis(scale: Scale, shown: bool = True, **look: Any) -> dict[str, Any]:
@@ -142,17 +138,14 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
         }
         for row, tip in zip(records(placed), tips(placed, (*words, *TOLD)), strict=True)
     ]  # fmt: skip
-    panel.draw(values, {"type": "rect"}, fill=color_of("color"), description={"field": "tip"}, **ENDS)
+    own = {"type": "nominal", "scale": None}  # colours that stand in a column
+    color = {"field": "color"} | own
+    panel.draw(values, {"type": "rect"}, fill=color, description={"field": "tip"}, **ENDS)
     draw_limit(panel, rows, x, y)
     look = {"type": "text", "fontSize": 10.5}
     text = {"text": {"field": "text"}, "x": {"field": "i"} | panel.x, "y": {"field": "j"} | panel.y}
-    panel.draw(values, look, **text, stroke=color_of("color"), strokeWidth={"value": 5})  # keeps the limit off them
-    panel.draw(values, look, **text, color=color_of("ink"))
-
-
-def color_of(column: str) -> dict[str, Any]:
-    """Return the channel of colours that stand in a column."""
-    return {"field": column, "type": "nominal", "scale": None}
+    panel.draw(values, look, **text, stroke=color, strokeWidth={"value": 5})  # keeps the limit off them
+    panel.draw(values, look, **text, color={"field": "ink"} | own)
 
 
 def symbol(row: Row) -> str:
@@ -160,7 +153,9 @@ def symbol(row: Row) -> str:
     count = row["iterations"]
     if row["outcome"] in SYMBOLS or count is None:
         return SYMBOLS.get(row["outcome"], "")
-    return f"{count:.0f}" if count < 1000 else f"{count / 1000:.{1 if count < 9950 else 0}f}k"
+    if count < 1000:
+        return f"{count:.0f}"
+    return f"{count / 1000:.{int(count < 9950)}f}k"
 
 
 def draw_limit(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:

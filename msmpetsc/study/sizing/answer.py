@@ -18,26 +18,19 @@ from msmpetsc.study.sizing.choice import Candidate, Choice, CostModel
 
 @dataclass(frozen=True)
 class SizeTrial:
-    """A run that was made.
-
-    asked, cells : valid cells asked for, and had
-    cost         : computing seconds a simulated second
-    substeps     : of a step, for verlet; else iterations; their mean
-    inverted     : cells that end inside out
-    result       : its file
-    """
+    """A run that was made."""
 
     method: Candidate
-    asked: int
-    cells: float
-    cost: float
-    substeps: float
-    inverted: float
+    asked: int  # valid cells
+    cells: float  # that it had
+    cost: float  # computing seconds a simulated second
+    substeps: float  # of a step, for verlet; else iterations; their mean
+    inverted: float  # cells that end inside out
     result: Path
 
     @property
     def edge(self) -> float:
-        """Edge of a cell, of a body of one cell."""
+        """Edge of a cell, over that of a body of one cell."""
         return self.cells ** (-1 / 3)
 
 
@@ -52,58 +45,36 @@ class Tried(NamedTuple):
 
 @dataclass
 class SizePlan:
-    """The answer.
+    """The answer."""
 
-    choice : the cheapest that meets the error, or of the smallest error there is
-    met    : whether it is expected to meet the error
-    bounds : what keeps the error from being smaller, or the estimate from being sure, in words
-    """
-
-    choice: Choice
-    met: bool
-    bounds: list[str] = field(default_factory=list)
+    choice: Choice  # the cheapest that meets the error, or of the smallest error there is
+    met: bool  # whether it is expected to meet the error
+    bounds: list[str] = field(default_factory=list)  # what keeps the error from being smaller, or sure, in words
     tried: list[Tried] = field(default_factory=list)
 
 
 def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
-    """Return what an error out of reach is made of: more than half of it by the step, or by the cells.
-
-    step_known : whether what is wrong with the step is said already
-    """
-    bounds, best, wanted = [], model.best().budget, model.cells_for(target / 2)
+    """Return what makes over half of an error out of reach: the step, unless that is said already, or the cells."""
+    bounds = []
+    best = model.best().budget
     if best.time > target / 2 and not step_known:
         bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
     if best.cells > target / 2:
-        bounds.append(
-            f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; half the error asked for "
-            f"would take {wanted:.2g}"
-        )
+        wanted = f"half the error asked for would take {model.cells_for(target / 2):.2g}"
+        bounds.append(f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; {wanted}")
     return bounds
 
 
-def fewest_bound(choice: Choice, coarser: Sequence[tuple[int, float]]) -> list[str]:
-    """Return why a choice of so small an error has no fewer cells.
-
-    coarser : cells and error of the finest lattice that is too coarse, if there is one
-    """
-    why = "no lattice of fewer can be run"
-    for cells, error in coarser:
-        why = f"{cells} cells have {error:.1e}, nothing was found between"
-    return [f"the fewest cells: {choice.budget.total:.1e} is less than was asked for; {why}"]
-
-
-def inverted_bound(inverted: float, cells: float, law: str) -> list[str]:
-    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge.
-
-    law : of the material
-    """
-    if not inverted:
+def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
+    """Return that cells of the finest lattice tried end inside out, if any do: such a motion need not converge."""
+    finest = max(trials, key=lambda each: each.cells)
+    if not finest.inverted:
         return []
-    helps = "" if law == "stiffening" else ' or material.law = "stiffening"'
-    return [
-        f"the motion: of {cells:.0f} cells {inverted:.0f} end inside out, each lattice in its own way; fewer --frames"
-        f"{helps} may help"
-    ]
+    helps = "fewer --frames"
+    if law != "stiffening":
+        helps += ' or material.law = "stiffening"'
+    found = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
+    return [f"the motion: {found}; {helps} may help"]
 
 
 def time_bound(model: CostModel, target: float, times: Sequence[float], apart: Callable[[float], float]) -> list[str]:
@@ -129,17 +100,13 @@ Tables = Mapping[str, Mapping[str, Any]]  # of a scene file, by name and key
 
 def tables(method: Candidate) -> Tables:
     """Return what the method says of a scene; None: the key must not stand there."""
-    values = {
-        "integrator": method.integrator, "time_step": method.time_step, "substep": None, "preset": method.preset,
-        "error": method.step_error, "max_iterations": None,
-    }  # fmt: skip
+    values = vars(method) | {"substep": None, "error": method.step_error, "max_iterations": None}
     if method.integrator == STATIC:
         del values["time_step"]  # which spaces states, and need not stand there
     return scene_tables(values)
 
 
 def lines(tables: Tables) -> str:
-    """Return TOML lines to paste."""
     shown = {name: {key: value for key, value in table.items() if value is not None} for name, table in tables.items()}
     return tomlkit.dumps(shown).strip()
 

@@ -24,33 +24,25 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Stepping:
-    """An integrator with its step, tried on one lattice.
-
-    error : of the time step alone [-]
-    cost  : computing seconds a simulated second there
-    """
+    """An integrator with its step, tried on one lattice."""
 
     method: Candidate
-    error: float
-    cost: float
+    error: float  # of the time step alone [-]
+    cost: float  # computing seconds a simulated second there
 
 
 @dataclass(frozen=True)
 class Solving:
-    """A relative error of each step that is asked for.
-
-    error : that it leaves in the motion [-]
-    cost  : over that of the trials
-    """
+    """A relative error of each step that is asked for."""
 
     step_error: float | None
-    error: float
-    cost: float
+    error: float  # that it leaves in the motion [-]
+    cost: float  # over that of the trials
 
 
 @dataclass(frozen=True)
 class Budget:
-    """The parts of a surface error, each relative to the largest displacement [-]."""
+    """The parts of a surface error, each relative to the largest displacement [-]; their sum is never exceeded."""
 
     cells: float
     time: float
@@ -58,43 +50,31 @@ class Budget:
 
     @property
     def total(self) -> float:
-        """Return their sum, which no combination of them exceeds."""
         return self.cells + self.time + self.step
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What to run, and what is expected of it.
-
-    cost   : computing seconds a simulated second
-    shares : of the cost by part of the error: how much of its rise each part is, were a smaller error asked for
-    """
+    """What to run, and what is expected of it."""
 
     method: Candidate
     cells: int
     budget: Budget
-    cost: float
-    shares: Budget
+    cost: float  # computing seconds a simulated second
+    shares: Budget  # of its rise, were a smaller error asked for
 
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the trials told: errors of the cells, the steps and their solution, and what each costs.
+    """What the trials told: errors of the cells, the steps and their solution, and what each costs."""
 
-    law         : of the error over the edge of a cell, cells^(-1/3)
-    cells       : of the lattice that the steppings were tried on
-    costs       : of one of them by the cells of the lattices tried, ascending
-    explicit    : whether that one was explicit, whose substeps shorten as the edge of a cell
-    least, most : cells that may be chosen
-    """
-
-    law: ErrorLaw
+    law: ErrorLaw  # of the error over the edge of a cell, cells^(-1/3)
     steppings: Sequence[Stepping]
     solvings: Sequence[Solving]
-    cells: float
-    costs: Sequence[tuple[float, float]]
-    explicit: bool
-    least: int
+    cells: float  # of the lattice that the steppings were tried on
+    costs: Sequence[tuple[float, float]]  # of one of them by the cells of the lattices tried, ascending
+    explicit: bool  # whether that one was explicit, whose substeps shorten as the edge of a cell
+    least: int  # cells that may be chosen
     most: int
 
     def cheapest(self, target: float) -> Choice | None:
@@ -120,7 +100,6 @@ class CostModel:
         return max(self.least, math.ceil(self.law.size(error) ** -3)) if self.law.factor > 0 else self.least
 
     def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
-        """Return a choice with its errors and its cost."""
         budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
         shorter = (stepping.method.integrator == "verlet") - self.explicit  # substeps, than those of the costs known
         growth = self.growth(self.cells, cells) * (cells / self.cells) ** (shorter / 3)
@@ -134,14 +113,11 @@ class CostModel:
         if len(cells) < 2:
             return after / before
         slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, STEEPEST)
-        beyond = max(1.0, slopes[-1])
         knots = np.concatenate([[0.0], np.cumsum(slopes * np.diff(cells))])
-
-        def log_cost(count: float) -> float:
-            past = max(0.0, math.log(count) - cells[-1])  # where nothing was tried
-            return float(np.interp(math.log(count), cells, knots)) + beyond * past
-
-        return math.exp(log_cost(after) - log_cost(before))
+        ends = np.log([before, after])
+        past = np.maximum(0.0, ends - cells[-1])  # where nothing was tried
+        start, end = np.interp(ends, cells, knots) + max(1.0, slopes[-1]) * past
+        return math.exp(end - start)
 
     def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
         """Return how its steps may be solved; explicit ones are not."""
@@ -150,24 +126,19 @@ class CostModel:
     def _shares(self, stepping: Stepping, solving: Solving, cells: float) -> Budget:
         """Return d log cost / d log error of each part over their sum."""
         same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
-        parts = (
-            3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order,
-            _steepness([(each.error, each.cost) for each in same], (stepping.error, stepping.cost)),
-            _steepness([(each.error, each.cost) for each in self.solvings], (solving.error, solving.cost)),
-        )
+        of_cells = 3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order
+        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))
         total = sum(parts) or 1.0
         return Budget(*(part / total for part in parts))
 
 
-def _steepness(tried: Sequence[tuple[float, float]], chosen: tuple[float, float]) -> float:
+def _steepness(tried: Sequence[Stepping | Solving], chosen: Stepping | Solving) -> float:
     """Return how fast cost rises as the error falls, d log cost / -d log error, towards the next smaller error tried.
 
     Where none is smaller, from the next greater one; 0 of one alone.
     """
-    error, cost = chosen
-    others = [other for other in tried if other[0] > 0 and other[0] != error]
-    if error <= 0 or not others:
+    others = sorted((each.error, each.cost) for each in tried if each.error > 0 and each.error != chosen.error)
+    if chosen.error <= 0 or not others:
         return 0.0
-    smaller = [other for other in others if other[0] < error]
-    near = max(smaller) if smaller else min(others)
-    return max(0.0, math.log(near[1] / cost) / math.log(error / near[0]))
+    error, cost = next((other for other in reversed(others) if other[0] < chosen.error), others[0])
+    return max(0.0, math.log(cost / chosen.cost) / math.log(chosen.error / error))

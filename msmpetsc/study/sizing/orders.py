@@ -25,16 +25,12 @@ UNSEEN = 0.05  # a measured order may lie so far below the range before it count
 
 @dataclass(frozen=True)
 class ErrorLaw:
-    """An error that goes as a power of a size: factor size^order.
-
-    seen   : whether the order was measured; else it is the end of the range that the measurements left
-    cosine : of what parts two runs and the finer one's error
-    """
+    """An error that goes as a power of a size: factor size^order."""
 
     factor: float
     order: float
-    seen: bool = True
-    cosine: float = 1.0
+    seen: bool = True  # the order was measured; else it is the end of the range that the measurements left
+    cosine: float = 1.0  # of what parts two runs and the finer one's error
 
     def error(self, size: float) -> float:
         """Return the error of a size [-]."""
@@ -52,16 +48,12 @@ class ErrorLaw:
 
     def measured(self, apart: float, finer: float) -> float:
         """Return the error of a run so far from a finer run of this size."""
-        return _coarser_error(apart, self.error(finer), self.cosine)
+        error = self.error(finer)
+        return math.sqrt(apart**2 + error**2 + 2 * self.cosine * apart * error)
 
     def measured_finer(self, apart: float, size: float, coarser: float) -> float:
         """Return the error of a run of this size that is so far from a coarser one."""
         return _finer_error(apart, (coarser / size) ** self.order, self.cosine)
-
-
-def _coarser_error(apart: float, error: float, cosine: float) -> float:
-    """Return e_a from d, e_b and c."""
-    return math.sqrt(apart**2 + error**2 + 2 * cosine * apart * error)
 
 
 def _finer_error(apart: float, ratio: float, cosine: float) -> float:

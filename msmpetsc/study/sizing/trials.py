@@ -11,19 +11,10 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import SURFACE, Case, inline, study_cases
+from msmpetsc.study.cases import Case, inline, with_solver, with_time
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.schema import Study, StudyScene, Sweep
-from msmpetsc.study.sizing.answer import (
-    SizePlan,
-    SizeTrial,
-    Tried,
-    fewest_bound,
-    inverted_bound,
-    size_bounds,
-    time_bound,
-)
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tried, inverted_bound, size_bounds, time_bound
 from msmpetsc.study.sizing.choice import Budget, Candidate, Choice, CostModel, Solving, Stepping
 from msmpetsc.study.sizing.orders import CELL_ORDERS, STEP_ORDERS, ErrorLaw, cosine_of, error_law
 
@@ -48,16 +39,11 @@ AIM, ENOUGH = 0.9, 0.75  # times the error asked for: what is tried, and where f
 
 
 class Asked(NamedTuple):
-    """What a plan is asked for.
+    """What a plan is asked for."""
 
-    target : error of the surface
-    frames : first frames of the scene that are tried
-    cells  : of the finest lattice that is tried; the scene's if None
-    """
-
-    target: float
-    frames: int
-    cells: int | None = None
+    target: float  # error of the surface
+    frames: int  # first frames of the scene that are tried
+    cells: int | None = None  # of the finest lattice that is tried; the scene's if None
     ranks: int = 1
 
 
@@ -72,7 +58,10 @@ class Sizer:
         presets: Collection[str],
         report: Callable[[SizeTrial | str], None],
     ):
-        self.scene, self.bench, self.target, self.presets, self.ranks = scene, bench, asked.target, presets, asked.ranks
+        self.scene = scene
+        self.bench = bench
+        self.target = asked.target
+        self.ranks = asked.ranks
         self.as_given = load_scene(scene, (), presets)
         count = asked.cells or self.as_given.cages.count
         if count is None:
@@ -182,9 +171,9 @@ class Sizer:
             if run is None:
                 break
             runs.append(run)
-            if len(runs) > 2 and self._left(runs, [each.method.time_step for each in runs]) <= self.target / PART:
+            if len(runs) > 2 and self._left(runs, self.halved[: len(runs)]) <= self.target / PART:
                 break
-        return runs, [each.method.time_step for each in runs]
+        return runs, self.halved[: len(runs)]
 
     def _left(self, runs: list[SizeTrial], sizes: list[float]) -> float:
         """Return the error of the last of runs whose steps, or substeps, have these sizes."""
@@ -221,11 +210,12 @@ class Sizer:
             return [Solving(self.solved, 0.0, 1.0)]
         base = self._run(method, cells)
         known: list[Solving] = []
+        rest = 0.0
         for step_error in LOOSE:
-            run = self._run(replace(method, step_error=step_error), cells) if base else None
-            if run and base:
-                known.append(Solving(step_error, _apart(run, base), run.cost / base.cost))
-        rest = known[-1].error * self.solved / known[-1].step_error if known and known[-1].step_error else 0.0
+            if base and (run := self._run(replace(method, step_error=step_error), cells)):
+                error = _apart(run, base)
+                known.append(Solving(step_error, error, run.cost / base.cost))
+                rest = error * self.solved / step_error
         return [*known, Solving(self.solved, rest, 1.0)]
 
     # Cells
@@ -256,9 +246,13 @@ class Sizer:
         law = error_law([each.edge for each in runs], apart, orders, None if far else across, cosine)
         law, self.cell_bound = replace(law, seen=law.seen and not inverted), ""
         if not law.seen:
-            why = "two lattices alone could be run" if len(runs) < 3 else "their distances do not shrink as they should"
-            why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell" if far else why
-            why = "cells end inside out" if inverted else why
+            why = "their distances do not shrink as they should"
+            if inverted:
+                why = "cells end inside out"
+            elif far:
+                why = f"the coarsest two are {apart[0]:.1e} apart, too far to tell"
+            elif len(runs) < 3:
+                why = "two lattices alone could be run"
             self.cell_bound = f"the cells: no order was seen ({why}); order {law.order:g} is taken"
         return law
 
@@ -297,7 +291,10 @@ class Sizer:
             model = replace(model, law=law.through(*coarse, *fine))
         bounds = []
         if met is not None and met.budget.total < ENOUGH * self.target and (coarse or model.least > model.most):
-            bounds = fewest_bound(met, [(round(edge**-3), error) for edge, error in coarse])
+            why = "no lattice of fewer can be run"
+            for edge, error in coarse:
+                why = f"{edge**-3:.0f} cells have {error:.1e}, nothing was found between"
+            bounds = [f"the fewest cells: {met.budget.total:.1e} is less than was asked for; {why}"]
         return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None, bounds), model
 
     def _without(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
@@ -309,11 +306,6 @@ class Sizer:
         self.bounds.append(f"the step: {method.integrator} with steps of {method.time_step:g} s fails on finer cells")
         return replace(model, steppings=kept or model.steppings)
 
-    def _alike(self, method: Candidate, finest: SizeTrial) -> SizeTrial:
-        """Return the finest lattice stepped by a method, so that only the cells differ; as it was, if that fails."""
-        as_tried = self._as_tried(method)
-        return finest if as_tried == finest.method else self._run(as_tried, finest.asked) or finest
-
     def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
         """Return the errors of a run of the choice, that of its cells from its distance to the finest lattice.
 
@@ -321,7 +313,7 @@ class Sizer:
         """
         if 1 < run.cells / finest.cells < FINE:
             return choice.budget
-        finest = self._alike(choice.method, finest)
+        finest = self._run(self._as_tried(choice.method), finest.asked) or finest  # so that only the cells differ
         apart = _apart(run, finest)
         if run.edge < finest.edge:
             return replace(choice.budget, cells=law.measured_finer(apart, run.edge, finest.edge))
@@ -331,8 +323,7 @@ class Sizer:
 
     def _bounds(self, plan: SizePlan, model: CostModel, lattices: list[SizeTrial]) -> list[str]:
         """Return what bounds the error, in words; of the lattices that tell the cells' error."""
-        finest = max(self.trials, key=lambda each: each.cells)
-        inverted = inverted_bound(finest.inverted, finest.cells, self.as_given.material.law)
+        inverted = inverted_bound(self.trials, self.as_given.material.law)
         bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted]
         if not plan.met:
             times = [self.step * frame for frame in range(1, round(self.duration / self.step))]
@@ -383,17 +374,15 @@ class Sizer:
     def case(self, method: Candidate, cells: int) -> Case:
         """Return the run of a method on so many cells, with the surface at the scene's own frames."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
-        scene = StudyScene(
-            name=self.scene.stem, file=self.scene.name, duration=self.duration, set=(f"cages={inline(cages)}",)
-        )
-        sweep = Sweep(
-            integrators=(method.integrator,), time_steps=(method.time_step,), ranks=(self.ranks,),
-            presets=(method.preset,) if method.preset else (), errors=(method.step_error,) if method.step_error else (),
-        )  # fmt: skip
         timeout = TIME if cells < self.cells else LONG_TIME
-        study = Study(timeout=timeout, scene=(scene,), sweep=(sweep,))
-        case = study_cases(study, self.scene.parent, True, self.presets)[0]
-        return case.changed(SURFACE, f"output.every={max(1, round(self.step / method.time_step))}")
+        case = Case(
+            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={inline(cages)}",), ranks=self.ranks,
+            integrator=method.integrator, time_step=method.time_step, preset=method.preset, error=method.step_error,
+            timeout=timeout,
+        )  # fmt: skip
+        every = max(1, round(self.step / method.time_step))
+        case = with_time(with_solver(case, self.as_given), self.duration, 1, self.as_given, surface=True)
+        return case.changed(f"output.every={every}")
 
 
 def _apart(run: SizeTrial, reference: SizeTrial, until: float = math.inf) -> float:

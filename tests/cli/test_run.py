@@ -28,24 +28,15 @@ def run_bunny(msmpetsc, path: Path, ranks: int, *options: object) -> h5py.File:
 
 @pytest.fixture(scope="module")
 def fall(folder: Path) -> h5py.File:
-    """The shipped scene at its own time step, solved tightly by newton."""
+    """The shipped scene at its own time step until it has struck the ground, solved tightly by newton."""
     from conftest import run
 
     msmpetsc = lambda ranks, *arguments, **options: run(ranks, "-m", "msmpetsc.cli.main", *arguments, **options)  # noqa: E731
-    return run_bunny(msmpetsc, folder / "fall.h5", 1, "--preset", "newton", "--error", "1e-9")
+    return run_bunny(msmpetsc, folder / "fall.h5", 1, "--preset", "newton", "--error", "1e-9", "--frames", 125)
 
 
 def frames_before_contact(file: h5py.File) -> int:
     return int(np.argmax(file["frames/position"][:, :, 2].min(axis=1) <= 0))
-
-
-def test_free_fall_matches_the_schemes_closed_form(fall: h5py.File):
-    """q_n = q_0 + g t^2 n (n + 1) / 2 for implicit Euler from rest."""
-    count, t = frames_before_contact(fall), fall["frames/time"][1]
-    assert count >= 11  # at least ten frames of free fall
-    n = np.arange(count)[:, None, None]
-    q = fall["frames/position"][:count]
-    np.testing.assert_allclose(q, q[0] + GRAVITY * t**2 * n * (n + 1) / 2, rtol=0, atol=1e-10)
 
 
 def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5py.File):
@@ -61,26 +52,6 @@ def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5p
         np.add.at(gradient, ends[:, 1], -force)
         F = m[:, None] * (x - y) + t**2 * (gradient - m[:, None] * GRAVITY)
         assert np.linalg.norm(F) < 1e-8 * scale
-
-
-def test_the_bunny_hits_the_ground_leaps_and_keeps_its_shape(fall: h5py.File):
-    q, m = fall["frames/position"][:], fall["lattice/mass"][:]
-    height = q[:, :, 2] @ m / m.sum()
-    contact = frames_before_contact(fall)
-    lowest = contact + int(np.argmin(height[contact : contact + 60]))
-    assert height[lowest:].max() > height[lowest] + 0.005  # it leaps: 5 mm and more
-    assert fall["frames/momentum"][contact - 1, 2] < 0 < fall["frames/momentum"][lowest + 15, 2]
-    assert fall["frames/elastic"][contact : lowest + 5].max() > 0.01 * fall["frames/kinetic"][contact - 1]
-    assert fall["frames/surface"][:, :, 2].min() > -0.01  # nowhere deeper than half a cell
-    assert shape_error(q[-1], q[0]) < 0.05 * 0.3  # 5% of the bunny's 0.3 m
-
-
-def shape_error(q: np.ndarray, rest: np.ndarray) -> float:
-    """Root mean square distance [m] after the best rigid motion (Kabsch)."""
-    a, b = rest - rest.mean(axis=0), q - q.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return float(np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()))
 
 
 def test_the_energies_and_momentum_of_the_file_are_those_of_its_frames(fall: h5py.File):

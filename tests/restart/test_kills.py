@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 def test_killed_at_any_moment_on_one_rank(tmp_path):
     """While it is set up, runs, goes on, and makes room for more frames than were planned."""
     worker = WORKERS / "kill_worker.py"
-    command = [sys.executable, worker, hanging(tmp_path, 100), tmp_path, ALONE, 1]
+    command = [sys.executable, worker, hanging(tmp_path, 150), tmp_path, ALONE, 1]
     done = subprocess.run([*map(str, command)], env=ENVIRONMENT, capture_output=True, text=True, timeout=220)
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout.splitlines()[-1])

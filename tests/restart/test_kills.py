@@ -15,7 +15,7 @@ from stopped_runs import assert_same, hanging, ranks_of
 
 from msmpetsc.results.reader import finished
 
-ALONE, ON_TWO = 14, 3  # kills
+ALONE, ON_TWO = 24, 6  # kills
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from forked import run_forked
+from forked import run_forked, run_ranks
 
 ROOT = Path(__file__).parent.parent
 WORKERS = ROOT / "tests" / "workers"  # programs for mpiexec
@@ -30,6 +30,13 @@ SMOKE = {
     "test_static", "test_step", "test_writer",
 }  # fmt: skip
 
+# the files that take longest, which are begun first: what is left for the end is short
+LONGEST = [
+    "test_readme", "test_scenes", "test_agreement", "test_kills", "test_tunnelling", "test_touching", "test_sizing",
+    "test_cycle_options", "test_extras", "test_recovery", "test_cli", "test_bodies", "test_adaptive", "test_run",
+    "test_cycle", "test_bodies_contact", "test_anchor", "test_cages", "test_going_on", "test_grids",
+]  # fmt: skip
+
 Run = Callable[..., subprocess.CompletedProcess]
 
 
@@ -41,7 +48,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of a few files as smoke, so that `-m smoke` means them."""
+    """Mark the tests of a few files as smoke, so that `-m smoke` means them; put the longest files first."""
+    place = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
     for item in items:
         if item.path.stem in SMOKE and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.smoke)
@@ -50,12 +59,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def run(ranks: int, *arguments: object, timeout: float = 120) -> subprocess.CompletedProcess:
     """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out.
 
-    The program itself on one rank is forked.
+    Several ranks, and the program itself on one, are forked.
     """
-    if ranks == 1 and arguments[:2] == ("-m", "msmpetsc.cli.main"):
-        return run_forked([*map(str, arguments[2:])], ENVIRONMENT, timeout)
-    launcher = ["mpiexec", "--oversubscribe", "-n", str(ranks)]
-    command = [*launcher, sys.executable, *map(str, arguments)]
+    words = [*map(str, arguments)]
+    if ranks > 1:
+        return run_ranks(ranks, words, ENVIRONMENT, timeout)
+    if words[:2] == ["-m", "msmpetsc.cli.main"]:
+        return run_forked(words[2:], ENVIRONMENT, timeout)
+    command = ["mpiexec", "-n", "1", sys.executable, *words]
     return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
 
 

@@ -17,8 +17,11 @@ PROGRAM = "msmpetsc.cli.main"
 COLD = [sys.executable, "-m", "msmpetsc"]  # a command that starts it begins with this
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
-    ["msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume", "msmpetsc.build"]
-)  # all but PETSc
+    [
+        "msmpetsc.study.preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume", "msmpetsc.build",
+        "msmpetsc.geometry.readers",
+    ]
+)  # fmt: skip  # all but PETSc
 
 
 class Forked:

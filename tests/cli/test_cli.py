@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from conftest import ENVIRONMENT, run
+from conftest import run
 from one_process import IN_ONE_PROCESS, errors
 
 from msmpetsc.cli.arguments import split_petsc_options
@@ -72,14 +71,8 @@ def scene(folder: Path) -> Path:
     return folder / "scene.toml"
 
 
-def alone(*arguments: object, timeout: float = 60) -> subprocess.CompletedProcess:
-    """The command without mpiexec."""
-    command = [sys.executable, *COMMAND, *map(str, arguments)]
-    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
-
-
 def on(ranks: int, *arguments: object) -> subprocess.CompletedProcess:
-    return alone(*arguments) if ranks == 1 else run(ranks, *COMMAND, *arguments, timeout=60)
+    return run(ranks, *COMMAND, *arguments, timeout=60)
 
 
 def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
@@ -95,13 +88,13 @@ def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str)
 
 def test_the_default_output_is_in_out_and_is_not_replaced_unasked(scene: Path, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert alone(scene).returncode == 0
+    assert on(1, scene).returncode == 0
     result = tmp_path / "out/scene.h5"
     assert sorted(p.name for p in result.parent.iterdir()) == ["scene.h5", "scene.xdmf"]
     before = result.read_bytes()
-    assert_one_line(alone(scene, "--frames", "1"), 2, "out/scene.h5 exists", "--overwrite")
+    assert_one_line(on(1, scene, "--frames", "1"), 2, "out/scene.h5 exists", "--overwrite")
     assert result.read_bytes() == before
-    assert alone(scene, "--frames", "1", "--overwrite").returncode == 0
+    assert on(1, scene, "--frames", "1", "--overwrite").returncode == 0
     with h5py.File(result) as file:
         assert finished(file) == 2
 
@@ -109,7 +102,7 @@ def test_the_default_output_is_in_out_and_is_not_replaced_unasked(scene: Path, t
 def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
     out = tmp_path / "new" / "named.h5"
     more = ("--error", "1e-6", "--frames", "2", "--set", "cages.count=80", "--set", "output.surface=true")
-    done = alone("-ksp_max_it", "400", scene, "-o", out, "--preset", "newton", *more)
+    done = on(1, "-ksp_max_it", "400", scene, "-o", out, "--preset", "newton", *more)
     assert done.returncode == 0, done.stderr
     with h5py.File(out) as file:
         as_run = tomllib.loads(file.attrs["scene"])
@@ -146,7 +139,7 @@ def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path
     ],
 )
 def test_no_option_is_left_unused_and_the_users_wins(scene: Path, tmp_path: Path, preset: str, options: str, seen: str):
-    done = alone(scene, "-o", tmp_path / "o.h5", "--preset", preset, "--frames", "1", *options.split(), "-options_left")
+    done = on(1, scene, "-o", tmp_path / "o.h5", "--preset", preset, "--frames", "1", *options.split(), "-options_left")
     assert done.returncode == 0, done.stderr
     assert "There are no unused options." in done.stdout
     assert seen in done.stdout
@@ -180,7 +173,7 @@ def test_an_option_that_petsc_does_not_know_is_refused_before_the_first_frame(sc
 
 
 def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(scene: Path, tmp_path: Path):
-    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")  # newton has no NPC
+    done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")  # newton has no NPC
     assert_one_line(done, 2, "-npc_ksp_view")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]  # what was computed is kept, whole
 
@@ -256,7 +249,7 @@ def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
 
 
 def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
-    done = alone(scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"))
+    done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"))
     assert done.returncode == 0, done.stderr
     (warning,) = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")]
     assert "open (14 boundary edges)" in warning and "winding number will decide what is inside" in warning

@@ -28,11 +28,11 @@ def run_bunny(msmpetsc, path: Path, ranks: int, *options: object) -> h5py.File:
 
 @pytest.fixture(scope="module")
 def fall(folder: Path) -> h5py.File:
-    """The shipped scene at its own time step, solved tightly by newton."""
+    """The shipped scene at its own time step until it has struck the ground, solved tightly by newton."""
     from conftest import run
 
     msmpetsc = lambda ranks, *arguments, **options: run(ranks, "-m", "msmpetsc.cli.main", *arguments, **options)  # noqa: E731
-    return run_bunny(msmpetsc, folder / "fall.h5", 1, "--preset", "newton", "--error", "1e-9")
+    return run_bunny(msmpetsc, folder / "fall.h5", 1, "--preset", "newton", "--error", "1e-9", "--frames", 125)
 
 
 def frames_before_contact(file: h5py.File) -> int:
@@ -52,6 +52,15 @@ def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5p
         np.add.at(gradient, ends[:, 1], -force)
         F = m[:, None] * (x - y) + t**2 * (gradient - m[:, None] * GRAVITY)
         assert np.linalg.norm(F) < 1e-8 * scale
+
+
+def test_the_energies_and_momentum_of_the_file_are_those_of_its_frames(fall: h5py.File):
+    m, n, t = fall["lattice/mass"][:], frames_before_contact(fall) - 1, fall["frames/time"][1]
+    q, before = fall["frames/position"][n], fall["frames/position"][n - 1]
+    velocity = (q - before) / t
+    assert fall["frames/kinetic"][n] == pytest.approx(0.5 * m @ (velocity**2).sum(axis=1))
+    assert fall["frames/potential"][n] == pytest.approx(9.81 * m @ q[:, 2])
+    np.testing.assert_allclose(fall["frames/momentum"][n], m @ velocity, atol=1e-9)
 
 
 HANG = (  # the bunny hangs by its ears and swings: pins, a force that ends, no contact

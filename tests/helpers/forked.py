@@ -1,16 +1,24 @@
-"""The program on one rank without its start: a process that has imported it forks a child for each run.
+"""Programs without their start: a process that has imported the package forks a child for each run, and for each rank.
 
-A start takes 2 s of a core, a fork 0.4 s. What several ranks do, and what starts by itself, has a real mpiexec.
+A small run takes 3 s of a core with its start, 0.7 s in a fork. Ranks are those of a real mpiexec: what it starts for
+each leaves the environment of the rank, by which a forked child joins the others, and ends as the child does.
 """
 
 import os
+import runpy
 import signal
 import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
+from multiprocessing.connection import wait
 from pathlib import Path
 
-from msmpetsc.study.forkserver import Forked
+from msmpetsc.study.forkserver import SERVER, Forked
+
+STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new; mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
+read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
 
 
 def run_forked(arguments: Sequence[str], environment: Mapping[str, str], timeout: float) -> subprocess.CompletedProcess:
@@ -24,3 +32,89 @@ def run_forked(arguments: Sequence[str], environment: Mapping[str, str], timeout
             os.killpg(child.pid, signal.SIGKILL)  # its session: what it started, too
             raise
         return subprocess.CompletedProcess(list(arguments), status, out.read_text(), error.read_text())
+
+
+def run_ranks(
+    ranks: int, arguments: Sequence[str], environment: Mapping[str, str], timeout: float
+) -> subprocess.CompletedProcess:
+    """Python with these arguments on so many ranks, as subprocess.run gives it. Raises subprocess.TimeoutExpired."""
+    end = time.monotonic() + timeout
+    with tempfile.TemporaryDirectory() as folder:
+        streams = [Path(folder, name) for name in ("out", "error")]
+        for rank in range(ranks):
+            os.mkfifo(Path(folder, f"{rank}.status"))
+        command = ["mpiexec", "--oversubscribe", "-n", str(ranks), "bash", "-c", STAND_IN, folder]
+        out, error = (path.open("a") for path in streams)
+        with out, error, subprocess.Popen(command, env=environment, stdout=out, stderr=error) as mpiexec:
+            children = []
+            try:
+                for rank in range(ranks):
+                    given = (list(arguments), streams, _environment_of(Path(folder, f"{rank}.env"), mpiexec, end))
+                    children.append(SERVER.Process(target=_rank, args=given, daemon=True))
+                    children[-1].start()
+                _hand_on(children, mpiexec, folder, end)
+                mpiexec.wait(max(0.1, end - time.monotonic()))
+            finally:
+                mpiexec.kill()
+                for child in children:
+                    if child.is_alive():  # another rank has ended all
+                        os.killpg(child.pid, signal.SIGKILL)
+        return subprocess.CompletedProcess(command, mpiexec.returncode, *(path.read_text() for path in streams))
+
+
+def _environment_of(path: Path, mpiexec: subprocess.Popen, end: float) -> dict[str, str]:
+    while not path.exists() and mpiexec.poll() is None and time.monotonic() < end:
+        time.sleep(0.01)
+    words = path.read_text().split("\0")
+    return dict(word.split("=", 1) for word in words if word) | {"PWD": os.getcwd()}
+
+
+def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float) -> None:
+    """Let what stands in for each rank end with its status, until all have ended or mpiexec has."""
+    running = dict(enumerate(children))
+    while running and mpiexec.poll() is None:
+        if time.monotonic() > end:
+            raise subprocess.TimeoutExpired("mpiexec", end)
+        wait([child.sentinel for child in running.values()], 0.05)
+        for rank in [rank for rank, child in running.items() if not child.is_alive()]:
+            status = running.pop(rank).exitcode
+            pipe = os.open(Path(folder, f"{rank}.status"), os.O_RDWR)  # never waits for a reader
+            os.write(pipe, b"%d\n" % (status if status >= 0 else 128 - status))
+
+
+def _rank(arguments: list[str], streams: list[Path], environment: dict[str, str]) -> None:
+    os.setsid()
+    for number in (signal.SIGINT, signal.SIGTERM):  # the server's own are none of ours
+        signal.signal(number, signal.SIG_DFL)
+    for stream, path in enumerate(streams, 1):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(environment["PWD"])
+    from mpi4py import MPI
+
+    MPI.Init()
+    status = 0
+    try:
+        _python(arguments)
+    except SystemExit as ended:
+        status = ended.code or 0
+    if "petsc4py.PETSc" in sys.modules:
+        sys.modules["petsc4py.PETSc"]._finalize()
+    MPI.Finalize()
+    sys.exit(status)
+
+
+def _python(arguments: list[str]) -> None:
+    """As Python takes them: -c TEXT, -m MODULE or a file, and what follows."""
+    kind, *rest = arguments
+    if kind not in ("-c", "-m"):
+        sys.argv, sys.path[0:0] = arguments, [str(Path(kind).parent)]
+        runpy.run_path(kind, run_name="__main__")
+        return
+    sys.argv = ["-c", *rest[1:]]
+    if kind == "-c":
+        exec(compile(rest[0], "<string>", "exec"), {"__name__": "__main__"})
+        return
+    sys.modules.pop(rest[0], None)  # of the server's, of which runpy would warn
+    runpy.run_module(rest[0], run_name="__main__", alter_sys=True)

@@ -183,7 +183,8 @@ class Case:
 
     def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None]) -> np.ndarray:
         """Matrix of what writes into its second vector, column by column (collective)."""
-        matrix, first = np.empty((self.size, self.size)), self.multigrid.operator.getOwnershipRange()[0] // 3
+        first = self.multigrid.operator.getOwnershipRange()[0] // 3
+        own = np.empty((3 * self.unknowns.size, self.size))
         for column in range(self.size):
             node, c = column // 3 - first, column % 3
             chosen = self.unknowns.columns_to_write(self.x)
@@ -191,8 +192,8 @@ class Case:
             if 0 <= node < self.unknowns.size:
                 chosen[c, node] = 1
             act(self.x, self.y)
-            matrix[:, column] = np.concatenate(self.comm.allgather(self.unknowns.columns(self.y).T.ravel()))
-        return matrix
+            own[:, column] = self.unknowns.columns(self.y).T.ravel()
+        return np.concatenate(self.comm.allgather(own))
 
     def hessian(self) -> np.ndarray:
         """H = M + t^2 (Hessian of E), and of contact where there is: by its products."""

@@ -2,15 +2,13 @@
 
 import io
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from conftest import ENVIRONMENT, WORKERS
+from conftest import WORKERS, run
 from frames_worker import NODES, POINTS, STEPS, frame, positions
 from mpi4py import MPI
 
@@ -26,8 +24,7 @@ pytestmark = pytest.mark.timeout(60)
 
 
 def run_on_ranks(ranks: int, action: str, path: Path) -> str:
-    command = ["mpiexec", "--oversubscribe", "-n", str(ranks), sys.executable, str(WORKER), action, str(path)]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=40)
+    done = run(ranks, WORKER, action, path, timeout=40)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

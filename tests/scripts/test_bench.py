@@ -1,7 +1,6 @@
-"""scripts/bench.py and lab.py: how figures are made of runs, what a table and its page have, and a real run."""
+"""scripts/bench.py: how figures are made of runs, and a real run."""
 
 import sys
-from argparse import Namespace
 from pathlib import Path
 
 import lab
@@ -31,26 +30,6 @@ def test_figures_are_of_all_frames_but_the_first_and_of_the_median_repeat():
         row["slowest tenth [ms]"] == pytest.approx(1200) and row["frames/s (paper's CPU, GPU)"] == "1.67 (19.9, 53.4)"
     )
     assert (row["us a cell"], row["kB a node"], row["error"]) == pytest.approx((600, 2, 1e-4))
-
-
-def test_kinds_alternate_and_one_that_failed_is_not_done_again():
-    done: list[str] = []
-
-    def kind(name: str, value: int | None):
-        return lambda: done.append(name) or value
-
-    found = lab.alternated({"a": kind("a", 1), "b": kind("b", None), "c": kind("c", 3)}, 2)
-    assert done == ["a", "b", "c", "a", "c"] and found == {"a": [1, 1], "b": [], "c": [3, 3]}
-
-
-def test_a_page_has_the_tables_below_the_command(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["scripts/x.py", "--only", "a b"])
-    with lab.page(Namespace(output=tmp_path / "results" / "x.md")):
-        lab.table([{"a": 1234, "b": 0.12345}, {"a": None}, {"a": 1, "c": "new"}])
-    page = (tmp_path / "results" / "x.md").read_text()
-    assert page.startswith("# x.py\n\n```sh\nscripts/x.py --only 'a b'\n```\n")
-    table = "\n| a | b |\n|---|---|\n| 1,234 | 0.123 |\n|  |  |\n\n| a | c |\n|---|---|\n| 1 | new |\n"
-    assert page.endswith(table) and capsys.readouterr().out == table
 
 
 def test_a_run_is_a_real_one(tmp_path: Path, monkeypatch):

@@ -1,14 +1,8 @@
 """What the programs of others are given, and the error that they are measured by."""
 
-import subprocess
-import sys
-from importlib.util import find_spec
-from pathlib import Path
-
 import bench_peers
 import peers
 import pytest
-from conftest import ENVIRONMENT, ROOT
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +25,3 @@ def test_the_error_of_verlet_s_trajectory_is_small(small: bench_peers.Setup):
     (row,) = bench_peers.rows([verlet], small)
     assert 1e-7 < row["trajectory error"] < 1e-2 and row["step error"] is None
     assert row["10%"] <= row["ms a frame"] <= row["90%"]
-
-
-@pytest.mark.parametrize("peer", ["vbd", "euler", "xpbd"])
-def test_a_peer_that_is_not_installed_names_the_extra(peer: str, small: bench_peers.Setup, tmp_path: Path):
-    package = peers.PEERS[peer][0]
-    if find_spec(package):
-        pytest.skip(f"{package} is installed")
-    command = [sys.executable, ROOT / "scripts" / "peers.py", peer, small.reference, tmp_path / "x.npz"]
-    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 1
-    assert done.stderr == f"{package} is not installed: pip install 'msmpetsc[peers]' brings it\n"

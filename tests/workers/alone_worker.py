@@ -12,7 +12,6 @@ ending.PATIENCE = 1.0
 WHAT = {
     "input": lambda: InputError("it fails"),
     "memory": lambda: MemoryError("Unable to allocate it all"),
-    "bug": lambda: ZeroDivisionError("it fails"),
 }
 
 

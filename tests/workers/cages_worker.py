@@ -57,7 +57,7 @@ def fill_to_file(mesh: Path, cell_size: float, method: str) -> None:
 
 
 if __name__ == "__main__":
-    check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=15)
+    check_random_grids([(7, 6, 8), (3, 9, 9), (16, 4, 5), (1, 5, 5)], seeds=6)
     for name, cell_size, method in FILLED:
         fill_to_file(Path(sys.argv[1], name + ".npz"), cell_size, method)
     print("passed", flush=True)

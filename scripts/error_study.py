@@ -152,7 +152,7 @@ def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
 
 
 def measured(seed: int, changes: list[str], number: int) -> dict:
-    """What became of one scene, some keys changed: ``status``, its words, what each step said of its error and truth."""
+    """What became of one scene, some keys changed: ``status``, its words, each step's error as said and in truth."""
     with tempfile.TemporaryDirectory() as folder:
         set_words = [word for change in changes for word in ("--set", change)]
         scene, result = draw_scene(seed, number, Path(folder)), Path(folder) / "run.h5"

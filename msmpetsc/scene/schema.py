@@ -10,7 +10,7 @@ from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_b
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
 from msmpetsc.scene.obstacles import ObstacleTable, SelfContactTable
-from msmpetsc.scene.problems import Broken, KeyPath
+from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.statics import one_state, unlike_the_integrator
 from msmpetsc.scene.time import Time
 from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
@@ -37,6 +37,9 @@ class Output(Table):
     """Choice of what the result file stores beside the lattice."""
 
     surface: bool = Field(True, description="store the surface of every frame")
+    stress: bool = Field(
+        False, description='store stress and strain energy of every frame; with material.law = "neo-hookean"'
+    )
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
 
 
@@ -93,7 +96,10 @@ class SceneFile(Table):
 
     def broken_rules(self) -> Iterator[Broken]:
         """Yield the rules that the tables break among each other."""
-        return chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
+        if self.output.stress and self.material.poisson is None:
+            words = f'may not have stress = true with material.law = "{self.material.law}": springs have no stress'
+            yield "output", rule(words, "material")
+        yield from chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
 
     @property
     def stored(self) -> int:

@@ -16,9 +16,10 @@ from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import on_root
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.fields import Frame
+from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
@@ -115,6 +116,8 @@ class TimeLoop:
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
+        solid = self.elasticity.solid if scene.output.stress else None
+        self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
@@ -248,7 +251,18 @@ class TimeLoop:
             energy_error=effort.energy_error,
             time_error=self.time_error,
             **vars(effort.work),
+            **(self.stress(q) if self.stress else {}),
         )
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """How many rows this rank has of fields that not all scenes ask for."""
+        lattice, rows = self.model.lattice, {}
+        if self.surface:
+            rows["surface"] = len(self.surface.starts) - 1
+        if self.stress:
+            rows |= {name: lattice.cells_owned if "c" in FRAME_FIELDS[name].shape else lattice.owned for name in STRESS}
+        return rows
 
     def __enter__(self) -> "TimeLoop":
         try:

@@ -64,7 +64,7 @@ def write(
             file.write("embedding/indptr", 8 * np.arange(len(POINTS) + 1))
             file.write("embedding/indices", cells()[[0, 1, 1, 0]].ravel())
             file.write("embedding/weights", np.full(8 * len(POINTS), 1 / 8))
-        file.start_frames(len(frames), len((arrays | lattice)["nodes"]), len(POINTS) if surface else None)
+        file.start_frames(len(frames), len((arrays | lattice)["nodes"]), {"surface": len(POINTS)} if surface else {})
         for one in frames:
             file.append(one)
             file.write_checkpoint(Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1}))

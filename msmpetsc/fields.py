@@ -5,8 +5,10 @@ of the documentation come from it.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple, get_type_hints
+
+import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 
@@ -51,7 +53,7 @@ class Frame:
 
     index      : number of the step that it shows, 0 for the start
     position   : (n_local, 3) [m]
-    surface    : (v_local, 3) [m]; as ``stress`` and all behind it None where the scene does not ask for it
+    surface    : (v_local, 3) [m]; as ``reaction`` and all behind it None where the scene does not ask for it
     iterations : of the nonlinear solver (SNES), or explicit substeps
     """
 
@@ -80,6 +82,12 @@ class Frame:
     self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
     self_distance: Annotated[float, _number("f8", "m", "least distance of a contact with itself")] = math.nan
     self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
+    load: Annotated[Floats, Field("f8", ("T", 3), "N", "gravity and forces on all bodies")] = field(
+        default_factory=lambda: np.zeros(3)
+    )
+    reaction: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")] = None
+    push: Annotated[Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")] = None
+    contact_push: Annotated[Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")] = None
     stress: Annotated[Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")] = None
     von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = None
     pressure: Annotated[Floats | None, _of_nodes("Pa", "pressure")] = None

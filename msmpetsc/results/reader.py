@@ -41,7 +41,8 @@ PATIENCE = 10  # [s] to read a file's tables
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
 AXES: dict[int | str, str] = {  # xarray's names of dimensions
-    "T": "time", "n": "node", "v": "point", "c": "cell", 3: "axis", 6: "component"
+    "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
+    3: "axis", 6: "component",
 }  # fmt: skip
 
 

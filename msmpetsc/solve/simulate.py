@@ -24,6 +24,7 @@ from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.forces import Forces
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
@@ -116,6 +117,7 @@ class TimeLoop:
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
+        self.forces = Forces(scene, model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
@@ -173,7 +175,7 @@ class TimeLoop:
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
-        frame = self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
             self._saved = self._save()
         return frame
@@ -223,7 +225,7 @@ class TimeLoop:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
 
-    def _frame(self, index: int, q: Positions) -> Frame:
+    def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.balance.energies
         effort, gained = self.effort, self.state.ledger.since_frame
@@ -251,13 +253,14 @@ class TimeLoop:
             energy_error=effort.energy_error,
             time_error=self.time_error,
             **vars(effort.work),
+            **self.forces(q, time, self.state.sides, step),
             **(self.stress(q) if self.stress else {}),
         )
 
     @property
     def rows(self) -> dict[str, int]:
         """How many rows this rank has of fields that not all scenes ask for."""
-        lattice, rows = self.model.lattice, {}
+        lattice, rows = self.model.lattice, dict(self.forces.rows)
         if self.surface:
             rows["surface"] = len(self.surface.starts) - 1
         if self.stress:

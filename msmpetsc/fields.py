@@ -88,6 +88,7 @@ class Frame:
     reaction: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")] = None
     push: Annotated[Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")] = None
     contact_push: Annotated[Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")] = None
+    probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None
     stress: Annotated[Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")] = None
     von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = None
     pressure: Annotated[Floats | None, _of_nodes("Pa", "pressure")] = None

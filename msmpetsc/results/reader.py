@@ -42,7 +42,7 @@ CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
 AXES: dict[int | str, str] = {  # xarray's names of dimensions
     "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
-    3: "axis", 6: "component",
+    "w": "probe", 3: "axis", 6: "component",
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from msmpetsc.scene.obstacles import ObstacleTable, SelfContactTable
 from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.statics import one_state, unlike_the_integrator
 from msmpetsc.scene.time import Time
-from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
+from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, Positive, PresetName, Table, Vector
 
 
 class Solver(Table):
@@ -33,6 +33,13 @@ class Safety(Table):
     checks: bool = Field(True, description="balance the energy of every step, and count cells inside out")
 
 
+class Probe(Table):
+    """A point of the body that is followed."""
+
+    name: FileName = Field(description="of its columns in `msmpetsc series`")
+    point: Vector = Field(description="where it is at rest; it goes with the cell that it lies in [m]")
+
+
 class Output(Table):
     """Choice of what the result file stores beside the lattice."""
 
@@ -40,6 +47,7 @@ class Output(Table):
     stress: bool = Field(
         False, description='store stress and strain energy of every frame; with material.law = "neo-hookean"'
     )
+    probe: ListOf[Probe] = Field((), description="points of the body whose places are stored")
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
 
 

@@ -22,6 +22,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.probe import ProbePoints
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.forces import Forces
@@ -117,6 +118,8 @@ class TimeLoop:
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
+        points = [probe.point for probe in scene.output.probe]
+        self.probe = ProbePoints(comm, model.lattice, points) if points else None
         self.forces = Forces(scene, model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None
@@ -253,6 +256,7 @@ class TimeLoop:
             energy_error=effort.energy_error,
             time_error=self.time_error,
             **vars(effort.work),
+            probe=self.probe(q) if self.probe else None,
             **self.forces(q, time, self.state.sides, step),
             **(self.stress(q) if self.stress else {}),
         )
@@ -261,6 +265,8 @@ class TimeLoop:
     def rows(self) -> dict[str, int]:
         """How many rows this rank has of fields that not all scenes ask for."""
         lattice, rows = self.model.lattice, dict(self.forces.rows)
+        if self.probe:
+            rows["probe"] = len(self.probe.corners)
         if self.surface:
             rows["surface"] = len(self.surface.starts) - 1
         if self.stress:

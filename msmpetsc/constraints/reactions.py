@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Rows
 
 
 @dataclass(frozen=True)
@@ -36,5 +36,5 @@ class Holders:
 
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
     """Return the sums (count, 3) of vectors (n, 3) by their numbers (n,); those of other numbers are left out."""
-    columns: list[Floats] = [np.bincount(number, column, count + 1)[:count] for column in vectors.T]
-    return np.stack(columns, axis=1)
+    sums: Rows = np.stack([np.bincount(number, column, count + 1)[:count] for column in vectors.T], axis=1, dtype=float)
+    return sums

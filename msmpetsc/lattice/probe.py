@@ -10,7 +10,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import CORNERS, Lattice
 
 SAME = 1e-9  # of a cell: a point of a face lies in both cells
-VTK_CORNERS = [0, 1, 3, 2, 4, 5, 7, 6]  # of a cell's nodes, x fastest, then y
 
 
 class ProbePoints:

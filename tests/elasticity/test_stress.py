@@ -147,6 +147,6 @@ def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
 
 def test_springs_are_refused_in_one_line(tmp_path):
     scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.1}, output={"stress": True})
-    with pytest.raises(InputError, match="output: .*springs have no stress") as refused:
+    with pytest.raises(InputError, match=r"output: .*springs have no stress") as refused:
         play(scene)
     assert "\n" not in str(refused.value)

@@ -39,7 +39,8 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
 def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> None:
     """The first `count` frames are those of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
-    fields = {name: field.dtype for name, field in FRAME_FIELDS.items() if name != "surface"}
+    fields = {name: FRAME_FIELDS[name].dtype for name in file["frames"] if name != "surface"}
+    assert {"position", *(name for name, field in FRAME_FIELDS.items() if field.shape == ("T",))} <= set(fields)
     if surface is not None:
         fields["surface"] = surface
     for name, kind in fields.items():

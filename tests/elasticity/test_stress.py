@@ -119,13 +119,12 @@ def plate_with_a_hole(half: float, radius: float, thick: float) -> trimesh.Trime
     return mesh
 
 
-@pytest.mark.slow  # 4,000 cells in statics: 10 s
-@pytest.mark.timeout(300)
 def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
     """Kirsch's  1/2 (2 + (a / r)^2 + 3 (a / r)^4)  beside the hole, 6 cells in radius, as far out as its cells lie.
 
     Poisson's ratio is 0, on which it does not depend, so that the clamp disturbs nothing. The plate is 10 radii wide:
-    3% more than an endless one (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3).
+    3 to 5% more than an endless one (Heywood: (2 + 0.8^3) / 0.8 = 3.14 for 3). Cells that the edge cuts scatter by more
+    than whole ones.
     """
     radius, cell, sigma = 1.0, 1 / 6, 10.0
     half, thick = 5.0, 1 / 6
@@ -142,7 +141,7 @@ def test_a_plate_with_a_hole_has_thrice_the_stress_at_its_edge(tmp_path):
     a_r = radius / np.hypot(x, y)[beside]
     kirsch = 1.03 * sigma * (2 + a_r**2 + 3 * a_r**4) / 2
     assert np.abs(frame.cell_stress[beside, 0] / kirsch - 1).max() < 0.06
-    assert frame.cell_stress[:, 0].max() / sigma == pytest.approx(3.0, rel=0.15)
+    assert frame.cell_stress[:, 0].max() / sigma == pytest.approx(3.14, rel=0.12)
 
 
 def test_springs_are_refused_in_one_line(tmp_path):

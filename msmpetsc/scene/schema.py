@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, tables_of, unlike_the_material
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
@@ -49,6 +49,13 @@ class Output(Table):
     )
     probe: ListOf[Probe] = Field((), description="points of the body whose places are stored")
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
+
+    @field_validator("probe")
+    @classmethod
+    def _has_distinct_names(cls, probes: tuple[Probe, ...]) -> tuple[Probe, ...]:
+        if len({probe.name for probe in probes}) < len(probes):
+            raise rule("must have a name of its own for each")
+        return probes
 
 
 class BudgetTable(Table):

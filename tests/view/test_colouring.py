@@ -58,9 +58,8 @@ def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
     assert shown.ends == ("0", "von Mises' stress [MPa]", "2")
     with pytest.raises(InputError, match="is of springs, whose law has no stress"):
         colouring_of(subject, "stress")
-    solid = SceneFile.model_validate(
-        toml_of(BARE.replace("stiffness = 1.0", 'young_modulus = 1.0, law = "neo-hookean"'))
-    )
+    text = BARE.replace("stiffness = 1.0", 'young_modulus = 1.0, law = "neo-hookean"')
+    solid = SceneFile.model_validate(toml_of(text))
     with pytest.raises(InputError, match=r"run its scene with output\.stress = true"):
         colouring_of(replace(subject, scene=solid), "stress")
 

@@ -1,7 +1,7 @@
 """From a scene to what is simulated: surfaces, cages, lattice, embedding, loads, obstacles."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -12,6 +12,7 @@ from msmpetsc.comm import log, on_root
 from msmpetsc.constraints.clamp import clamped
 from msmpetsc.constraints.coverage import NODES, Reach, Regions, reach_of, regions
 from msmpetsc.constraints.loads import Anchor, Load, Motion, OwnForce, spread_by_mass, total_of
+from msmpetsc.constraints.reactions import Holders
 from msmpetsc.contact.obstacles.friction import STICK
 from msmpetsc.contact.obstacles.from_scene import build_obstacles, surfaces_of
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
@@ -30,7 +31,7 @@ from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_e
 from msmpetsc.lattice.initial_state import InitialState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials
-from msmpetsc.scene.bodies import OfBody
+from msmpetsc.scene.bodies import OfBody, held_by
 from msmpetsc.scene.motion import ForceTable, Gravity
 from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
@@ -53,6 +54,7 @@ class Model:
     damping   : of velocities, by the mass [1/s]
     collision : the surface that meets itself, where it does
     obstacles : in the scene's order
+    holders   : pins and anchors, and which nodes each has
     bodies, reaches : what the first lines of a run say of the surfaces, and of pins, anchors and forces
     """
 
@@ -70,6 +72,7 @@ class Model:
     damping: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
+    holders: Holders = field(default_factory=lambda: Holders((), np.zeros(0, np.int64)))
 
     @property
     def body_of_point(self) -> Indices:
@@ -157,6 +160,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         reaches=reaches,
         damping=scene.material.damping,
         obstacles=tuple(obstacles),
+        holders=Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice.owned),
     )
 
 

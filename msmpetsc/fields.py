@@ -5,10 +5,12 @@ of the documentation come from it.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple, get_type_hints
 
-from msmpetsc.backend.arrays import Floats, Positions
+import numpy as np
+
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 
 
 class Field(NamedTuple):
@@ -33,6 +35,16 @@ def _number(dtype: str, unit: str, long_name: str) -> Field:
     return Field(dtype, ("T",), unit, long_name)
 
 
+def _of_nodes(unit: str, long_name: str) -> Field:
+    """Return the field of what is computed of cells, its mean over those around a node by their volume."""
+    return Field("f4", ("T", "n"), unit, long_name)
+
+
+def _of_cells(unit: str, long_name: str) -> Field:
+    """Return the field of one number a cell."""
+    return Field("f4", ("T", "c"), unit, long_name)
+
+
 @dataclass(frozen=True)
 class Frame:
     """One simulated time of a run: arrays hold this rank's rows, numbers are of the whole body.
@@ -41,7 +53,7 @@ class Frame:
 
     index      : number of the step that it shows, 0 for the start
     position   : (n_local, 3) [m]
-    surface    : (v_local, 3) [m], or None where the scene does not ask for it
+    surface    : (v_local, 3) [m]; as ``reaction`` and all behind it None where the scene does not ask for it
     iterations : of the nonlinear solver (SNES), or explicit substeps
     """
 
@@ -70,6 +82,21 @@ class Frame:
     self_contacts: Annotated[int, _number("i8", "1", "contacts of the surface with itself")] = 0
     self_distance: Annotated[float, _number("f8", "m", "least distance of a contact with itself")] = math.nan
     self_contact: Annotated[float, _number("f8", "J", "energy in the push of the surface on itself")] = 0.0
+    load: Annotated[Floats, Field("f8", ("T", 3), "N", "gravity and forces on all bodies")] = field(
+        default_factory=lambda: np.zeros(3)
+    )
+    reaction: Annotated[Rows | None, Field("f8", ("T", "a", 3), "N", "force of a pin or anchor")] = None
+    push: Annotated[Rows | None, Field("f8", ("T", "o", 3), "N", "force of an obstacle, blows left out")] = None
+    contact_push: Annotated[Rows | None, Field("f8", ("T", "b", 3), "N", "force on a body where surfaces meet")] = None
+    probe: Annotated[Rows | None, Field("f8", ("T", "w", 3), "m", "position of a probe")] = None
+    stress: Annotated[Rows | None, Field("f4", ("T", "n", 6), "Pa", "Cauchy stress: xx, yy, zz, xy, yz, xz")] = None
+    von_mises: Annotated[Floats | None, _of_nodes("Pa", "von Mises' stress, of /frames/stress")] = None
+    pressure: Annotated[Floats | None, _of_nodes("Pa", "pressure")] = None
+    strain_energy: Annotated[Floats | None, _of_nodes("J/m^3", "elastic energy in a volume at rest")] = None
+    cell_stress: Annotated[Rows | None, Field("f4", ("T", "c", 6), "Pa", "Cauchy stress of a cell")] = None
+    cell_von_mises: Annotated[Floats | None, _of_cells("Pa", "von Mises' stress of a cell")] = None
+    cell_pressure: Annotated[Floats | None, _of_cells("Pa", "pressure of a cell")] = None
+    cell_strain_energy: Annotated[Floats | None, _of_cells("J/m^3", "elastic energy of a cell in its volume")] = None
 
     def __repr__(self) -> str:
         """Return one line, for the arrays would fill the screen."""
@@ -82,6 +109,8 @@ FRAME_FIELDS: dict[str, Field] = {
     for name, hint in get_type_hints(Frame, include_extras=True).items()
     if hasattr(hint, "__metadata__")
 }
+STRESS = tuple(name for name in FRAME_FIELDS if name.endswith(("stress", "von_mises", "pressure", "strain_energy")))
+RANKS_SHARE = {"n", "v", "c"}  # letters of rows that ranks share out
 LATTICE = {
     "nodes": Field("f8", ("n", 3), "m", "node positions at rest"),
     "cells": Field("i8", ("c", 8), "1", "corner nodes in VTK's order"),

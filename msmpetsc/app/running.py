@@ -235,8 +235,7 @@ def start_output(comm: MPI.Intracomm, plan: RunPlan, file: ResultFile, model: Mo
     write_model(comm, file, model)
     if plan.resumed:
         plan.resumed.restore(comm, file, simulation)
-    points = model.embedding.points if model.embedding else None
-    file.start_frames(simulation.stored, model.lattice.owned, points, saved=simulation.saved())
+    file.start_frames(simulation.stored, model.lattice.owned, simulation.rows, simulation.saved())
     return simulation.stored_until(simulation.step) if simulation.step else 0
 
 

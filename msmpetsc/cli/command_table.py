@@ -128,7 +128,7 @@ RENDER = (
     argument("--size", metavar="WxH", help="of a film, or of a panel at most [px] (960x720; 460x1000)"),
     argument(
         "--colour", metavar="FIELD",
-        help="colour by displacement, speed, strain, contact, part or error, with a legend",
+        help="colour by displacement, speed, strain, stress, contact, part or error, with a legend",
     ),
     argument(
         "--reference", metavar="OUT.h5", type=checked_file,
@@ -269,6 +269,18 @@ COMMANDS = {
         description="Write frames of a result for another program; the name's ending says in which format: .glb "
         "and .usd hold frames in time, .obj, .ply, .stl and .vtu one frame.",
         alone="it writes on one process",
+    ),
+    "series": Command(
+        "print energies, forces and places of probes of a result, a row a frame",
+        ("msmpetsc series out/my.h5 -o out/my.csv", "msmpetsc series out/my.h5 | cut -d, -f1,3"),
+        (
+            argument("result", metavar="OUT.h5", type=checked_file),
+            argument("-o", "--output", metavar="FILE.csv", type=checked_file, help="default: print them"),
+            switch("--overwrite", "replace FILE.csv"),
+        ),
+        description="Write as CSV, for each frame, energies, momentum, loads, the reaction of each pin and anchor, the "
+        "push of each obstacle and of contacts on each body, and where the scene's probes are.",
+        alone="it reads one file, which one process does alone",
     ),
     "check": Command(
         "store a scene's numbers; say whether they still hold",

@@ -259,6 +259,16 @@ def _quadratic(w: Floats, other: Floats, lane: int) -> float:
     return total
 
 
+@numba.njit(cache=True, inline="always")
+def energy_of_lane(w: Floats, lane: int, h4: float) -> float:
+    """Return the energy [J] of a lane's cell, 0 at rest."""
+    f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+    n = _cofactors(f)
+    j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+    volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
+    return 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
+
+
 @numba.njit(cache=True)
 def elastic_energy(blocks: Blocks, owned: int, h4: float, q: Positions) -> float:
     """Return E [J] of the first ``owned`` blocks, 0 at rest."""
@@ -267,11 +277,7 @@ def elastic_energy(blocks: Blocks, owned: int, h4: float, q: Positions) -> float
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-            n = _cofactors(f)
-            j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
-            volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
-            energy += 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
+            energy += energy_of_lane(w, lane, h4)
     return energy
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from msmpetsc.errors import InputError
-from msmpetsc.fields import LATTICE
+from msmpetsc.fields import FRAME_FIELDS, LATTICE, STRESS
 from msmpetsc.results.reader import Result
 
 Mesh = Literal["surface", "lattice"]
@@ -35,7 +35,7 @@ class Moments:
         return self.run.frames.position[frame] if self.mesh == "lattice" else self.run.surface_at(frame)
 
     def data_of_points(self, frame: int) -> dict[str, np.ndarray]:
-        """Return what is known at the points: of the lattice masses, and which are pinned, too.
+        """Return what is known at the points: of the lattice masses, which are pinned; its stress, if it was stored.
 
         displacement : from rest, (n, 3) [m]
         velocity     : the mean since the frame before, (n, 3) [m/s]; 0 at the first
@@ -46,18 +46,25 @@ class Moments:
             before, now = self.run.frames.time[frame - 1 : frame + 1]
             velocity = (points - self.points(frame - 1)) / (now - before)
         data = {"displacement": (points - self.rest).astype(points.dtype), "velocity": velocity.astype(points.dtype)}
+        stress = self._stress("n", frame)
         if self.mesh == "surface":
-            return data
+            W = self.run.embedding if stress else None
+            return data | ({} if W is None else {name: W @ rows for name, rows in stress.items()})
         pinned = np.zeros(len(self.rest), np.uint8)
         if "pinned" in self.run.lattice:
             pinned[self.run.lattice.pinned[:]] = 1
-        return data | {"pinned": pinned} | self._constant("n", "nodes")
+        return data | {"pinned": pinned} | self._constant("n", "nodes") | stress
 
     def data_of_cells(self, frame: int) -> dict[str, np.ndarray]:
         """Return what is known of the lattice's cells: strain, (c, 6) [-], and all that the file has of each."""
         if self.mesh == "surface":
             return {}
-        return {"strain": green_strain(self.rest, self.cells, self.points(frame))} | self._constant("c", "cells")
+        strain = green_strain(self.rest, self.cells, self.points(frame))
+        return {"strain": strain} | self._constant("c", "cells") | self._stress("c", frame)
+
+    def _stress(self, letter: str, frame: int) -> dict[str, np.ndarray]:
+        arrays = self.run.frames
+        return {name: arrays[name][frame] for name in STRESS if name in arrays and letter in FRAME_FIELDS[name].shape}
 
     def _constant(self, letter: str, points: str) -> dict[str, np.ndarray]:
         arrays = self.run.lattice

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import h5py
 import numpy as np
 
-from msmpetsc.fields import FIELDS, FRAME_FIELDS, unit_of
+from msmpetsc.fields import FIELDS, FRAME_FIELDS, RANKS_SHARE, unit_of
 from msmpetsc.results.disk import Storage
 
 CHUNK_BYTES = 64 * 2**20
@@ -25,6 +25,11 @@ def open_to_write(storage: Storage, mode: str) -> h5py.File:
     file. No chunk cache: nothing waits to be written. No lock: a running result may be looked at.
     """
     return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
+
+
+def of_ranks(name: str) -> bool:
+    """Return whether each rank has rows of its own of a field of frames."""
+    return bool(RANKS_SHARE.intersection(FRAME_FIELDS[name].shape))
 
 
 class Plan(NamedTuple):
@@ -42,26 +47,30 @@ class Layout:
 
     frames  : planned, frame 0 included
     nodes   : of all ranks
-    points  : surface points of all ranks; None where they are not stored
+    also    : rows, of all ranks, of fields that not all scenes ask for, by their names: {"surface": 1000}
     rows    : by name, shape of a node's part of the checkpoint's rows
     numbers : names of the checkpoint's numbers
     """
 
     frames: int = 0
     nodes: int = 0
-    points: int | None = None
+    also: dict[str, int] = field(default_factory=dict)
     rows: dict[str, tuple[int, ...]] = field(default_factory=dict)
     numbers: tuple[str, ...] = ()
 
     def plans(self) -> Iterator[Plan]:
         """Yield the datasets in the order in which they are laid out."""
-        for name, about in FRAME_FIELDS.items():
-            if name not in ("position", "surface"):
-                shape = (self.frames, *(size for size in about.shape[1:] if isinstance(size, int)))
-                yield Plan(f"frames/{name}", shape, shape, about.dtype)
-        yield _rows_plan("frames/position", self.frames, self.nodes, (3,), FRAME_FIELDS["position"].dtype)
-        if self.points is not None:
-            yield _rows_plan("frames/surface", self.frames, self.points, (3,), FRAME_FIELDS["surface"].dtype)
+        counts = {"position": self.nodes, **self.also}
+        for last in (False, True):
+            for name, about in FRAME_FIELDS.items():
+                is_left_out = name not in counts and any(isinstance(size, str) for size in about.shape[1:])
+                if is_left_out or of_ranks(name) != last:
+                    continue
+                shape = tuple(size if isinstance(size, int) else counts[name] for size in about.shape[1:])
+                if last:
+                    yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
+                else:
+                    yield Plan(f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype)
         # The checkpoint comes last: it is never trimmed, so the end of the file never moves back. (HDF5 would cut the
         # file before noting its new length; killed in between, it could not be opened.)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)

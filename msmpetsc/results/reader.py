@@ -40,7 +40,10 @@ NAMED = {  # by datasets of numbers, what these are numbers of
 PATIENCE = 10  # [s] to read a file's tables
 CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 DEFLATE_MOST = 1032  # zlib packs no better than this
-AXES: dict[int | str, str] = {"T": "time", "n": "node", "v": "point", 3: "axis"}  # xarray's names of dimensions
+AXES: dict[int | str, str] = {  # xarray's names of dimensions
+    "T": "time", "n": "node", "v": "point", "c": "cell", "a": "holder", "o": "obstacle", "b": "body",
+    "w": "probe", 3: "axis", 6: "component",
+}  # fmt: skip
 
 
 class Result:

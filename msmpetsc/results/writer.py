@@ -14,7 +14,7 @@ then either. Else it writes a new one, takes the frames over, and renames it whe
 
 import os
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from enum import Enum
 from pathlib import Path
@@ -38,7 +38,7 @@ from msmpetsc.results.disk import (
     refuse_no_file,
     refuse_small_disk,
 )
-from msmpetsc.results.layout import Layout, open_to_write
+from msmpetsc.results.layout import Layout, of_ranks, open_to_write
 from msmpetsc.results.reader import (
     FORMAT,
     FORMAT_VERSION,
@@ -94,8 +94,7 @@ class ResultFile:
         self._lock: Lock | None = None  # held on rank 0 only
         self._copied: int | None = None  # most frames to take over, all if None
         self._layout = Layout()
-        self._nodes: tuple[int, ...] = ()  # of each rank
-        self._points: tuple[int, ...] = ()  # surface points of each rank, if they are stored
+        self._rows: dict[str, list[int]] = {}  # fields that ranks have rows of: how many each has
         self._failed = False  # to write
         with self._together():
             if comm.rank == 0:
@@ -137,24 +136,25 @@ class ResultFile:
         self,
         count: int,
         nodes: int,
-        surface_points: int | None = None,
+        also: Mapping[str, int] | None = None,
         saved: Checkpoint | None = None,
     ) -> None:
         """Plan the frames and checkpoints, and give the file its name.
 
-        count          : of frames, frame 0 included
-        nodes          : of this rank
-        surface_points : of this rank; None: not stored
-        saved          : a checkpoint like those to come; None: of q and q_previous alone
+        count : of frames, frame 0 included
+        nodes : of this rank
+        also  : this rank's rows of fields that not all scenes ask for, by their names: {"surface": 1000}
+        saved : a checkpoint like those to come; None: of q and q_previous alone
         """
-        self._nodes, points = zip(*self._comm.allgather((nodes, surface_points)), strict=True)
-        self._points = () if points[0] is None else points
+        given = self._comm.allgather({"position": nodes, **(also or {})})
+        counts = {name: [rank[name] for rank in given] for name in given[0]}
+        self._rows = {name: counts[name] for name in counts if of_ranks(name)}
+        sizes = {name: sum(rows) if name in self._rows else rows[0] for name, rows in counts.items()}
         rows: dict[str, tuple[int, ...]] = {"q": (3,), "q_previous": (3,)}
         if saved:
             rows |= {name: values.shape[1:] for name, values in saved.rows.items()}
-        stored = sum(self._points) if self._points else None
         numbers = tuple(saved.numbers) if saved else ()
-        self._layout = Layout(count, sum(self._nodes), stored, rows, numbers)
+        self._layout = Layout(count, sizes.pop("position"), sizes, rows, numbers)
         with self._together():
             if self._file is not None:
                 self._lay_out(self._file)
@@ -165,18 +165,19 @@ class ResultFile:
             if self._file is not None:
                 self._publish(self._file)
                 self._same = os.open(self.path, os.O_RDONLY)
-                names = FRAME_FIELDS.keys() - {"time", "position", "surface"}
-                self._numbers = {name: self._file[f"frames/{name}"] for name in names}
+                self._numbers = {
+                    name: dataset
+                    for name, dataset in self._file["frames"].items()
+                    if name in FRAME_FIELDS and name != "time" and not of_ranks(name)
+                }
         if self._comm.size > 1 and not self._gathers:
             self._direct = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
         """Store the next frame; once this returns, no kill can lose it."""
         index = self.finished
-        self._collect(frame.position, np.dtype("f8"), self._nodes, "frames/position", index)
-        if frame.surface is not None and self._points:
-            dtype = np.dtype(FRAME_FIELDS["surface"].dtype)
-            self._collect(frame.surface, dtype, self._points, "frames/surface", index)
+        for name, counts in self._rows.items():
+            self._collect(getattr(frame, name), np.dtype(FRAME_FIELDS[name].dtype), counts, f"frames/{name}", index)
         with self._together():
             if self._file is not None:
                 for name, numbers in self._numbers.items():
@@ -196,7 +197,7 @@ class ResultFile:
                 self._flush(self._file)
         slot = self._comm.bcast(slot)
         for name, values in saved.rows.items():
-            self._collect(values, np.dtype("f8"), self._nodes, f"checkpoint/{name}", slot)
+            self._collect(values, np.dtype("f8"), self._rows["position"], f"checkpoint/{name}", slot)
         with self._together():
             if self._file is not None:
                 if saved.numbers:

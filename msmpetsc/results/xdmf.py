@@ -3,6 +3,7 @@
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+from msmpetsc.fields import FRAME_FIELDS, STRESS
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 
@@ -12,7 +13,8 @@ NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 def write_xdmf(h5_path: str | Path) -> Path:
     """Write x.xdmf beside x.h5 once that is closed, and return its path. Raises InputError.
 
-    Two temporal collections: the surface triangles, where the surface was stored, and the lattice cells.
+    Two temporal collections: the surface triangles, where the surface was stored, and the lattice cells with their
+    stress, where that was.
     """
     h5_path = Path(h5_path)
     root = ET.Element("Xdmf", Version="3.0")
@@ -20,9 +22,19 @@ def write_xdmf(h5_path: str | Path) -> Path:
     with Result(h5_path) as run:
         if "frames/surface" in run:
             _collection(domain, "surface", "Triangle", run, "surface/triangles", "frames/surface")
-        for grid in _collection(domain, "lattice", "Hexahedron", run, "lattice/cells", "frames/position"):
+        grids = _collection(domain, "lattice", "Hexahedron", run, "lattice/cells", "frames/position")
+        for grid in grids:
             kind = ET.SubElement(grid, "Attribute", Name="cell_kind", AttributeType="Scalar", Center="Cell")
             kind.append(_data_item(run, "lattice/cell_kind"))
+        for name in filter(run.frames.__contains__, STRESS):
+            centre = "Cell" if "c" in FRAME_FIELDS[name].shape else "Node"
+            is_tensor = run.frames[name].ndim == 3  # as two vectors: XDMF's readers differ in the order of a tensor
+            parts = {f"{name}_normal": 0, f"{name}_shear": 3} if is_tensor else {name: None}
+            for index, grid in enumerate(grids):
+                for part, first in parts.items():
+                    sort = "Vector" if is_tensor else "Scalar"
+                    field = ET.SubElement(grid, "Attribute", Name=part, AttributeType=sort, Center=centre)
+                    field.append(_frame_slab(run, f"frames/{name}", index, first))
     ET.indent(root)
     path = h5_path.with_suffix(".xdmf")
     write_whole(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
@@ -47,14 +59,20 @@ def _collection(domain: ET.Element, name: str, kind: str, run: Result, elements:
     return grids
 
 
-def _frame_slab(run: Result, points: str, index: int) -> ET.Element:
-    """Return frame `index` of points (T, n, 3): start, stride, count, and the dataset."""
-    _, rows, axes = run[points].shape
-    item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=f"{rows} {axes}", Type="HyperSlab")
-    item.append(ET.Comment(f"frame {index}"))  # VTK takes the first thing in it for its name, and caches points by that
-    part = ET.SubElement(item, "DataItem", Dimensions="3 3", Format="XML")
-    part.text = f"{index} 0 0  1 1 1  1 {rows} {axes}"
-    item.append(_data_item(run, points))
+def _frame_slab(run: Result, name: str, index: int, first: int | None = 0) -> ET.Element:
+    """Return frame `index` of a dataset (T, r, k), its 3 columns from the ``first`` on, or of one (T, r), with None.
+
+    It is start, stride, count, and the dataset.
+    """
+    rows = run[name].shape[1]
+    columns, start = (f" {rows}", f"{index} 0") if first is None else (f" {rows} 3", f"{index} 0 {first}")
+    axes = len(columns.split())
+    item = ET.Element("DataItem", ItemType="HyperSlab", Dimensions=columns.strip(), Type="HyperSlab")
+    # VTK takes the first thing in it for its name, and caches by that
+    item.append(ET.Comment(f"frame {index} of {name}, {first}"))
+    part = ET.SubElement(item, "DataItem", Dimensions=f"3 {1 + axes}", Format="XML")
+    part.text = f"{start}  1{' 1' * axes}  1{columns}"
+    item.append(_data_item(run, name))
     return item
 
 

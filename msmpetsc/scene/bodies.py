@@ -52,6 +52,12 @@ def tables_of(scene: Any, kind: str) -> Iterator[OfBody]:
             yield OfBody(("body", body, kind, number), body, table)
 
 
+def held_by(scene: Any) -> Iterator[OfBody]:
+    """Yield the tables of what holds nodes, pins and then anchors: of two on a node the first has it."""
+    for kind in ("pin", "anchor"):
+        yield from tables_of(scene, kind)
+
+
 def unlike_the_material(scene: Any) -> Iterator[Broken]:
     """Yield the rules that bodies and parts break beside the material.
 

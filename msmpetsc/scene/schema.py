@@ -4,16 +4,16 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from msmpetsc.scene.bodies import OF_REGIONS, BodyTable, OfBody, regions_of_no_body, tables_of, unlike_the_material
 from msmpetsc.scene.body import CagesTable, Material, MeshTable, PartTable
 from msmpetsc.scene.motion import AnchorTable, Force, Gravity, Pin, Start
 from msmpetsc.scene.obstacles import ObstacleTable, SelfContactTable
-from msmpetsc.scene.problems import Broken, KeyPath
+from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.statics import one_state, unlike_the_integrator
 from msmpetsc.scene.time import Time
-from msmpetsc.scene.values import Count, Direction, ListOf, NotNegative, Positive, PresetName, Table
+from msmpetsc.scene.values import Count, Direction, FileName, ListOf, NotNegative, Positive, PresetName, Table, Vector
 
 
 class Solver(Table):
@@ -33,11 +33,29 @@ class Safety(Table):
     checks: bool = Field(True, description="balance the energy of every step, and count cells inside out")
 
 
+class Probe(Table):
+    """A point of the body that is followed."""
+
+    name: FileName = Field(description="of its columns in `msmpetsc series`")
+    point: Vector = Field(description="where it is at rest; it goes with the cell that it lies in [m]")
+
+
 class Output(Table):
     """Choice of what the result file stores beside the lattice."""
 
     surface: bool = Field(True, description="store the surface of every frame")
+    stress: bool = Field(
+        False, description='store stress and strain energy of every frame; with material.law = "neo-hookean"'
+    )
+    probe: ListOf[Probe] = Field((), description="points of the body whose places are stored")
     every: Count = Field(1, description="store every N-th step only, and the last [-]")
+
+    @field_validator("probe")
+    @classmethod
+    def _has_distinct_names(cls, probes: tuple[Probe, ...]) -> tuple[Probe, ...]:
+        if len({probe.name for probe in probes}) < len(probes):
+            raise rule("must have a name of its own for each")
+        return probes
 
 
 class BudgetTable(Table):
@@ -93,7 +111,10 @@ class SceneFile(Table):
 
     def broken_rules(self) -> Iterator[Broken]:
         """Yield the rules that the tables break among each other."""
-        return chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
+        if self.output.stress and self.material.poisson is None:
+            words = f'may not have stress = true with material.law = "{self.material.law}": springs have no stress'
+            yield "output", rule(words, "material")
+        yield from chain(unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self))
 
     @property
     def stored(self) -> int:

@@ -16,13 +16,16 @@ from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import ANY, Checkpoint, Counting, Range
 from msmpetsc.comm import on_root
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.stress import StressField
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.fields import Frame
+from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.probe import ProbePoints
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
+from msmpetsc.solve.forces import Forces
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators import INTEGRATORS, make_integrator
 from msmpetsc.solve.integrators.adaptive import Adaptive, refuse_bad_steps
@@ -115,6 +118,11 @@ class TimeLoop:
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
+        points = [probe.point for probe in scene.output.probe]
+        self.probe = ProbePoints(comm, model.lattice, points) if points else None
+        self.forces = Forces(scene, model, self.environment, self.elasticity)
+        solid = self.elasticity.solid if scene.output.stress else None
+        self.stress = StressField(model.lattice, solid) if solid else None
         q, velocity = model.start
         sides = self.environment.contact_faces(q, q, 0.0, 0.0, None, self.environment.fixed_at(0.0))
         self.state, self.effort = State(q.copy(), q - self.time_step * velocity, sides=sides), Effort()
@@ -170,7 +178,7 @@ class TimeLoop:
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
-        frame = self._frame(index, result.position) if index % self.every == 0 or index == self.steps else None
+        frame = self._frame(index, result.position, result) if index % self.every == 0 or index == self.steps else None
         if index % REMEMBERED == 0 or (self.rest and self.rest.has_come and index == self.steps):
             self._saved = self._save()
         return frame
@@ -220,7 +228,7 @@ class TimeLoop:
         """Raise InputError for PETSc options of the user that nothing has used (collective)."""
         self.integrator.refuse_unused_options(at_end, self.recovery.awaited)
 
-    def _frame(self, index: int, q: Positions) -> Frame:
+    def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.balance.energies
         effort, gained = self.effort, self.state.budget.since_frame
@@ -248,7 +256,22 @@ class TimeLoop:
             energy_error=effort.energy_error,
             time_error=self.time_error,
             **vars(effort.work),
+            probe=self.probe(q) if self.probe else None,
+            **self.forces(q, time, self.state.sides, step),
+            **(self.stress(q) if self.stress else {}),
         )
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """How many rows this rank has of fields that not all scenes ask for."""
+        lattice, rows = self.model.lattice, dict(self.forces.rows)
+        if self.probe:
+            rows["probe"] = len(self.probe.corners)
+        if self.surface:
+            rows["surface"] = len(self.surface.starts) - 1
+        if self.stress:
+            rows |= {name: lattice.cells_owned if "c" in FRAME_FIELDS[name].shape else lattice.owned for name in STRESS}
+        return rows
 
     def __enter__(self) -> "TimeLoop":
         try:

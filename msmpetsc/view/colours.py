@@ -56,6 +56,7 @@ def of_classes(numbers: np.ndarray) -> np.ndarray:
 
 NEAR = 0.01  # of the longest side of a body: gaps up to this are told apart
 PREFIXES = {1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
+LARGE = {1e9: "G", 1e6: "M", 1e3: "k"}  # of pascals alone: a body is some 2000 m long
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Colouring:
     """A field on the surface points.
 
     title   : what it is
-    unit    : "m", "%"; "" where the numbers are those of classes
+    unit    : "m", "Pa", "%"; "" where the numbers are those of classes
     values  : number of a frame -> (v,)
     high    : end of the scale, which begins at 0
     classes : names, where the field is a number of a class; those without a name are not in the legend
@@ -91,8 +92,9 @@ class Colouring:
         if self.unit == "%":
             return "0", f"{self.title} [%]", f"{100 * self.high:.3g}"
         largest = self.below or self.high
-        size = next((size for size in PREFIXES if largest >= size), 1.0)
-        title = f"{self.title} [{PREFIXES[size]}{self.unit}]"
+        prefixes = LARGE | PREFIXES if self.unit == "Pa" else PREFIXES
+        size = next((size for size in prefixes if largest >= size), 1.0)
+        title = f"{self.title} [{prefixes[size]}{self.unit}]"
         if self.below is None:
             return "0", title, f"{self.high / size:.3g}"
         return f"{self.below / size:.3g} or more", title, "0"
@@ -145,6 +147,16 @@ def _strain(subject: Drawable, _: Result | None) -> Colouring:
         return subject.on_surface(np.sqrt(np.bincount(springs.ravel(), squares, len(nodes)) / count))
 
     return Colouring("strain of the springs", "%", values)
+
+
+def _stress(subject: Drawable, _: Result | None) -> Colouring:
+    """Colour by von Mises' stress, the mean of the cells around a node carried by the embedding."""
+    von_mises = subject.von_mises
+    if von_mises is None:
+        if subject.scene is not None and subject.scene.material.poisson is None:
+            raise InputError(f"--colour stress: {subject.name} is of springs, whose law has no stress")
+        raise InputError(f"--colour stress: {subject.name} has no stress: run its scene with output.stress = true")
+    return Colouring("von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)))
 
 
 def _error(subject: Drawable, reference: Result | None) -> Colouring:
@@ -204,6 +216,7 @@ COLOURINGS: dict[str, Callable[[Drawable, Result | None], Colouring]] = {
     "displacement": _displacement,
     "speed": _speed,
     "strain": _strain,
+    "stress": _stress,
     "error": _error,
     "part": _part,
     "contact": _contact,

@@ -100,6 +100,7 @@ class Drawable:
     embedding : W (v, n); None where the surface points are the nodes
     array     : name of a dataset of a result, "lattice/springs" -> its numbers
     solids    : surfaces at time 0 of obstacles that are meshes or functions, by their numbers
+    von_mises : number of a frame -> stress at the nodes (n,) [Pa]; None where none was stored
     carry     : (v, w) numbers at the file's own points -> numbers at the surface points; None: they are the same
     """
 
@@ -115,6 +116,7 @@ class Drawable:
     array: Callable[[str], np.ndarray]
     solids: Mapping[int, Surface]
     carry: csr_array | None = None
+    von_mises: Callable[[int], np.ndarray] | None = None
 
     @property
     def title(self) -> str:
@@ -168,6 +170,7 @@ def drawable_of_result(run: Result) -> Drawable:
         embedding=run.embedding,
         array=lambda name: run.indices(name) if name == "lattice/springs" else run[name][:],
         solids=solids_of(run),
+        von_mises=(lambda index: run.frames.von_mises[index].astype(float)) if "von_mises" in run.frames else None,
     )
 
 

@@ -19,9 +19,11 @@ from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
 from msmpetsc.export.gltf import normals
 from msmpetsc.export.moments import green_strain
+from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
 
 PINNED = [0, 3]
+SCALARS = ("von_mises", "pressure", "strain_energy")
 
 
 @pytest.fixture
@@ -186,3 +188,32 @@ def test_the_xdmf_file_is_read_by_vtk_without_a_complaint(result: Path):
         body = pyvista.wrap(named["lattice"])
         assert body.n_cells == 2 and body["cell_kind"].tolist() == [1, 1] and body.volume == pytest.approx(2 * H**3)
     assert heard == []
+
+
+def stressed(index: int) -> dict[str, np.ndarray]:
+    """Stress of the bar's nodes and cells at a frame."""
+    rows = {"": len(NODES), "cell_": 2}
+    numbers = {f"{whose}{name}": index + np.arange(rows[whose]) for whose in rows for name in SCALARS}
+    return numbers | {f"{whose}stress": index + np.arange(6.0 * rows[whose]).reshape(-1, 6) for whose in rows}
+
+
+def test_stress_comes_with_xdmf_and_vtu(tmp_path: Path):
+    """In VTK's order, and of the surface as the embedding carries it; XDMF has a tensor as two vectors."""
+    result = small_result.write(tmp_path / "x.h5", [small_result.frame(k, **stressed(k)) for k in range(3)])
+    reader = vtk.vtkXdmfReader()
+    reader.SetFileName(str(write_xdmf(result)))
+    heard = complaints(reader)
+    for index in (0, 2, 1):
+        reader.UpdateTimeStep(DT * index)
+        body, expected = pyvista.wrap(reader.GetOutputDataObject(0).GetBlock(1)), stressed(index)
+        for whose, data in (("", body.point_data), ("cell_", body.cell_data)):
+            assert np.array_equal(data[f"{whose}stress_normal"], expected[f"{whose}stress"][:, :3])
+            assert np.array_equal(data[f"{whose}stress_shear"], expected[f"{whose}stress"][:, 3:])
+            assert all(np.array_equal(data[whose + name], expected[whose + name]) for name in SCALARS)
+    assert heard == []
+    lattice = meshio.read(export(result, tmp_path / "l.vtu", frames=[1]))
+    found = lattice.point_data | {name: blocks[0] for name, blocks in lattice.cell_data.items()}
+    assert all(np.array_equal(found[name], rows) for name, rows in stressed(1).items())
+    surface_data = meshio.read(export(result, tmp_path / "s.vtu", "surface", [1])).point_data
+    with Result(result) as run:
+        assert np.allclose(surface_data["von_mises"], run.embedding @ stressed(1)["von_mises"])

@@ -53,7 +53,7 @@ def write_ball(path: Path, surface: bool, scene: str = SCENE) -> Path:
             file.write("lattice/pinned", np.flatnonzero(ball.vertices[:, 0] >= 0.02))
         for name, part in (("weights", embedding.data), ("indices", embedding.indices), ("indptr", embedding.indptr)):
             file.write(f"embedding/{name}", part)
-        file.start_frames(len(HEIGHTS), rows, rows if surface else None)
+        file.start_frames(len(HEIGHTS), rows, {"surface": rows} if surface else {})
         for index, height in enumerate(HEIGHTS):
             points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]
             energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)

@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.checkpoint import Checkpoint
-from msmpetsc.fields import Frame
+from msmpetsc.fields import STRESS, Frame
 from msmpetsc.results.writer import ResultFile
 
 H, DT, FRAMES = 0.5, 0.01, 5  # [m], [s]
@@ -64,7 +64,9 @@ def write(
             file.write("embedding/indptr", 8 * np.arange(len(POINTS) + 1))
             file.write("embedding/indices", cells()[[0, 1, 1, 0]].ravel())
             file.write("embedding/weights", np.full(8 * len(POINTS), 1 / 8))
-        file.start_frames(len(frames), len((arrays | lattice)["nodes"]), len(POINTS) if surface else None)
+        also = {"surface": len(POINTS)} if surface else {}
+        also |= {name: len(rows) for name in STRESS if (rows := getattr(frames[0], name)) is not None}
+        file.start_frames(len(frames), len((arrays | lattice)["nodes"]), also)
         for one in frames:
             file.append(one)
             file.write_checkpoint(Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1}))

@@ -70,7 +70,7 @@ def test_what_is_not_there_is_an_index_error(whole: Path, key):
 def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
     with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
         file.write("lattice/nodes", NODES)
-        file.start_frames(1000, len(NODES), len(POINTS))
+        file.start_frames(1000, len(NODES), {"surface": len(POINTS)})
         with msmpetsc.open(tmp_path / "x.h5") as run:
             assert run.frames.position[:].shape == (0, *NODES.shape)
         for index in range(3):

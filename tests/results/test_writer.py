@@ -31,7 +31,7 @@ def run_on_ranks(ranks: int, action: str, path: Path) -> str:
 
 def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
     with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(planned, NODES, POINTS)
+        file.start_frames(planned, NODES, {"surface": POINTS})
         for index in range(count):
             file.append(frame(index))
 
@@ -39,7 +39,8 @@ def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
 def assert_holds(file: h5py.File, count: int, surface: str | None = "f4") -> None:
     """The first `count` frames are those of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
-    fields = {name: field.dtype for name, field in FRAME_FIELDS.items() if name != "surface"}
+    fields = {name: FRAME_FIELDS[name].dtype for name in file["frames"] if name != "surface"}
+    assert {"position", *(name for name, field in FRAME_FIELDS.items() if field.shape == ("T",))} <= set(fields)
     if surface is not None:
         fields["surface"] = surface
     for name, kind in fields.items():
@@ -92,7 +93,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "open_to_write", disk.opened)
     marks = {}  # number of writes made -> (frames, newest checkpoint) that were then finished
     file = ResultFile(path, MPI.COMM_SELF, {})
-    file.start_frames(40, NODES, POINTS)
+    file.start_frames(40, NODES, {"surface": POINTS})
     for index in range(12):
         marks[len(disk.log)] = index, index - 1
         file.append(frame(index))
@@ -120,7 +121,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     """As above, from the opening of a file that was left by a kill, until it is closed."""
     path, disk = tmp_path / "x.h5", Disk()
     with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(9, NODES, POINTS)
+        file.start_frames(9, NODES, {"surface": POINTS})
         for index in range(3):
             file.append(frame(index))
             file.write_checkpoint(saved(index))
@@ -129,7 +130,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     io.BytesIO.write(disk, before)
     monkeypatch.setattr(writer, "open_to_write", disk.opened)
     file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
-    file.start_frames(9, NODES, POINTS)
+    file.start_frames(9, NODES, {"surface": POINTS})
     assert file.finished == 3
     for index in range(3, 6):
         file.append(frame(index))
@@ -205,7 +206,7 @@ class Disk(io.BytesIO):
 def test_ended_early_it_is_trimmed(tmp_path, failure):
     try:
         with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-            file.start_frames(STEPS + 1, NODES, POINTS)
+            file.start_frames(STEPS + 1, NODES, {"surface": POINTS})
             for index in range(4):
                 file.append(frame(index))
             if failure:

@@ -50,6 +50,20 @@ def test_speed_is_the_way_over_the_time_around_a_frame(subject):
     assert values(8) == pytest.approx(0.0, abs=1e-5)  # 0.2 m before and after
 
 
+def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
+    nodes = len(subject.rest.nodes)
+    stressed = replace(subject, von_mises=lambda index: np.full(nodes, 2e6 * index))
+    shown = scaled(colouring_of(stressed, "stress"), [0, 1])
+    assert shown.values(1) == pytest.approx(np.full(len(subject.rest.points), 2e6))
+    assert shown.ends == ("0", "von Mises' stress [MPa]", "2")
+    with pytest.raises(InputError, match="is of springs, whose law has no stress"):
+        colouring_of(subject, "stress")
+    text = BARE.replace("stiffness = 1.0", 'young_modulus = 1.0, law = "neo-hookean"')
+    solid = SceneFile.model_validate(toml_of(text))
+    with pytest.raises(InputError, match=r"run its scene with output\.stress = true"):
+        colouring_of(replace(subject, scene=solid), "stress")
+
+
 def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
     """Three nodes in a row: the first spring 10% longer, the second 20% shorter."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

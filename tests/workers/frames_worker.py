@@ -46,7 +46,7 @@ def write_all(path: str, gathers: bool = False) -> None:
         file.write("lattice/nodes", positions(0, NODES)[nodes])
         file.write("lattice/springs", np.arange(2 * NODES).reshape(-1, 2)[nodes])
         file.write("lattice/pinned", np.zeros(0, int))
-        file.start_frames(STEPS + 1, nodes.stop - nodes.start, points.stop - points.start)
+        file.start_frames(STEPS + 1, nodes.stop - nodes.start, {"surface": points.stop - points.start})
         for index in range(STEPS + 1):
             file.append(frame(index, nodes, points))
             file.write_checkpoint(

@@ -104,6 +104,13 @@ class ContactState:
         rows = np.flatnonzero(depths > 0)
         return rows, depths[rows], self.obstacle.normals_at(q[rows], self.time, face[rows])
 
+    def add_gradient(self, q: Positions, gradient: Rows) -> None:
+        """Add the gradient [N] of the push and the friction at q (owned, 3) to ``gradient`` (owned or more, 3)."""
+        rows, depth, normal = self.pressed(q)
+        gradient[rows] -= (self.stiffness * depth)[:, None] * normal
+        if self.friction:
+            self.friction.add_gradient(q, gradient)
+
     def change(self, q: Positions, base: Positions) -> float:
         """Return the energy of the push at q less that at base (n, 3) [J]."""
         (depths, face), (base_depths, base_face) = self.depths(q), self.depths(base)
@@ -152,10 +159,7 @@ class Contact:
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add its gradient [N] to ``gradient`` (owned or more, 3)."""
         for state in self.states:
-            rows, depth, normal = state.pressed(q[: self.owned])
-            gradient[rows] -= (state.stiffness * depth)[:, None] * normal
-            if state.friction:
-                state.friction.add_gradient(q, gradient)
+            state.add_gradient(q[: self.owned], gradient)
         if self.surface:
             self.surface.add_gradient(q, gradient)
 

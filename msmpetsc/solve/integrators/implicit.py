@@ -107,7 +107,7 @@ class ImplicitEuler(Integrator):
             result = self.stepper.step(self.problem)
             faces.compare(result.position)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        return replace(result, cost=cost), faces.sides
+        return replace(result, cost=cost, problem=self.problem, tau=self.damped_tau), faces.sides
 
     def follow(self) -> None:
         self.trace = Trace()

@@ -190,14 +190,14 @@ class Static(ImplicitEuler):
         self._let_go(time)
         before = time - self.time_step
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
-            return StepResult(state.q, state.q, Work(self.error, steps=1), static=True), state
+            return StepResult(state.q, state.q, Work(self.error, steps=1), static=True, problem=self.problem), state
         stepper = self.stepper
         begun = stepper.work_so_far()
         path = LoadPath(self.comm, stepper, self.environment, state, time, self.time_step)
         result = self._follow(path, time)
         q, self.problem, self.error = result.position, path.problem, result.cost.step_error
         cost = replace(stepper.work_so_far() - begun, steps=1, step_error=self.error)
-        result = replace(result, previous=q, cost=cost, static=True)
+        result = replace(result, previous=q, cost=cost, static=True, problem=self.problem)
         return result, State(q, q, sides=path.sides)
 
     def _follow(self, path: LoadPath, time: float) -> StepResult:

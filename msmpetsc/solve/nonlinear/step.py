@@ -48,6 +48,7 @@ class StepResult:
     explicit   : taken in substeps; ``work`` then has that of all that moved, pushed or came to be there
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
+    problem    : that was solved, of F = M (x - y) + tau^2 (grad E - f_ext); None of explicit steps. Statics have no M
     """
 
     position: Positions  # (l, 3) [m], ghosts included
@@ -58,6 +59,8 @@ class StepResult:
     swing: float = 0.0
     static: bool = False  # a state of equilibrium, not a motion
     time_error: float = np.nan
+    problem: StepProblem | None = None
+    tau: float = np.inf  # [s]
 
 
 @dataclass(eq=False)

@@ -1,0 +1,86 @@
+"""Stress of a neo-Hookean solid: of each cell, and at each node the mean over the cells around it.
+
+With F the mean deformation gradient of a cell, J = det F and U of elasticity.neo_hookean, the first Piola-Kirchhoff and
+the Cauchy stress are (Bonet and Wood 2008, chapter 5)
+
+    P = mu F + U' cof F,        sigma = P F^T / J = mu / J F F^T + U' I,
+
+the pressure -tr(sigma) / 3, and von Mises' stress (3/2 |sigma + p I|^2)^(1/2). The mean at a node is by the cells'
+volume at rest. It is what to look at where a solid is nearly incompressible: pressures may alternate from cell to cell.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+from scipy.sparse import csr_array
+
+from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.elasticity.cell_lanes import CONSTANTS, LANES, STATE, WORK, Blocks, gather, load
+from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean, energy_of_lane
+from msmpetsc.lattice.lattice import Lattice
+
+UPPER = np.array([0, 4, 8, 1, 5, 2])  # xx, yy, zz, xy, yz, xz of a tensor's nine
+
+
+class StressField:
+    """The fields of stress that a frame has (fields.Frame), of one rank's part of a lattice.
+
+    lanes  : (d,) where each of the lattice's ``local_cells`` stands in the solid's blocks
+    around : (owned, d) of each node the weights of the cells around it, which sum to 1
+    """
+
+    def __init__(self, lattice: Lattice, solid: NeoHookean):
+        assert lattice.solid is not None
+        self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
+        corners = lattice.local_cells
+        first, lanes = np.unique(solid.blocks.nodes[:, :, 0], return_index=True)  # before the lanes that fill up
+        self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
+        weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
+        around = csr_array((weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners)))
+        self.around = around[: lattice.owned]
+        self.around.data /= np.repeat(self.around.sum(axis=1), np.diff(self.around.indptr))
+
+    def __call__(self, q: Positions) -> dict[str, Any]:
+        """Return the fields at q (l, 3) [m]: of owned nodes, and by ``cell_...`` of the cells that this rank owns.
+
+        A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]; strain energies are [J/m^3] of volume at rest.
+        """
+        stress = self.cauchy(q)
+        energy = np.empty((len(self.solid.blocks.nodes), LANES))
+        cell_energies(self.solid.blocks, self.solid.h4, q, energy)
+        energies = energy.ravel()[self.lanes] / self.cells.volume
+        own = slice(self.cells_owned)
+        of_nodes = _fields(self.around @ stress, self.around @ energies)
+        return of_nodes | {f"cell_{name}": rows for name, rows in _fields(stress[own], energies[own]).items()}
+
+    def cauchy(self, q: Positions) -> Rows:
+        """Return the Cauchy stress (d, 6) [Pa] of the lattice's ``local_cells`` at q (l, 3) [m].
+
+        Below J_0, where U is no solid's any more, J_0 stands for J, so that the stress stays finite.
+        """
+        state = self.solid.state(q, False).reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
+        f, slope = state[:, :9].reshape(-1, 3, 3), state[:, 9] * self.solid.h4**2 / self.cells.volume
+        share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
+        sigma: Rows = (share[:, None, None] * (f @ f.transpose(0, 2, 1))).reshape(-1, 9)[:, UPPER]
+        sigma[:, :3] += slope[:, None]
+        return sigma
+
+
+def _fields(stress: Rows, energy: Floats) -> dict[str, Any]:
+    """Return what is known by stresses (k, 6) [Pa] and energies (k,) [J/m^3]."""
+    pressure = -stress[:, :3].mean(axis=1)
+    deviator = np.concatenate([stress[:, :3] + pressure[:, None], np.sqrt(2) * stress[:, 3:]], axis=1)
+    von_mises = np.sqrt(1.5) * np.linalg.norm(deviator, axis=1)
+    return {"stress": stress, "von_mises": von_mises, "pressure": pressure, "strain_energy": energy}
+
+
+@numba.njit(cache=True)
+def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
+    """Write the energy of each cell [J] at q (l, 3) [m] into ``energies`` (b, LANES)."""
+    w = np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        gather(blocks.nodes, b, q, w)
+        load(blocks.constants, blocks.which[b], w, CONSTANTS)
+        for lane in range(LANES):
+            energies[b, lane] = energy_of_lane(w, lane, h4)

@@ -1,0 +1,62 @@
+"""The forces on a body at a frame: loads, reactions of pins and anchors, pushes of obstacles and of the surface.
+
+They are those of the step that ended last: its inertia, and friction as it had it. Where there is none, as at the start
+and in explicit steps, nothing that is held accelerates, and obstacles push without friction.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from msmpetsc.backend.arrays import Indices, Positions, to_host
+from msmpetsc.build import Model
+from msmpetsc.constraints.reactions import sums_by
+from msmpetsc.contact.obstacles.penalty import Contact
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.environment import Environment
+from msmpetsc.scene.reading import Scene
+from msmpetsc.solve.nonlinear.step import StepResult
+
+
+class Forces:
+    """The fields of forces that a frame has (fields.Frame), by the names of those that the scene has a use for."""
+
+    def __init__(self, scene: Scene, model: Model, environment: Environment, elasticity: Elasticity):
+        self.comm, self.model, self.environment = model.lattice.table.comm, model, environment
+        self.elasticity = elasticity
+        self.pushing = [number for number, obstacle in enumerate(scene.obstacle) if obstacle.response != "exchange"]
+        bodies = len(model.lattice.first_of_body) if model.collision else 0
+        rows = {"reaction": len(model.holders.keys), "push": len(model.obstacles), "contact_push": bodies}
+        self.rows = {name: count for name, count in rows.items() if count}
+
+    def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
+        """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
+        lattice, environment, owned = self.model.lattice, self.environment, self.model.lattice.owned
+        problem = step.problem if step else None
+        contact = problem.contact if problem else environment.push(time, sides)
+        held, load = np.zeros_like(q), environment.load(time)
+        pushes = self._pushes(q, contact)
+        self.elasticity.add_gradient(q, held)
+        if contact:
+            contact.add_gradient(q, held)
+        held = held[:owned] - load
+        if step and problem:
+            held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
+        held *= environment.fixed_at(time)[:owned, None]
+        sums = {"reaction": self.model.holders.totals(to_host(held)), "load": to_host(load).sum(axis=0), **pushes}
+        return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
+
+    def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
+        """Return what obstacles (o, 3) and the surface on each body (b, 3) push this rank's nodes with [N]."""
+        lattice, owned = self.model.lattice, self.model.lattice.owned
+        push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
+        for state in contact.states if contact else ():
+            which = next(k for k, penalty in enumerate(penalties) if penalty.obstacle is state.obstacle)
+            gradient = np.zeros_like(q[:owned])
+            state.add_gradient(q[:owned], gradient)
+            push[self.pushing[which]] -= to_host(gradient).sum(axis=0)
+        own = np.zeros_like(q[:owned])
+        if contact and contact.surface:
+            contact.surface.add_gradient(q, own)
+        bodies = len(lattice.first_of_body)
+        return {"push": push, "contact_push": -sums_by(lattice.body[:owned], to_host(own), bodies)}

@@ -1,0 +1,113 @@
+"""Forces on a body add up; probes go with it; `msmpetsc series` prints both, the same on any number of ranks."""
+
+import csv
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from block_scene import CELL, SIDES, block_scene, play
+from conftest import run
+
+from msmpetsc.cli.main import main
+from msmpetsc.errors import InputError
+
+G = [0.5, 1.0, -9.81]
+BOTTOM = {"box": [[-1, -1, -0.01], [1, 1, 0.01]]}
+TOP = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
+EDGE = {"box": [[-1, -1, -0.01], [0.01, 1, 0.01]]}
+SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
+TIGHT = {"solver": {"error": 1e-12}, "gravity": {"acceleration": G}}
+LIFT = [{"region": BOTTOM, "path": [{"time": 0.015, "by": [0, 0, 0.01]}]}]
+PLATE = {"shape": "plane", "point": [0, 0, 0.252], "normal": [0, 0, -1], "response": "penalty", "friction": 0.3}
+
+
+def totals(frame) -> np.ndarray:
+    """Reactions, loads and pushes together (3,) [N]."""
+    return frame.load + sum(rows.sum(axis=0) for rows in (frame.reaction, frame.push) if rows is not None)
+
+
+@pytest.mark.parametrize("material", [SOLID, {"young_modulus": 1e5, "density": 1000.0}], ids=["solid", "springs"])
+def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
+    """A pull and the weight, held by two pins that share an edge: the edge's nodes count once."""
+    scene = block_scene(
+        tmp_path, **TIGHT, material=material, time={"integrator": "static"},
+        pin=[{"region": BOTTOM}, {"region": EDGE}], force=[{"region": TOP, "total": [30.0, 0, 200.0]}],
+    )  # fmt: skip
+    *_, frame = play(scene)[1]
+    pull = np.array([30.0, 0, 200.0]) + 1000 * SIDES.prod() * np.array(G)
+    assert frame.load == pytest.approx(pull, rel=1e-12)
+    assert frame.reaction[0] == pytest.approx(-pull, abs=1e-9 * np.abs(pull).max())
+    assert (frame.reaction[1] == 0).all()  # the first has all its nodes
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+@pytest.mark.parametrize("damping", [0.0, 3.0])
+def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping):
+    """Lifted against a plate that rubs: of implicit Euler the change of momentum; damping takes its part."""
+    scene = block_scene(
+        tmp_path, **TIGHT, material=SOLID | {"damping": damping}, anchor=LIFT, obstacle=[PLATE],
+        time={"step": 0.01, "duration": 0.03, "integrator": integrator},
+    )  # fmt: skip
+    _, frames = play(scene)
+    p = [frame.momentum for frame in frames]
+    pushed = max(np.abs(frame.push).max() for frame in frames)
+    assert pushed > 100 and max(np.abs(frame.push[0, :2]).max() for frame in frames) > 1e-4 * pushed
+    if integrator == "implicit-euler":
+        rates = [(b - a) / 0.01 + damping * b for a, b in pairwise(p)]
+    else:  # of the third step on, which looks back to two
+        rates = [None, None, (3 * p[3] - 4 * p[2] + p[1]) / 0.02 + damping * p[3]]
+    for frame, rate in zip(frames[1:], rates, strict=True):
+        if rate is not None:
+            assert totals(frame) == pytest.approx(rate, abs=1e-8 * pushed)
+
+
+def test_explicit_steps_hang_from_their_pin_with_their_weight_in_the_mean(tmp_path):
+    """Over whole swings the reaction is minus the weight; within one, the momentum's change."""
+    scene = block_scene(
+        tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}],
+        time={"step": 1e-4, "duration": 3e-3, "integrator": "verlet"},
+    )  # fmt: skip
+    _, frames = play(scene)
+    p = np.array([frame.momentum for frame in frames])
+    forces = np.array([totals(frame) for frame in frames])
+    middle = (p[2:] - p[:-2]) / 2e-4
+    assert np.abs(forces[1:-1] - middle).max() < 0.02 * np.abs(forces).max()
+
+
+def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, capsys):
+    scene = block_scene(
+        tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}], obstacle=[PLATE],
+        time={"step": 0.01, "duration": 0.02},
+        output={"surface": False, "stress": True, "probe": [{"name": "top, middle", "point": [0.25, 0.3, 0.2]}]},
+    )  # fmt: skip
+    tables = []
+    for ranks in (1, 2):
+        path = tmp_path / f"{ranks}.h5"
+        done = run(ranks, "-m", "msmpetsc", "run", scene, "-o", path, "--quiet")
+        assert done.returncode == 0, done.stderr
+        assert main(["series", str(path), "-o", str(path.with_suffix(".csv"))]) == 0
+        with path.with_suffix(".csv").open() as file:
+            head, *rows = csv.reader(file)
+        tables.append(np.array(rows, float))
+    _, frames = play(scene)
+    one, two = tables
+    np.testing.assert_allclose(one, two, atol=1e-8 * np.abs(one).max())
+    column = {name: one[:, number] for number, name in enumerate(head)}
+    assert head[0] == "time [s]" and "push obstacle.0 z [N]" in head
+    assert column["reaction pin.0 z [N]"][2] == pytest.approx(frames[2].reaction[0, 2], rel=1e-9)
+    assert [column[f"probe top, middle {axis} [m]"][0] for axis in "xyz"] == pytest.approx([0.25, 0.3, 0.2])
+    assert column["probe top, middle z [m]"][2] == pytest.approx(frames[2].probe[0, 2], rel=1e-12)
+    capsys.readouterr()
+    assert main(["series", str(tmp_path / "1.h5"), "-o", str(tmp_path / "1.csv")]) == 2
+    assert "exists already: --overwrite replaces it" in capsys.readouterr().err
+
+
+def test_a_probe_goes_with_its_cell(tmp_path):
+    scene = block_scene(
+        tmp_path, **TIGHT, material=SOLID, anchor=LIFT, time={"step": 0.01, "duration": 0.01},
+        output={"surface": False, "probe": [{"name": "edge", "point": [CELL, 0.1, 0.0]}]},
+    )  # fmt: skip
+    _, frames = play(scene)
+    assert frames[1].probe == pytest.approx(np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12)  # a held face, as it is led
+    with pytest.raises(InputError, match=r"output\.probe\.0\.point: \(9, 0, 0\) m lies in no cell"):
+        play(scene, 'output.probe=[{name="far", point=[9, 0, 0]}]')

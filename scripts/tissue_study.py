@@ -39,7 +39,7 @@ def row(scene: str, changes: list[str]) -> lab.Row:
             "Newton's iterations": mean["iterations"],
             "of CG": mean["ksp_its"],
             "products": mean["products"],
-            "inside out": int(frames.inverted.max()),
+            "inside out": int(frames.inverted[:].max()),
             "volume": ", ".join(lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])),
         }
 

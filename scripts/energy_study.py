@@ -4,8 +4,8 @@
     scripts/energy_study.py [SCENE ...] [--set KEY=VALUE ...] [-o PAGE]
 
 Of each run, over the most kinetic and elastic energy that the body had: the greatest rise of kinetic + elastic +
-contact's + potential energy from the frames of the file, and what the run's own ledger counts (frames/energy_gained).
-Anchors and obstacles that move do work, so that there the first is no gain.
+contact's + potential energy from the frames of the file, and what the run's own energy budget
+counts (frames/energy_gained). Anchors and obstacles that move do work, so that there the first is no gain.
 """
 
 import lab

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--at-once 2] [-o PAGE]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT] [--at-once 2] [-o PAGE]
+                           [--set KEY=VALUE ...]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -150,11 +151,12 @@ def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
     scene["anchor"] = [{"region": region, "path": [{"time": scene["time"]["duration"], "by": by}]}]
 
 
-def measured(seed: int, number: int) -> dict:
-    """What became of one scene: ``status``, its words, and what each step said of its error beside the truth."""
+def measured(seed: int, changes: list[str], number: int) -> dict:
+    """What became of one scene, some keys changed: ``status``, its words, each step's error as said and in truth."""
     with tempfile.TemporaryDirectory() as folder:
+        set_words = [word for change in changes for word in ("--set", change)]
         scene, result = draw_scene(seed, number, Path(folder)), Path(folder) / "run.h5"
-        run = lab.run(scene, result, ["--true-error", 1, "--quiet"], timeout=SECONDS, warm=True)
+        run = lab.run(scene, result, ["--true-error", 1, "--quiet", *set_words], timeout=SECONDS, warm=True)
         solver, steps = load_scene(scene).solver, []
         if result.exists():  # of a run that failed, the steps before
             frames = run.frames("step_error", "true_error")
@@ -191,6 +193,8 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", type=int)
     options.add_argument("--write", type=Path)
+    options.add_argument("--json", type=Path)
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     options.add_argument("--at-once", type=int, default=2)
     args = options.parse_args()
     if args.write:
@@ -198,11 +202,13 @@ def main() -> int:
         print(draw_scene(args.seed, args.only or 0, args.write))
         return 0
     if args.only is not None:
-        row = measured(args.seed, args.only)
+        row = measured(args.seed, args.set, args.only)
         print(json.dumps(row, indent=1))
         return int(bad(row))
     with ThreadPoolExecutor(args.at_once) as pool:
-        rows = list(pool.map(partial(measured, args.seed), range(args.scenes)))
+        rows = list(pool.map(partial(measured, args.seed, args.set), range(args.scenes)))
+    if args.json:
+        args.json.write_text(json.dumps(rows))
     for row in filter(bad, rows):
         steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
         print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)

@@ -35,7 +35,7 @@ Seven = tuple[float, float, float, float, float, float, float]
 class Blocks(NamedTuple):
     """Cells of a rank, eight a block; the last block of a kind is filled up with cells of no stiffness.
 
-    nodes     : (b, LANES, 8) local corner nodes, x fastest
+    nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, so that no index is looked at for being negative
     which     : (b,) row of the constants
     constants : (k, ROWS * LANES), LANES of each number
     """
@@ -148,7 +148,7 @@ def load(rows: Rows, row: int, w: Floats, at: int) -> None:
 def in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
     """Return cells in blocks (b, LANES, 8) and their constants (b, ROWS * LANES); the last is filled up by no cells."""
     lacking = -len(nodes) % LANES
-    nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.int32)
+    nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.uint32)
     rows = np.concatenate([constants, np.zeros((lacking, ROWS))]).reshape(-1, LANES, ROWS)
     return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
 

@@ -82,7 +82,7 @@ class Elasticity:
         self.springs: SpringScatter | SpringGather | None = None
         self.cells: CellScatter | CellGather | None = None
         if lattice.solid is not None and not on_cpu:
-            raise InputError('material.law = "neo-hookean" computes on the CPU: choose -mat_type aij')
+            raise InputError('material.law = "neo-hookean" is computed on CPUs: --device cpu')
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
         if self.solid is None:
             self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)

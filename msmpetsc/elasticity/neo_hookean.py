@@ -5,10 +5,11 @@ With mu and lambda of a cell, V of it inside the surface, F the mean deformation
     E = 1/2 mu (integral of |grad x|^2 - 3 V) + V U(J),     U(J) = -mu ln J + lambda/2 (J - 1)^2
 
 above J_0, below it the Taylor polynomial of second order there (Bonet and Wood 2008, Eq. 6.27; Smith, de Goes and Kim
-2018 on why the logarithm stays). The first part is that of springs of no rest length, so that A = M + t^2 L is the
-paper's matrix; the integral is that of lattice.cell_moments. U'' > 0 everywhere: a cell that is turned inside out is
-pushed back. At rest the second variation is  2 mu |sym G|^2 + lambda (tr G)^2 >= 0  of the mean slope G of a
-displacement, and what the modes add is not negative: semidefinite whatever part of a cell is inside.
+2018 on why the logarithm stays). The first part is that of springs of no rest length, as L of the paper's A = M + t^2 L
+is, with 2 mu + 3 lambda in mu's place to be no less than the Hessian; the integral is that of lattice.cell_moments.
+U'' > 0 everywhere: a cell that is turned inside out is pushed back. At rest the second variation is
+2 mu |sym G|^2 + lambda (tr G)^2 >= 0 of the mean slope G of a displacement, and what the modes add is not negative:
+semidefinite whatever part of a cell is inside.
 
 The Hessian of a cell is, on G,  V (mu G + U'' (cof F : G) cof F + U' F x G),  with F x G the change of cof F. In the
 singular values s of F it has the 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu], and one of 3 x 3 that is not negative where

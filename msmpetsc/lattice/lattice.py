@@ -54,7 +54,7 @@ class Lattice:
     springs     : (s, 2) local ends; the first ``springs_owned`` belong to this rank, with the
                   lower-numbered end first, the others to the rank of their lower-numbered end
     rest_length : (s,) distance of their ends at rest [m]
-    stiffness   : (s,) [N/m]; with ``solid`` of springs of no rest length, whose L is that of the shear modulus
+    stiffness   : (s,) [N/m]; with ``solid`` of springs of no rest length, whose L is no less than the Hessian at rest
     pinned      : (l,) bool, nodes that do not move
     stiffening  : of the springs' law (elasticity.springs) [-]; 0 for Hooke's
     local_cells : (d, 8) local corner nodes of the cells that belong to this rank, as their first corner does: the
@@ -105,8 +105,9 @@ class Lattice:
         return self.body_of(self.global_numbers)
 
     def stiffest(self, comm: MPI.Comm) -> float:
-        """Return the greatest stiffness of any spring [N/m] (collective)."""
-        return float(comm.allreduce(self.stiffness.max(initial=0), MPI.MAX))
+        """Return the greatest stiffness of any spring, or of such as a solid would have, [N/m] (collective)."""
+        stiffness = self.stiffness if self.solid is None else self.cell_stiffness
+        return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""
@@ -257,7 +258,8 @@ def _solid(net: Topology, h: float, made_of: CellMaterial) -> tuple[Floats, Floa
     diagonal = np.diagonal(pairs, axis1=1, axis2=2)
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-    of_spring = _sums_of_springs(net.cells, -h * shear, pairs, net.ijk, net.springs, owned)
+    most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
+    of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
     inside: Floats = volume * made_of.spring
     return mass, of_spring, inside, SolidCells(forms, h**3 * volume, shear, lame)
 

@@ -32,7 +32,7 @@ from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.solve.integrators.integrator import Integrator
-from msmpetsc.solve.integrators.state import Ledger, State
+from msmpetsc.solve.integrators.state import EnergyBudget, State
 from msmpetsc.solve.integrators.verlet import crushing_energy
 from msmpetsc.solve.nonlinear.step import StepResult
 
@@ -62,7 +62,7 @@ class Energies:
 
 @dataclass(eq=False)
 class EnergyBalance:
-    """Examiner of a run's steps; states keep the ledger.
+    """Examiner of a run's steps; states keep the energy budget.
 
     checks : whether steps are balanced; if not only numbers that are not finite are found
     """
@@ -113,54 +113,56 @@ class EnergyBalance:
         )
 
     def step(self, integrator: Integrator, before: State, time: float, time_step: float) -> tuple[StepResult, State]:
-        """Take the step of an integrator that ends at ``time``, and enter it into the ledger (collective).
+        """Take the step of an integrator that ends at ``time``, and enter it into the energy budget (collective).
 
         Raises StepFailed where a number is not finite, or far more came from nowhere than the body ever had.
         """
         result, after = integrator.advance(before, time)
-        return result, replace(after, ledger=self._examine(before, result, after, time, time_step))
+        return result, replace(after, budget=self._examine(before, result, after, time, time_step))
 
-    def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Ledger:
+    def _examine(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> EnergyBudget:
         v = (result.position - result.previous) / time_step
         self.show(result.position, v, time, after.sides)
         if not self.checks:
             self._refuse_infinite(self._sums(result.position.sum())[0], result)
-            return before.ledger
+            return before.budget
         solved = ended = self.energies
         self._refuse_infinite(solved.kinetic + solved.inner, result)
         if result.static:  # which owes nothing to the state before
-            return before.ledger
+            return before.budget
         bounces = self._bounces(result, after)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
-        ledger = self._entered(before.ledger, solved, ended, sums, bounces)
-        if ledger.gained > MOST * ledger.put_in:
+        budget = self._entered(before.budget, solved, ended, sums, bounces)
+        if budget.gained > MOST * budget.put_in:
             raise StepFailed(
-                f"gained {ledger.gained:.2e} J from nowhere, of {ledger.put_in:.2e} J that were there: "
+                f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were there: "
                 f"{self._worst(v)}{describe_inverted(self.comm, self.lattice, result.position)}; "
                 f"try {self.remedy(result.explicit)}"
                 + ("" if self.environment.exchanges else ', or safety.on_failure = "fallback"'),
                 "energy",
             )
         self.known = after.q, ended.elastic
-        return ledger
+        return budget
 
     def _refuse_infinite(self, total: float, result: StepResult) -> None:
         if not np.isfinite(total):
             raise StepFailed(f"left numbers that are not finite, {self._worst(result.position)}", "not finite")
 
-    def _entered(self, ledger: Ledger, solved: Energies, ended: Energies, sums: Floats, bounces: bool) -> Ledger:
+    def _entered(
+        self, budget: EnergyBudget, solved: Energies, ended: Energies, sums: Floats, bounces: bool
+    ) -> EnergyBudget:
         start, pushed, work, struck, swing = sums
-        gained = solved.inner - start - work + ledger.bounced - (0.0 if bounces else struck)
+        gained = solved.inner - start - work + budget.bounced - (0.0 if bounces else struck)
         bounced = ended.inner + ended.potential - solved.inner - solved.potential - struck if bounces else 0.0
-        by_right = start - max(ledger.bounced, 0.0) - pushed - max(ledger.gained, 0.0)  # an exchange puts nothing in
-        put_in = max(ledger.put_in, by_right + max(work, 0.0), self.floor)
-        put_in = max(put_in, solved.inner - max(ledger.gained + gained, 0.0))
+        by_right = start - max(budget.bounced, 0.0) - pushed - max(budget.gained, 0.0)  # an exchange puts nothing in
+        put_in = max(budget.put_in, by_right + max(work, 0.0), self.floor)
+        put_in = max(put_in, solved.inner - max(budget.gained + gained, 0.0))
         least = -self.credit * put_in
-        steady = max(least, ledger.steady + gained - swing)
-        since_frame = ledger.since_frame + gained
-        return Ledger(put_in, max(least, ledger.gained + gained), steady, since_frame, bounced)
+        steady = max(least, budget.steady + gained - swing)
+        since_frame = budget.since_frame + gained
+        return EnergyBudget(put_in, max(least, budget.gained + gained), steady, since_frame, bounced)
 
     def remedy(self, explicit: bool) -> str:
         """Return what was seen to keep energy from coming from nowhere, in words."""

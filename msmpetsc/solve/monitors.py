@@ -14,7 +14,7 @@ from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.energy_balance import MUCH
-from msmpetsc.solve.integrators.state import Ledger
+from msmpetsc.solve.integrators.state import EnergyBudget
 
 FAR = 0.3  # relative error of a step: a budget of iterations that leaves so much is none
 
@@ -70,16 +70,16 @@ class Monitors:
                     index, time, overlapping,
                 )  # fmt: skip
 
-    def gain(self, index: int, time: float, ledger: Ledger, remedy: str) -> None:
+    def gain(self, index: int, time: float, budget: EnergyBudget, remedy: str) -> None:
         """Take note of what the body has from nowhere after a step, and of what mends that."""
-        if not ledger.share <= MUCH:
+        if not budget.share <= MUCH:
             if not self.gaining:
                 log.warning(
                     "frame %d (t = %.6g s): %.2g%% of all energy, %.2g J of %.2g J, came from nowhere; try %s",
-                    index, time, 100 * ledger.share, ledger.share * ledger.put_in, ledger.put_in, remedy,
+                    index, time, 100 * budget.share, budget.share * budget.put_in, budget.put_in, remedy,
                 )  # fmt: skip
             self.gaining += 1
-            self.worst_gain = max(self.worst_gain, ledger.share)
+            self.worst_gain = max(self.worst_gain, budget.share)
 
     def sum_up(self) -> None:
         """Log at the end of a run how often each warning was due."""

@@ -169,7 +169,7 @@ class TimeLoop:
             errors, trace = self.integrator.true_errors(index, result)
             self.effort.measure(errors)
             self.trace = trace or self.trace
-        self.monitors.gain(index, time, after.ledger, self.balance.remedy(result.explicit))
+        self.monitors.gain(index, time, after.budget, self.balance.remedy(result.explicit))
         self.step = index
         if self.rest and self.rest.look(index, time, before, after):
             self.steps = index
@@ -226,10 +226,10 @@ class TimeLoop:
     def _frame(self, index: int, q: Positions) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
         time, energies = index * self.time_step, self.balance.energies
-        effort, gained = self.effort, self.state.ledger.since_frame
+        effort, gained = self.effort, self.state.budget.since_frame
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
             self.effort = Effort()
-            self.state = replace(self.state, ledger=replace(self.state.ledger, since_frame=0.0))
+            self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
         self.monitors.error(index, time, effort.work.step_error)
         position = to_host(q[: self.model.lattice.owned])
         return Frame(

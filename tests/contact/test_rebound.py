@@ -1,4 +1,4 @@
-"""What strikes an obstacle and leaps off again gains no energy, by its own ledger and by the sum of its frames."""
+"""What strikes an obstacle and leaps off again gains no energy, by its energy budget and by the sum of its frames."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
     _, frames = play(ball(tmp_path, time=time, obstacle=[PLANE | {"restitution": restitution}], **FALL))
     share = 1e-2 if integrator == "verlet" else 1e-3
     assert rise(frames) < share
-    if integrator != "verlet":  # whose swings the ledger counts up and down
+    if integrator != "verlet":  # whose swings the budget counts up and down
         assert sum(frame.energy_gained for frame in frames) < share * frames[0].kinetic
     assert frames[-1].momentum[2] > 0  # it leaves
 

@@ -151,10 +151,22 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
-    """mu h / 12 each, and none on edges: K of a trilinear cell."""
+    """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are 1."""
     lattice = build_lattice(cages_of(block(1, 1, 1), H), 1000.0, young_modulus=2.5, poisson=0.25)
     kind = np.rint((lattice.rest_length / H) ** 2).astype(int)
-    np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 1, 1])[kind] * H / 12, atol=1e-17)
+    np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 5, 5])[kind] * H / 12, atol=1e-17)
+
+
+@cases
+def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(poisson: float, cut: bool):
+    """So that local/global iterations, which solve with it, come nearer."""
+    lattice = solid(3, 2, 2, poisson=poisson)
+    laplacian = np.zeros(2 * (len(lattice.nodes),))
+    for (a, b), k in zip(lattice.springs, lattice.stiffness, strict=True):
+        laplacian[[a, b], [a, b]] += k
+        laplacian[[a, b], [b, a]] -= k
+    h = hessian(Elasticity(COMM, lattice), lattice.nodes)
+    assert np.linalg.eigvalsh(np.kron(laplacian, np.eye(3)) - h).min() > -1e-12 * np.abs(h).max()
 
 
 def test_below_the_onset_the_volume_energy_goes_on_smoothly():

@@ -14,7 +14,7 @@ HISTORY, SIDES = ("history_q", "history_v"), "sides"
 
 
 @dataclass(frozen=True)
-class Ledger:
+class EnergyBudget:
     """Energies that a run keeps account of [J]."""
 
     put_in: float = 0.0  # the most that the body had by right
@@ -29,7 +29,7 @@ class Ledger:
         return min(self.gained, self.steady) / self.put_in if self.put_in else 0.0
 
 
-NO_ENERGY = Ledger()
+NO_ENERGY = EnergyBudget()
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class State:
     q_previous: Positions
     history: tuple[Positions, Rows] | None = None
     sides: Indices | None = None
-    ledger: Ledger = NO_ENERGY  # of energy, as the steps so far have filled it
+    budget: EnergyBudget = NO_ENERGY  # of energy, as the steps so far have filled it
 
     def velocity(self, time_step: float) -> Rows:
         """(l, 3) [m/s]"""
@@ -67,7 +67,7 @@ class State:
             checkpoint.keep(numbers={"history": self.history is not None})
         if has_sides and self.sides is not None:
             rows[SIDES] = 1.0 * self.sides[:, :owned].T
-        checkpoint.keep(rows, vars(self.ledger))
+        checkpoint.keep(rows, vars(self.budget))
 
     @staticmethod
     def restored(comm: MPI.Comm, lattice: Lattice, checkpoint: Checkpoint) -> "State":
@@ -77,7 +77,7 @@ class State:
         history = (last[0], last[1]) if last else None
         sides = _sides(comm, lattice, checkpoint.rows[SIDES]) if SIDES in checkpoint.rows else None
         numbers = {name: checkpoint.number(name, 0.0, *FINITE) for name in vars(NO_ENERGY)}
-        return State(q, q_previous, history, sides, Ledger(**numbers))
+        return State(q, q_previous, history, sides, EnergyBudget(**numbers))
 
 
 def _sides(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Indices:

@@ -26,8 +26,6 @@ class Preset:
     iterations   : a fixed number of them is the method as published; None: to the error target
     inexact      : ksp_rtol is only the tightest that a linear solve is held to: less where the step needs less
     chooses      : pc_type is only what it begins with, where multigrid of the Hessian is not worth its while
-    springs_only : without a line search, its iterations come to an end where the Hessian is below 2 A: that of springs
-                   is, that of a solid has up to 2 + lambda / mu times what A has
     """
 
     about: str
@@ -40,7 +38,6 @@ class Preset:
     inexact: bool = False
     kronecker: bool = False  # A is factored as A (x) I_3, 3m x 3m
     chooses: bool = False
-    springs_only: bool = False
 
 
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
@@ -89,7 +86,6 @@ PRESETS = {
             **LOCAL_GLOBAL,
         },
         inexact=True,
-        springs_only=True,
     ),
     "lbfgs": Preset(
         "Liu et al. 2017: L-BFGS with A as the first Hessian and a line search: between anderson and newton",
@@ -118,7 +114,6 @@ PRESETS = {
             "ksp_rtol": "1e-1",
         },
         inexact=True,
-        springs_only=True,
     ),
     "newton": Preset(
         "Newton's method with the true Hessian and a line search: the default, fastest to nearly any error",
@@ -146,14 +141,12 @@ PRESETS = {
         {**PLAIN, **CHOLESKY},
         extrapolate=False,
         iterations=10,
-        springs_only=True,
     ),
     "fast-msm-kronecker": Preset(
         "The same as the seed paper must have had it: the factor of A (x) I_3, 3m x 3m; only to compare with",
         {**PLAIN, **CHOLESKY},
         extrapolate=False,
         iterations=10,
-        springs_only=True,
         kronecker=True,
     ),
     "paper": Preset(
@@ -169,7 +162,6 @@ PRESETS = {
         start_from_b=True,
         extrapolate=False,
         iterations=10,
-        springs_only=True,
     ),
 }
 

@@ -21,7 +21,6 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.embedding import Embedding
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.scene.body import SOLID
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import Probes
@@ -63,8 +62,6 @@ def refuse_bad_options(comm: MPI.Comm, scene: Scene, probes: Probes) -> None:
     refuse_bad_steps(scene.time)
     if scene.self_contact and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(f"self_contact is for newton's presets, not {scene.solver.preset}")
-    if scene.material.law == SOLID and any(preset.springs_only for preset, _ in solvers.values()):
-        raise InputError(f'material.law = "{SOLID}" is for newton\'s presets and lbfgs, not {scene.solver.preset}')
     if scene.time.error and probes != Probes():
         raise InputError("the true error and the trace are of a step as the scene has it: time.error has others")
     if "" not in solvers:

@@ -4,7 +4,6 @@ written."""
 from contextlib import nullcontext
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from block_scene import block_scene
@@ -174,22 +173,6 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
         assert reason == (reasons.CONVERGED_ITS if budget else rule)
         seen.add(reason)
     assert seen >= {reasons.CONVERGED_SNORM_RELATIVE, reasons.CONVERGED_ITS}
-
-
-SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.45}
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_presets_without_a_line_search_refuse_solids_and_the_others_solve_them(preset: str, tmp_path: Path, capsys):
-    scene = block_scene(tmp_path, **SCENE, material=SOLID, solver={"preset": preset, "error": 1e-3})
-    status = main(["run", str(scene), "-o", str(tmp_path / "o.h5"), "--quiet"])
-    if PRESETS[preset].springs_only:
-        assert status == 2 and f"is for newton's presets and lbfgs, not {preset}" in capsys.readouterr().err
-        assert not (tmp_path / "o.h5").exists()
-    else:
-        assert status == 0
-        with h5py.File(tmp_path / "o.h5") as file:
-            assert 0 < file["frames/step_error"][1:].max() <= 1e-3
 
 
 def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):

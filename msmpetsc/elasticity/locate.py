@@ -5,6 +5,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, to_host
 from msmpetsc.elasticity.cell_volume import least_volumes
+from msmpetsc.lattice.cell_moments import volume_ratios
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -23,9 +24,15 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 
 
 def worst_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> tuple[int, str]:
-    """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective)."""
-    cells = lattice.local_cells[: lattice.cells_owned]
-    volumes = least_volumes(q, cells)
+    """Return how many cells are inverted at q (l, 3) [m], and where the worst is, "" if none is (collective).
+
+    A solid's cell is where what is inside the surface is, in the mean: corners of a sliver may fold far outside.
+    """
+    cells, solid = lattice.local_cells[: lattice.cells_owned], lattice.solid
+    if solid is None:
+        volumes = least_volumes(q, cells)
+    else:
+        volumes = volume_ratios(solid.forms[: len(cells)], q[cells], lattice.cell_size)
     total = comm.allreduce(int((volumes <= 0).sum()))
     if not total:
         return 0, ""
@@ -43,7 +50,8 @@ def describe_inverted(comm: MPI.Comm, lattice: Lattice, q: Positions) -> str:
     count, _ = worst_inverted(comm, lattice, q)
     if not count:
         return ""
-    law = "" if lattice.stiffening > 0 else ' (material.law = "stiffening" resists that)'
+    resists = lattice.stiffening > 0 or lattice.solid is not None
+    law = "" if resists else ' (material.law = "neo-hookean" resists that)'
     return f", {count} cell{'s are' if count > 1 else ' is'} inside out{law}"
 
 

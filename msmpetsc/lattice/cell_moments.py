@@ -71,6 +71,15 @@ def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
     return np.stack(slopes, axis=1), np.stack(modes, axis=1)
 
 
+def volume_ratios(forms: Rows, corners: Rows, cell_size: float) -> Floats:
+    """Return J (c,) of cells: det of the mean slope of positions over what is inside, 1 at rest [-].
+
+    corners : (c, 8, 3) positions [m]
+    """
+    ratios: Floats = np.linalg.det(slopes_and_modes(forms)[0] @ corners / (4 * cell_size))
+    return ratios
+
+
 def laplacians(forms: Rows, volume: Floats) -> Rows:
     """Return the integrals (c, 8, 8) of grad N_a . grad N_b over what is inside of cells, in cell units.
 

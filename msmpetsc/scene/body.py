@@ -99,7 +99,8 @@ class Material(Table):
     stiffness: Positive | None = Field(None, description="the same stiffness for every spring [N/m]")
     density: Positive = Field(description="mass density [kg/m^3]")
     law: Literal["neo-hookean", "linear", "stiffening"] = Field(
-        "linear", description="a solid's, or how springs pull at large strain, whose Poisson's ratio is 1/4"
+        "linear",
+        description="neo-hookean: a solid; linear, stiffening: how springs pull, whose Poisson's ratio is 1/4",
     )
     poisson_ratio: PoissonRatio = Field(0.25, description='of law = "neo-hookean"; tissue has 0.45 to 0.49 [-]')
     stiffening: Positive | None = Field(
@@ -116,7 +117,7 @@ class Material(Table):
     @model_validator(mode="after")
     def _solids_have_no_springs(self) -> Self:
         if self.law == SOLID and self.stiffness is not None:
-            raise rule('is of springs; law = "neo-hookean" takes young_modulus', "stiffness")
+            raise rule('of law = "neo-hookean" takes young_modulus, not stiffness', "stiffness")
         return self
 
     @property

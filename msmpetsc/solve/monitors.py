@@ -94,6 +94,6 @@ class Monitors:
             )
 
     def _remedy(self) -> str:
-        if self.lattice.stiffening > 0:
+        if self.lattice.stiffening > 0 or self.lattice.solid is not None:
             return "a smaller time.step or a smaller solver.error helps to keep them as they were"
-        return 'springs cannot turn them back, material.law = "stiffening" can'
+        return 'springs cannot turn them back, material.law = "neo-hookean" can'

@@ -5,9 +5,11 @@ import pytest
 from lattices import COMM, block, cages_of
 from scipy.spatial.transform import Rotation
 
+from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.elasticity.neo_hookean import ONSET
-from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
+from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes, volume_ratios
 from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
 
 RNG = np.random.default_rng(30)
@@ -173,3 +175,21 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly():
     above, below = (lattice.nodes * [1, 1, ONSET + e] for e in (1e-9, -1e-9))
     np.testing.assert_allclose(gradient(elastic, above), gradient(elastic, below), rtol=1e-6, atol=1e-6 * YOUNG * H**2)
     np.testing.assert_allclose(hessian(elastic, above), hessian(elastic, below), atol=1e-6 * YOUNG * H)
+
+
+def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
+    """A sliver's far corner may fold; the mean deformation gradient of what is inside has the say."""
+    lattice = solid(1, 1, 1, poisson=0.45)
+    points = 0.02 * RNG.random((100, 3)) - 0.5
+    share, squares = moments(points, 10**8)
+    cells = lattice.solid._replace(forms=forms_of(share[None], squares[None]), volume=H**3 * share.mean(keepdims=True))
+    sliver = Lattice(**(vars(lattice) | {"solid": cells}))
+    folded, turn = lattice.nodes.copy(), 1.3 * np.array([[0.9, 0.2, 0], [0.1, 1, 0.3], [0, -0.4, 0.8]])
+    folded[np.argmax(folded.sum(axis=1))] -= 1.2 * H
+    assert least_volumes(folded, lattice.local_cells)[0] < 0
+    assert worst_inverted(COMM, sliver, folded) == (0, "")
+    assert worst_inverted(COMM, sliver, folded * [1, 1, -1])[0] == 1
+    moved = lattice.nodes @ turn.T
+    for each in (sliver, lattice):
+        ratio = volume_ratios(each.solid.forms, moved[lattice.local_cells], H)
+        np.testing.assert_allclose(ratio, np.linalg.det(turn), rtol=1e-13)

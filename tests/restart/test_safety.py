@@ -135,7 +135,7 @@ def test_inverted_cells_are_counted_and_told_with_their_place(tmp_path: Path, ca
     assert of(frames, "inverted").tolist() == [32] * (STEPS + 1)
     told = [record.getMessage() for record in caplog.records if "inside out" in record.getMessage()]
     assert len(told) == 2 and "frame 0 (t = 0 s): 32 cells are inside out, the worst at rest at (" in told[0]
-    assert 'material.law = "stiffening"' in told[0] and "in 7 frames, at most 32; 32 still are" in told[1]
+    assert 'material.law = "neo-hookean"' in told[0] and "in 7 frames, at most 32; 32 still are" in told[1]
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):

@@ -7,7 +7,7 @@ from conftest import ROOT
 pytestmark = pytest.mark.timeout(200)
 
 
-@pytest.mark.parametrize("scene", ["heart_pull", "armadillo_leg"])
+@pytest.mark.parametrize("scene", ["heart_tissue", "armadillo_leg"])
 def test_quick_scenes_are_as_stored(scene: str, capsys):
     outcome = regression.check(scene, 1, False)
     if outcome is None:

@@ -342,7 +342,7 @@ def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
     plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0)
     order, motion = plan.bounds
     assert order == "the cells: no order was seen (cells end inside out); order 1 is taken"
-    assert motion.startswith("the motion: of 6400 cells 7 end inside out") and motion.endswith('"stiffening" may help')
+    assert motion.startswith("the motion: of 6400 cells 7 end inside out") and motion.endswith('"neo-hookean" may help')
     without, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0)
     assert without.bounds == [] and plan.choice.cells >= without.choice.cells
 

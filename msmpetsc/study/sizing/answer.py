@@ -71,8 +71,8 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
     if not finest.inverted:
         return []
     helps = "fewer --frames"
-    if law != "stiffening":
-        helps += ' or material.law = "stiffening"'
+    if law == "linear":
+        helps += ' or material.law = "neo-hookean"'
     found = f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, each lattice in its own way"
     return [f"the motion: {found}; {helps} may help"]
 

@@ -372,7 +372,7 @@ def flight_rows(poisson: float | None) -> lab.Rows:
 def of_both(rows: Callable[[float | None], lab.Rows]) -> lab.Rows:
     """Rows of both laws."""
     for name, poisson in LAWS.items():
-        yield from ({"law": name} | row for row in rows(poisson))
+        yield from ({"law": name, **row} for row in rows(poisson))
 
 
 def bar_rows(mesh: trimesh.Trimesh, exact: float, sizes: tuple[float, ...]) -> lab.Rows:

@@ -6,8 +6,9 @@
 All but the uniform strains are runs of the product; errors are relative.
 """
 
+import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,6 @@ from lab import percent
 import manifold3d
 import numpy as np
 import skfem
-import tetgen
 import trimesh
 from material_study import COMM, SPRINGS, lattice_of
 from petsc4py import PETSc
@@ -29,12 +29,13 @@ import msmpetsc
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
+from msmpetsc.geometry.prepare import prepare
+from msmpetsc.geometry.registry import load
 from msmpetsc.lattice.lattice import Lattice
 
 E, DENSITY, G = 1e6, 1000.0, 9.81  # [Pa], [kg/m^3], [m/s^2]
 POISSON = (0.25, 0.45, 0.49, 0.4999)
-Tables = Mapping[str, Any]
-SHARED = Path("/work/shared")
+Tables = dict[str, Any]
 
 
 class Run(NamedTuple):
@@ -71,7 +72,8 @@ def run(mesh: trimesh.Trimesh | Path, poisson: float | None, **tables: Any) -> R
         simulation = msmpetsc.Simulation(msmpetsc.Scene.of(scene))
         frames = list(simulation.frames())
     assert simulation.model is not None
-    return Run(simulation.model.lattice, simulation.model.surface and simulation.model.surface.points, frames)
+    surface = simulation.model.surface
+    return Run(simulation.model.lattice, None if surface is None else surface.points, frames)
 
 
 def name_of(poisson: float | None) -> str:
@@ -98,28 +100,33 @@ def bent(length: int, across: int, poisson: float | None, load: float) -> Run:
     return run(box(length, 1, 1), poisson, cages={"cell_size": 1 / across}, pin=[held(0, 0, -1)], force=[force])
 
 
+def sag_error(across: int, poisson: float | None, length: int = 10) -> float:
+    """Return the error of a cantilever's tip under a small load, against Timoshenko's beam."""
+    nu, load = 0.25 if poisson is SPRINGS else poisson, 1e-5 * E
+    kappa = 10 * (1 + nu) / (12 + 11 * nu)  # Cowper (1966)
+    exact = load * (length**3 / (3 * E / 12) + length * 2 * (1 + nu) / (kappa * E))
+    return -bent(length, across, poisson, load).moved(length)[2] / exact - 1
+
+
 def cantilever_rows() -> lab.Rows:
-    length, load = 10, 1e-4 * E
     for poisson in (SPRINGS, *POISSON):
-        nu = 0.25 if poisson is SPRINGS else poisson
-        kappa = 10 * (1 + nu) / (12 + 11 * nu)  # Cowper (1966)
-        exact = load * 1e-3 * (length**3 / (3 * E / 12) + length * 2 * (1 + nu) / (kappa * E))
-        row = {"Poisson's ratio": name_of(poisson)}
-        for across in (2, 4):
-            tip = -bent(length, across, poisson, 1e-3 * load).moved(length)[2]
-            row[f"{across} cells"] = percent(tip / exact - 1, 2)
-        yield row
+        errors = {f"{across} cells": percent(sag_error(across, poisson), 2) for across in (2, 4)}
+        yield {"Poisson's ratio": name_of(poisson)} | errors
 
 
-DOWN, BACK = 0.71379, 0.38763  # of the length, Bisshopp and Drucker (1945)
+LENGTH, DOWN, BACK = 20, 0.71379, 0.38763  # the tip's way in lengths, Bisshopp and Drucker (1945)
+
+
+def elastica(across: int, poisson: float | None) -> Run:
+    """Return a cantilever with P L^2 / (E I) = 5."""
+    return bent(LENGTH, across, poisson, 5 * E / 12 / LENGTH**2)
 
 
 def elastica_rows() -> lab.Rows:
-    length = 20
     for poisson in (SPRINGS, 0.25, 0.45, 0.49):
         for across in (2, 4):
-            of = bent(length, across, poisson, 5 * E / 12 / length**2)
-            back, _, down = -of.moved(length) / length
+            of = elastica(across, poisson)
+            back, _, down = -of.moved(LENGTH) / LENGTH
             yield {
                 "Poisson's ratio": name_of(poisson),
                 "cells across": across,
@@ -135,6 +142,8 @@ def elastica_rows() -> lab.Rows:
 
 def tetrahedra(surface: trimesh.Trimesh) -> skfem.MeshTet:
     """Return a tetrahedral mesh of the inside; its first points are those of the surface."""
+    import tetgen  # AGPL: no extra brings it
+
     mesh = tetgen.TetGen(np.asarray(surface.vertices), np.asarray(surface.faces))
     points, cells = mesh.tetrahedralize(order=1, nobisect=True, minratio=1.4, mindihedral=10)[:2]
     assert np.allclose(points[: len(surface.vertices)], surface.vertices)
@@ -166,10 +175,11 @@ def cholesky(K: csr_matrix, f: np.ndarray) -> np.ndarray:
     return x.array.copy()
 
 
-SCAN_E, PUSH = 1e9, [9.81, 0.0, 0.0]
+SCAN_E, PUSH = 1e9, [9.81, 0.0, 0.0]  # [Pa], [m/s^2]: small displacements
+CUT = 0.44  # of the bunny's height
 
 
-def scan_rows(surface: trimesh.Trimesh, exact: np.ndarray) -> lab.Rows:
+def scan_rows(surface: Any, exact: np.ndarray) -> lab.Rows:
     """Relative L2 of the displacement over the surface against ``exact`` (v, 3) [m]."""
     area = np.bincount(surface.faces.ravel(), np.repeat(surface.area_faces / 3, 3))
     for count in (1000, 10_000):
@@ -194,18 +204,19 @@ def fit(u: np.ndarray, exact: np.ndarray, area: np.ndarray) -> float:
 
 
 def rod_rows() -> lab.Rows:
-    rod = trimesh.load(SHARED / "solid" / "rod_cut.ply", process=False)
-    yield from scan_rows(rod, np.load(SHARED / "solid" / "rod_fem.npz")["U"])
+    """Rows of the rod and its finite elements in $MSMPETSC_SOLID."""
+    folder = Path(os.environ.get("MSMPETSC_SOLID", ""))
+    yield from scan_rows(trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"])
 
 
 def bunny_rows() -> lab.Rows:
-    """The upper three quarters of the scan, clamped at the cut."""
-    whole = trimesh.load(SHARED / "cases" / "bunny_cut.ply", process=False)
-    low, high = whole.bounds[:, 2]
-    solid = manifold3d.Manifold(manifold3d.Mesh(whole.vertices.astype("f4"), whole.faces.astype("u4")))
-    cut = solid.trim_by_plane((0, 0, 1), low + (high - low) / 4).simplify(1e-4).to_mesh()
-    base = [0, 0, low + (high - low) / 4]
-    surface = trimesh.Trimesh(cut.vert_properties[:, :3].astype(float) - base, cut.tri_verts, process=False)
+    """Rows of the upper part of the bunny, clamped at the cut."""
+    whole = prepare(load("bunny", lab.SCENES), [{"simplify": 4000}])
+    low, high = whole.points[:, 2].min(), whole.points[:, 2].max()
+    base = low + CUT * (high - low)
+    solid = manifold3d.Manifold(manifold3d.Mesh(whole.points.astype("f4"), whole.triangles.astype("u4")))
+    cut = solid.trim_by_plane((0, 0, 1), base).simplify(1e-4).to_mesh()
+    surface = trimesh.Trimesh(cut.vert_properties[:, :3] - np.array([0, 0, base]), cut.tri_verts, process=False)
     surface.vertices[np.abs(surface.vertices[:, 2]) < 1e-6, 2] = 0
     yield from scan_rows(surface, fem_surface(surface, SCAN_E, 0.25, DENSITY * np.array(PUSH)))
 
@@ -220,15 +231,20 @@ def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
     return mu * (F - inverse) + lame * (J - 1) * J * inverse
 
 
-def free_sides(poisson: float, shape: Callable[[float], np.ndarray], side: int) -> np.ndarray:
-    """Return the deformation gradient of this shape whose normal stress on a side is none."""
-    return shape(brentq(lambda a: textbook(shape(a), poisson)[side, side], 0.1, 10, xtol=1e-15))
+def stretched(poisson: float, s: float, sides: int) -> np.ndarray:
+    """Return the deformation gradient of stretches s along all axes but the last so many, whose faces are free."""
+
+    def shape(free: float) -> np.ndarray:
+        return np.diag([*(3 - sides) * [s], *sides * [free]])
+
+    return shape(brentq(lambda free: textbook(shape(free), poisson)[2, 2], 0.1, 10, xtol=1e-15))
 
 
 def strains(poisson: float) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield names and deformation gradients."""
     for s in (0.5, 1.5):
-        yield f"uniaxial, {s}", free_sides(poisson, lambda a, s=s: np.diag([s, a, a]), 1)
-        yield f"equibiaxial, {s}", free_sides(poisson, lambda a, s=s: np.diag([s, s, a]), 2)
+        yield f"uniaxial, {s}", stretched(poisson, s, 2)
+        yield f"equibiaxial, {s}", stretched(poisson, s, 1)
         yield f"shear, {s}", np.array([[1, s, 0], [0, 1, 0], [0, 0, 1.0]])
     yield "confined, 0.7", np.diag([0.7, 1, 1])
 
@@ -321,26 +337,23 @@ STARTS: dict[str, Tables] = {
     "scattered": {"scatter": 1.0},
     "collapsed": {"scale": [0, 0, 0]},
 }
-TIMES: dict[str, Tables] = {
-    "static": {"integrator": "static"},
-    "implicit Euler": {"step": 1 / 60, "duration": 30, "until": "rest"},
-}
+FALL = {"time": {"step": 1 / 20, "duration": 60, "until": "rest"}, "solver": {"error": 1e-3}}
 
 
-def start_rows() -> lab.Rows:
-    """A clamped bar of 4 x 1 x 1 m without a load."""
-    for start, tables in STARTS.items():
-        for integrator, time in TIMES.items():
-            row = {"start": start, "integrator": integrator}
-            for poisson in (0.25, 0.45, 0.49):
-                row[f"nu {poisson}"] = came_back(poisson, {"start": tables, "time": time})
-            yield row
+def start_rows(tables: Tables) -> lab.Rows:
+    """A clamped bar of 4 x 1 x 1 m without a load: what becomes of it, by Poisson's ratio."""
+    for name, start in STARTS.items():
+        yield {"start": name} | {f"nu {nu}": came_back(nu, tables | {"start": start}) for nu in (0.25, 0.45, 0.49)}
+
+
+def clamped_bar(poisson: float, tables: Tables) -> Run:
+    return run(box(4, 1, 1), poisson, cages={"cell_size": 1 / 4}, pin=[held(0, 0, -1)], **tables)
 
 
 def came_back(poisson: float, tables: Tables) -> str:
     """Return how far the farthest node is from rest [cells], after how many steps and iterations."""
     try:
-        of = run(box(4, 1, 1), poisson, cages={"cell_size": 1 / 4}, pin=[held(0, 0, -1)], **tables)
+        of = clamped_bar(poisson, tables)
     except StepFailed as failure:
         return f"failed: {failure}"[:120]
     far = np.linalg.norm(of.frames[-1].position - of.lattice.nodes, axis=1).max() * 4
@@ -354,9 +367,9 @@ def came_back(poisson: float, tables: Tables) -> str:
 BEAM = lab.SCENES / "studies" / "beam.obj"
 
 
-def beam(poisson: float | None, h: float, time: Tables, g: float = G) -> Run:
+def beam(poisson: float | None, h: float, time: Tables, g: float = G, error: float = 1e-6) -> Run:
     tables = {"gravity": {"acceleration": [0, 0, -g]}, "pin": [held(0, 0, -1)], "material": {"young_modulus": 5e5}}
-    return run(BEAM, poisson, cages={"cell_size": h}, time=time, **tables)
+    return run(BEAM, poisson, cages={"cell_size": h}, time=time, solver={"error": error}, **tables)
 
 
 def rest_rows(*sizes: int) -> lab.Rows:
@@ -378,10 +391,10 @@ def rest_rows(*sizes: int) -> lab.Rows:
 
 
 def swing_rows() -> lab.Rows:
-    time = {"step": 1 / 60, "duration": 0.5}
-    for poisson in (SPRINGS, 0.25, 0.45):
-        for h in (1 / 32, 1 / 70):
-            of = beam(poisson, h, time)
+    time = {"step": 1 / 60, "duration": 0.5}  # as in scenes/studies/beam_soft.toml
+    for poisson, sizes in ((SPRINGS, (1 / 32,)), (0.25, (1 / 32, 1 / 70)), (0.45, (1 / 32, 1 / 70))):
+        for h in sizes:
+            of = beam(poisson, h, time, error=1e-3)
             its = [frame.iterations for frame in of.frames[1:]]
             yield {
                 "Poisson's ratio": name_of(poisson),
@@ -407,7 +420,8 @@ TABLES: dict[str, Callable[[], lab.Rows]] = {
     "strain": strain_rows,
     "pad": lambda: pressed_rows(WIDE / 2),
     "punch": lambda: pressed_rows(WIDE / 4),
-    "starts": start_rows,
+    "starts": lambda: start_rows(FALL),
+    "statics": lambda: start_rows({}),
     "rest": lambda: rest_rows(16, 32),
     "fine": lambda: rest_rows(64),
     "swing": swing_rows,

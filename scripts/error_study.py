@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--at-once 2] [-o PAGE]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT] [--at-once 2] [-o PAGE]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -191,6 +191,7 @@ def main() -> int:
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", type=int)
     options.add_argument("--write", type=Path)
+    options.add_argument("--json", type=Path)
     options.add_argument("--at-once", type=int, default=2)
     args = options.parse_args()
     if args.write:
@@ -203,6 +204,8 @@ def main() -> int:
         return int(bad(row))
     with ThreadPoolExecutor(args.at_once) as pool:
         rows = list(pool.map(partial(measured, args.seed), range(args.scenes)))
+    if args.json:
+        args.json.write_text(json.dumps(rows))
     for row in filter(bad, rows):
         steps = " ".join(f"{said:.2g}/{true:.2g}" for said, true in row["steps"])
         print(f"scene {row['number']}, {row['preset']}, goal {row['goal']}: {steps} {row['said']}", file=sys.stderr)

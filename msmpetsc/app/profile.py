@@ -17,7 +17,7 @@ from msmpetsc.backend.machine import machine
 from msmpetsc.comm import on_root
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
-from msmpetsc.results.disk import write_whole
+from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
 
 if TYPE_CHECKING:  # imports PETSc, which must first be given its options
     from msmpetsc.solve.simulate import TimeLoop
@@ -77,6 +77,18 @@ class Cost:
             "failure": failure and {"kind": failure.kind, "frame": failure.frame, "says": str(failure)},
         }  # fmt: skip
         on_root(comm, lambda: write_whole(path, json.dumps(record, indent=1)))
+
+
+def refuse_unwritable(path: Path | None) -> None:
+    """Raise InputError for a file that cannot be written, before the run rather than after it."""
+    if path:
+        existed = path.exists()
+        with plain_errors(path):
+            refuse_no_file(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            open(path, "a").close()
+            if not existed:
+                path.unlink()
 
 
 def peak_memory() -> int:

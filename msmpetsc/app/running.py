@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from msmpetsc import __version__
 from msmpetsc.app.checkpointing import Checkpoints, Interval, Signals
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.profile import Cost, versions
+from msmpetsc.app.profile import Cost, refuse_unwritable, versions
 from msmpetsc.app.request import FLAGS, RunRequest
 from msmpetsc.app.resume import Resumed, stored_scene
 from msmpetsc.app.summary import log_end, log_model, tell_stop, warn_of_long_steps
@@ -81,6 +81,7 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
     interval = Interval.parsed(request.checkpoint_every)
     scene = comm.bcast(on_root(comm, lambda: read_scene(request, earlier)))
     refuse_bad_options(comm, scene, probes)
+    on_root(comm, lambda: refuse_unwritable(request.measured))
     attributes = attributes_of(comm, scene, request)
     resumed = Resumed(earlier, scene, PETSc.Options().getAll(), request.force) if earlier else None
     return RunPlan(request, scene, probes, interval, resumed, attributes, began)

@@ -1,10 +1,11 @@
-"""Springs that the edge of a clamp cuts.
+"""Springs, and cells of a solid, that the edge of a clamp cuts.
 
 A pin holds nodes, but its region ends between them. Of a spring from a free node to a held one a part theta is free,
 and only that gives: it is 1 / theta as stiff. Where the held node sticks out of the body, as at a clamped face, the
 spring has been made of what is inside, a part sigma of its length (boundary_cells), and is 1 / (sigma theta) as stiff.
 Along a row of cells both are exact, and a clamp askew in the grid is where it should be to second order, as Gibou,
-Fedkiw, Cheng and Kang (2002) have it for the Poisson equation.
+Fedkiw, Cheng and Kang (2002) have it for the Poisson equation. A cell of a solid takes the mean of
+sigma theta over its pairs of a free and a held corner: along the clamp, where that is too much, nothing strains.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from itertools import chain
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Mask, Positions
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions
 from msmpetsc.constraints.coverage import Regions
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
@@ -26,29 +27,48 @@ Within = Callable[[Positions], Mask]  # points (n, 3) [m] -> (n,) bool
 
 
 def clamped(scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions) -> Lattice:
-    """Return the lattice with the springs that pins, and anchors that never let go, cut.
+    """Return the lattice with the springs, or the cells, that pins, and anchors that never let go, cut.
 
     points : (l, 3) of the bodies that nodes are nearest to [m]
     """
-    if lattice.solid is not None:
-        return lattice
     lasting = (table for table in scene.tables("anchor") if table.table.stop is None)
     tables = [t for t in chain(scene.tables("pin"), lasting) if t.table.region.painted is None]
     held = np.any([np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0)
+
+    def stiffer(free: Indices, fast: Indices) -> Floats:
+        """Return how much stiffer (n,) what joins a free node (n,) to a held one (n,) is: 1 / (sigma theta)."""
+        body = lattice.body[free]
+
+        def within(x: Positions) -> Mask:
+            where: Mask = np.any([np.zeros(len(x), bool), *(finder.inside(t, x, body) for t in tables)], axis=0)
+            return where
+
+        start = lattice.nodes[free]
+        theta = _free_part(within, start, lattice.nodes[fast])
+        of_body = _free_part(within, start, points[fast])
+        return np.maximum(of_body / theta**2, 1.0)  # sigma = theta / of_body
+
+    if lattice.solid is not None:
+        return _with_cut_cells(lattice, held, stiffer)
     a, b = lattice.springs.T
     cut = np.flatnonzero(held[a] != held[b])
     fast, free = np.where(held[a], (a, b), (b, a))[:, cut]
-    body = lattice.body[free]
-
-    def within(x: Positions) -> Mask:
-        where: Mask = np.any([np.zeros(len(x), bool), *(finder.inside(table, x, body) for table in tables)], axis=0)
-        return where
-
-    start, end = lattice.nodes[free], lattice.nodes[fast]
-    theta, of_body = _free_part(within, start, end), _free_part(within, start, points[fast])
     stiffness = lattice.stiffness.copy()
-    stiffness[cut] *= np.maximum(of_body / theta**2, 1.0)  # sigma = theta / of_body
+    stiffness[cut] *= stiffer(free, fast)
     return replace(lattice, stiffness=stiffness)
+
+
+def _with_cut_cells(lattice: Lattice, held: Mask, stiffer: Callable[[Indices, Indices], Floats]) -> Lattice:
+    """Return a solid whose cells with free and held corners are stiffer by the mean free part of their pairs."""
+    assert lattice.solid is not None
+    fast, corners = held[lattice.local_cells], lattice.local_cells
+    cell, far, near = np.nonzero(fast[:, :, None] & ~fast[:, None, :])
+    free = 1 / stiffer(corners[cell, near], corners[cell, far])
+    mean = np.ones(len(corners))
+    cut = np.unique(cell)
+    mean[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, free), LEAST**2))[cut]
+    solid = lattice.solid._replace(shear=mean * lattice.solid.shear, lame=mean * lattice.solid.lame)
+    return replace(lattice, solid=solid)
 
 
 def _free_part(within: Within, start: Positions, end: Positions) -> Floats:

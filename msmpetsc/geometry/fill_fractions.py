@@ -60,15 +60,20 @@ class Columns:
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
-        keys, sums = _sums_of_keys(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
-        at = _sums_above(keys // LIMIT, sums[:, :SEEN])
-        below, above = at[:, :4].reshape(-1, 2, 2), at - sums[:, :SEEN]
-        half = 0.5 * above[:, :4]
+        keys = np.unique(np.concatenate([of_part for of_part, _ in parts]))
+        sums = np.zeros((len(keys), SUMS))
+        for of_part, values in parts:  # whose keys are distinct, each
+            sums[np.searchsorted(keys, of_part)] += values
+        above = _sums_above(keys // LIMIT, sums[:, :SEEN])
+        below = 4 * above[:, :4].reshape(-1, 2, 2)
+        above -= sums[:, :SEEN]
+        for first in (SEEN, SEEN + 4):
+            sums[:, first : first + 4] += 0.5 * above[:, :4]
+        corners = 8 * sums[:, SEEN : SEEN + 8].reshape(-1, 2, 4).transpose(0, 2, 1)
         squares: Rows = sums[:, -3:].copy()
-        corners = 8 * np.stack([sums[:, SEEN : SEEN + 4] + half, sums[:, SEEN + 4 : SEEN + 8] + half], axis=2)
         squares[:, :2] += above[:, 4:]
         squares[:, 2] += above[:, :4].sum(axis=1) / 12
-        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), squares, 4 * below)
+        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), squares, below)
 
     @property
     def leak(self) -> float:
@@ -97,7 +102,10 @@ class Columns:
 def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
     """Return the distinct keys (c,) in ascending order, and the sums (c, k) of the rows (p, k) of each."""
     distinct, place = np.unique(keys, return_inverse=True)
-    return distinct, np.stack([np.bincount(place, rows, len(distinct)) for rows in values.T], axis=1)
+    sums: Rows = np.empty((len(distinct), values.shape[1]))
+    for column, rows in enumerate(values.T):
+        sums[:, column] = np.bincount(place, rows, len(distinct))
+    return distinct, sums
 
 
 @numba.njit(cache=True)

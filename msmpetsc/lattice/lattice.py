@@ -105,8 +105,9 @@ class Lattice:
         return self.body_of(self.global_numbers)
 
     def stiffest(self, comm: MPI.Comm) -> float:
-        """Return the greatest stiffness of any spring [N/m] (collective)."""
-        return float(comm.allreduce(self.stiffness.max(initial=0), MPI.MAX))
+        """Return the greatest stiffness of any spring, or of such as a solid would have, [N/m] (collective)."""
+        stiffness = self.stiffness if self.solid is None else self.cell_stiffness
+        return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""

@@ -188,7 +188,7 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert cages.grids.grids[0].shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
-    assert peak < 700 * len(cages.kind)  # bytes, 64 of them a cell's shares
+    assert peak < 800 * len(cages.kind)  # bytes: most while triangles are cut, whose pieces have 17 sums each
 
 
 # --- cages ---

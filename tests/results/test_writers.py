@@ -176,7 +176,6 @@ BY_HAND = re.compile(r"\.write_text\(|\.write_bytes\(|os\.replace\(|\.savefig\(|
 ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
-    "results/layout.py": "the same",
     "cli/commands/new.py": "under the name that the one way gave",
     "export/gltf.py": "the same",
     "study/table.py": "into memory",

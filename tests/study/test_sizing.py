@@ -347,6 +347,12 @@ def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
     assert without.bounds == [] and plan.choice.cells >= without.choice.cells
 
 
+def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "SCENE", SCENE.replace("1e5", '1e5, law = "stiffening"'))
+    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0)
+    assert plan.bounds[-1].endswith("fewer --frames may help")
+
+
 def test_a_plan_says_when_impacts_bound_the_error(tmp_path: Path, monkeypatch):
     """Shorter steps do not come nearer to each other."""
     plan, _, _ = sized(tmp_path, monkeypatch, 0.1, impacts=True)

@@ -8,12 +8,12 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions, greatest
+from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.contact.obstacles.penalty import Contact, Secants
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import ContactBlocks, ThreeColumns, TrueHessian, python_matrix
 from msmpetsc.solve.linear.preconditioner import ContactDiagonal, Preconditioner
-from msmpetsc.solve.linear.system import assemble, diagonal_of
+from msmpetsc.solve.linear.system import assemble
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
@@ -29,7 +29,7 @@ from msmpetsc.solve.presets import Preset, SolverOptions
 class Jacobian:
     """The true Hessian of g, or the constant A = M + t^2 L in its place (Eq. 15-17).
 
-    diagonal : of A (m,), of this rank's free nodes [kg]
+    diagonal : of inertia and the Hessian at rest (m,), of this rank's free nodes; of springs it is that of A [kg]
 
     Raises InputError where A is too large for PETSc, or of a type that does not go with the arrays,
     and for multigrid of the Hessian where the operator is A (collective).
@@ -44,7 +44,7 @@ class Jacobian:
     def __post_init__(self) -> None:
         functional, options, true_hessian = self.functional, self.options, self.preset.true_hessian
         self.comm, self.unknowns, elasticity = functional.comm, functional.unknowns, functional.elasticity
-        self.diagonal = diagonal_of(self.unknowns, functional.time_step)
+        self.diagonal = self._diagonal()
         self.hessian = TrueHessian(self.unknowns, elasticity, functional.time_step, self._contact_blocks())
         self.blocks = None if true_hessian else self._contact_blocks()  # that go with A
         chooses = self.preset.chooses and options.is_default("pc_type")
@@ -89,13 +89,18 @@ class Jacobian:
     def _contact_blocks(self) -> ContactBlocks | None:
         return ContactBlocks(self.unknowns, self.functional.time_step) if self.touches else None
 
-    def _stiffness_ratio(self) -> float:
-        """Return the greatest t^2 k / m of a free node, k the trace of the Hessian's block at rest (collective)."""
-        lattice, free, t2 = self.unknowns.lattice, self.unknowns.free, self.functional.time_step**2
+    def _diagonal(self) -> Floats:
+        """Return by how much free nodes (m,) resist being moved: inertia + t^2 times the trace of their blocks [kg]."""
+        unknowns, lattice = self.unknowns, self.unknowns.lattice
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
-        stiffness = blocks[free][:, [0, 4, 8]].sum(axis=1)
-        return self.comm.allreduce(greatest(t2 * stiffness / lattice.mass[free]), MPI.MAX)
+        stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
+        return unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
+
+    def _stiffness_ratio(self) -> float:
+        """Return the greatest t^2 k / m of a free node (collective)."""
+        mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
+        return self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
 
     def linearise(
         self, q: Positions, contact: Contact | None, projected: bool, secants: Secants | None, known: bool = False

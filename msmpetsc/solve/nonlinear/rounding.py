@@ -19,15 +19,15 @@ HOPELESS = 0.3  # of what its forces move a body: rounding that moves it more le
 class Rounding:
     """Rounding in the steps of one lattice and time step. All methods are collective.
 
-    diagonal : (m,) of A, of each free node of this rank [kg]
+    diagonal : (m,) of each free node of this rank: its inertia, and t^2 times how stiff it is at rest [kg]
     """
 
     def __init__(self, functional: StepFunctional, diagonal: Floats):
         self.functional, self.comm = functional, functional.comm
         self.rows = np.tile(ROUNDINGS * diagonal, 3)  # of F [kg m] for each metre of a coordinate
         stiffness, mass = self.comm.allreduce(np.array([3 * float(diagonal.sum()), float(functional.mass.sum())]))
-        # Springs whose forces are k eps off move the nodes by no more than sqrt(sum t^2 k) eps in the norm of H
-        # where that is positive definite, and in that of M no farther; the diagonal of A is no less than the sum.
+        # Springs or cells whose forces are k eps off move nodes by no more than sqrt(sum t^2 k) eps in the norm of H
+        # where that is positive definite, and in that of M no farther; the diagonal is no less than the sum.
         self.moved, self.size = ROUNDINGS * np.sqrt(stiffness), np.sqrt(mass)
 
     def is_all_of(self, f: PETSc.Vec) -> bool:

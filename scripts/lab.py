@@ -150,6 +150,19 @@ def parser(documentation: str | None) -> ArgumentParser:
     return options
 
 
+def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) -> None:
+    """Print the tables of a study that the command line names, or all."""
+    options = parser(documentation)
+    options.add_argument("tables", nargs="*", metavar="TABLE", help=f"of {', '.join(tables)}; all if none is named")
+    args = options.parse_args()
+    if unknown := set(args.tables) - set(tables):
+        options.error(f"no table {', '.join(sorted(unknown))}: {', '.join(tables)}")
+    with page(args):
+        for name in args.tables or tables:
+            print(f"\n## {name}")
+            table(tables[name]())
+
+
 @contextmanager
 def page(args: Namespace) -> Iterator[None]:
     """Leave what is printed in the file of -o, too, if there is one, below the command, the day and the machine."""

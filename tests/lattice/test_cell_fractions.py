@@ -1,13 +1,15 @@
 """Mass and stiffness of cells that the surface cuts, and bodies that do not lie along the grid against elasticity."""
 
-import runpy
 from functools import cache
 
+from lab import slope
+
+import material_study as study
 import numpy as np
 import pytest
 import trimesh
-from conftest import ROOT
 from mpi4py import MPI
+from strains import uniform_strains
 
 from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
 from msmpetsc.geometry.cages import BodySurface, fill
@@ -15,12 +17,11 @@ from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
 from msmpetsc.lattice.lattice import build_lattice
 
-STUDY = runpy.run_path(str(ROOT / "scripts" / "material_study.py"))
-E, DENSITY = STUDY["E"], STUDY["DENSITY"]
-bar_errors = cache(lambda name, size: STUDY["bar_errors"](*BARS[name], size * STUDY["RADIUS"], "fill")[1])
+E, DENSITY = study.E, study.DENSITY
+bar_errors = cache(lambda name, size: study.bar_errors(*BARS[name], size * study.RADIUS, "fill")[1])
 BARS = {
-    "round": (STUDY["round_bar"](), STUDY["ROUND_SAG"]),
-    "turned": (STUDY["turned_bar"](), STUDY["SQUARE_SAG"]),
+    "round": (study.round_bar(), study.ROUND_SAG),
+    "turned": (study.turned_bar(), study.SQUARE_SAG),
 }
 
 
@@ -44,17 +45,17 @@ def test_springs_have_the_mean_share_of_the_corners_that_agree_with_both_ends():
 def test_uniform_strain_costs_the_energy_of_the_volume_inside():
     """Of a box askew in the grid: u^T H u = C volume of any uniform strain, but for the least share of corners."""
     box = tilted_box()
-    lattice = STUDY["lattice_of"](box, 0.06, "fill")
+    lattice = study.lattice_of(box, 0.06, "fill")
     assert lattice.mass.sum() == pytest.approx(DENSITY * box.volume, rel=1e-3)
-    for _, G, other, exact in STUDY["uniform_strains"]():
+    for _, G, other, exact in uniform_strains():
         u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
-        found = u @ (STUDY["hessian"](lattice) @ v) * DENSITY / lattice.mass.sum()
+        found = u @ (study.hessian(lattice) @ v) * DENSITY / lattice.mass.sum()
         assert found == pytest.approx(exact, rel=1e-10)
 
 
 def test_every_node_has_the_mass_that_its_springs_diagonal_says():
     """So no light corner is stiff: the limit of explicit steps is a whole cell's, and CG brings in no net force."""
-    lattice = STUDY["lattice_of"](tilted_box(), 0.06, "fill")
+    lattice = study.lattice_of(tilted_box(), 0.06, "fill")
     assert lattice.mass.min() < 0.01 * lattice.mass.max()
     diagonal = np.bincount(lattice.springs.ravel(), np.repeat(lattice.stiffness, 2))
     np.testing.assert_allclose(diagonal / lattice.mass, diagonal[0] / lattice.mass[0], rtol=1e-12)
@@ -69,15 +70,15 @@ def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
     errors = np.array([bar_errors(name, size) for size in (0.4, 0.25)])
     assert (errors < 0).all() and errors[0].mean() > -0.105 and errors[1].mean() > -0.055
     assert np.ptp(errors, axis=1).max() < 0.015  # wherever the grid lies
-    assert STUDY["slope"]([0.4, 0.25], errors.mean(axis=1)) > 1.4
-    whole = STUDY["bar_errors"](*BARS[name], 0.4 * STUDY["RADIUS"], "whole")
+    assert slope([0.4, 0.25], errors.mean(axis=1)) > 1.4
+    whole = study.bar_errors(*BARS[name], 0.4 * study.RADIUS, "whole")
     assert whole[1].mean() < 3 * errors[0].mean() and whole[2].mean() > 0.3
 
 
 def test_a_ball_rings_as_lambs():
-    coarse, fine = (STUDY["ball_error"](size * STUDY["RADIUS"], "fill") for size in (1 / 4, 1 / 6))
+    coarse, fine = (study.ball_error(size * study.RADIUS, "fill") for size in (1 / 4, 1 / 6))
     assert -0.07 < coarse[1] < fine[1] < 0 and fine[1] > -0.03
-    assert STUDY["slope"]([1 / 4, 1 / 6], [coarse[1], fine[1]]) > 1.8
+    assert slope([1 / 4, 1 / 6], [coarse[1], fine[1]]) > 1.8
     assert abs(fine[2]) < 2e-4
 
 

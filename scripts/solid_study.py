@@ -1,0 +1,436 @@
+#!/usr/bin/env python3
+"""The neo-Hookean solid of the lattice against theory and finite elements. Needs scikit-fem.
+
+    scripts/solid_study.py [cantilever elastica rod ...] [-o PAGE]
+
+All but the uniform strains are runs of the product; errors are relative.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lab
+from lab import percent
+
+import manifold3d
+import numpy as np
+import skfem
+import trimesh
+from material_study import COMM, SPRINGS, lattice_of
+from petsc4py import PETSc
+from scipy.optimize import brentq
+from scipy.sparse import csr_matrix
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+import msmpetsc
+from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.errors import StepFailed
+from msmpetsc.fields import Frame
+from msmpetsc.geometry.prepare import prepare
+from msmpetsc.geometry.registry import load
+from msmpetsc.lattice.lattice import Lattice
+
+E, DENSITY, G = 1e6, 1000.0, 9.81  # [Pa], [kg/m^3], [m/s^2]
+POISSON = (0.25, 0.45, 0.49, 0.4999)
+Tables = dict[str, Any]
+
+
+class Run(NamedTuple):
+    """A run's lattice, its surface W x at rest (v, 3) [m] if it has one, and its frames."""
+
+    lattice: Lattice
+    surface: np.ndarray | None
+    frames: list[Frame]
+
+    @property
+    def iterations(self) -> int:
+        return sum(frame.iterations for frame in self.frames)
+
+    def moved(self, x: float, axis: int = 0) -> np.ndarray:
+        """Return the mean displacement (3,) [m] of the nodes with this coordinate, by their mass."""
+        rest, at = self.lattice.nodes, np.isclose(self.lattice.nodes[:, axis], x)
+        return np.average((self.frames[-1].position - rest)[at], axis=0, weights=self.lattice.mass[at])
+
+
+def run(mesh: trimesh.Trimesh | Path, poisson: float | None, **tables: Any) -> Run:
+    """Run a scene of a mesh: a state of equilibrium, if ``tables`` do not say otherwise.
+
+    poisson : Poisson's ratio of a neo-Hookean solid, or SPRINGS
+    """
+    law = {"law": "linear"} if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
+    with tempfile.TemporaryDirectory() as folder:
+        source = mesh
+        if isinstance(mesh, trimesh.Trimesh):
+            source = Path(folder) / "body.obj"
+            mesh.export(source, digits=17)
+        scene: dict[str, Any] = {"mesh": {"source": str(source)}, "time": {"integrator": "static"}, **tables}
+        scene["material"] = {"young_modulus": E, "density": DENSITY} | law | scene.get("material", {})
+        scene = {"solver": {"error": 1e-6}, "output": {"surface": False}} | scene
+        simulation = msmpetsc.Simulation(msmpetsc.Scene.of(scene))
+        frames = list(simulation.frames())
+    assert simulation.model is not None
+    surface = simulation.model.surface
+    return Run(simulation.model.lattice, None if surface is None else surface.points, frames)
+
+
+def name_of(poisson: float | None) -> str:
+    return "springs" if poisson is SPRINGS else str(poisson)
+
+
+def box(*sides: float) -> trimesh.Trimesh:
+    """Return a box with a corner at the origin."""
+    return trimesh.creation.box(bounds=[[0, 0, 0], sides])
+
+
+def held(axis: int, at: float, side: int) -> Tables:
+    """Return the region below (-1) or above (1) a plane across an axis."""
+    normal = side * np.eye(3)[axis]
+    return {"region": {"half_space": {"point": [*(at * np.eye(3)[axis] - 1e-6 * normal)], "normal": [*normal]}}}
+
+
+# ---- beams
+
+
+def bent(length: int, across: int, poisson: float | None, load: float) -> Run:
+    """Return a cantilever of thickness 1 m with a load [N] across its end."""
+    force = held(0, length, 1) | {"total": [0, 0, -load]}
+    return run(box(length, 1, 1), poisson, cages={"cell_size": 1 / across}, pin=[held(0, 0, -1)], force=[force])
+
+
+def sag_error(across: int, poisson: float | None, length: int = 10) -> float:
+    """Return the error of a cantilever's tip under a small load, against Timoshenko's beam."""
+    nu, load = 0.25 if poisson is SPRINGS else poisson, 1e-5 * E
+    kappa = 10 * (1 + nu) / (12 + 11 * nu)  # Cowper (1966)
+    exact = load * (length**3 / (3 * E / 12) + length * 2 * (1 + nu) / (kappa * E))
+    return -bent(length, across, poisson, load).moved(length)[2] / exact - 1
+
+
+def cantilever_rows() -> lab.Rows:
+    for poisson in (SPRINGS, *POISSON):
+        errors = {f"{across} cells": percent(sag_error(across, poisson), 2) for across in (2, 4)}
+        yield {"Poisson's ratio": name_of(poisson)} | errors
+
+
+LENGTH, DOWN, BACK = 20, 0.71379, 0.38763  # the tip's way in lengths, Bisshopp and Drucker (1945)
+
+
+def elastica(across: int, poisson: float | None) -> Run:
+    """Return a cantilever with P L^2 / (E I) = 5."""
+    return bent(LENGTH, across, poisson, 5 * E / 12 / LENGTH**2)
+
+
+def elastica_rows() -> lab.Rows:
+    for poisson in (SPRINGS, 0.25, 0.45, 0.49):
+        for across in (2, 4):
+            of = elastica(across, poisson)
+            back, _, down = -of.moved(LENGTH) / LENGTH
+            yield {
+                "Poisson's ratio": name_of(poisson),
+                "cells across": across,
+                "tip down": percent(down / DOWN - 1, 2),
+                "tip back": percent(back / BACK - 1, 2),
+                "tip off, of the length": percent(np.hypot(down - DOWN, back - BACK), 2),
+                "Newton iterations": of.iterations,
+            }
+
+
+# ---- bodies cut by the grid
+
+
+def tetrahedra(surface: trimesh.Trimesh) -> skfem.MeshTet:
+    """Return a tetrahedral mesh of the inside; its first points are those of the surface."""
+    import tetgen  # AGPL: no extra brings it
+
+    mesh = tetgen.TetGen(np.asarray(surface.vertices), np.asarray(surface.faces))
+    points, cells = mesh.tetrahedralize(order=1, nobisect=True, minratio=1.4, mindihedral=10)[:2]
+    assert np.allclose(points[: len(surface.vertices)], surface.vertices)
+    return skfem.MeshTet(points.T.copy(), cells.T.copy())
+
+
+def fem_surface(surface: trimesh.Trimesh, young: float, poisson: float, load: np.ndarray) -> np.ndarray:
+    """Return the linear displacement (v, 3) [m] by quadratic tetrahedra, z = 0 clamped, ``load`` (3,) [N/m^3]."""
+    basis = skfem.Basis(tetrahedra(surface), skfem.ElementVector(skfem.ElementTetP2()))
+    K = linear_elasticity(*lame_parameters(young, poisson)).assemble(basis)
+    f = skfem.LinearForm(lambda v, _: load[0] * v[0] + load[1] * v[1] + load[2] * v[2]).assemble(basis)
+    fixed = basis.get_dofs(basis.mesh.facets_satisfying(lambda x: x[2] < 1e-9, boundaries_only=True))
+    u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=cholesky)
+    return u[basis.nodal_dofs[:, : len(surface.vertices)]].T
+
+
+def cholesky(K: csr_matrix, f: np.ndarray) -> np.ndarray:
+    """Return K^(-1) f by MUMPS, K symmetric positive definite."""
+    matrix = PETSc.Mat().createAIJ(K.shape, csr=(K.indptr.astype("i4"), K.indices.astype("i4"), K.data))
+    matrix.setOption(PETSc.Mat.Option.SPD, True)
+    ksp = PETSc.KSP().create()
+    ksp.setOperators(matrix)
+    ksp.setType("preonly")
+    ksp.getPC().setType("cholesky")
+    ksp.getPC().setFactorSolverType("mumps")
+    x, b = matrix.createVecs()
+    b.array[:] = f
+    ksp.solve(b, x)
+    return x.array.copy()
+
+
+SCAN_E, PUSH = 1e9, [9.81, 0.0, 0.0]  # [Pa], [m/s^2]: small displacements
+CUT = 0.44  # of the bunny's height
+
+
+def scan_rows(surface: Any, exact: np.ndarray) -> lab.Rows:
+    """Relative L2 of the displacement over the surface against ``exact`` (v, 3) [m]."""
+    area = np.bincount(surface.faces.ravel(), np.repeat(surface.area_faces / 3, 3))
+    for count in (1000, 10_000):
+        row: dict[str, object] = {"cells asked": count}
+        for name, poisson in (("springs", SPRINGS), ("neo-Hookean", 0.25)):
+            tables = {"material": {"young_modulus": SCAN_E}, "gravity": {"acceleration": PUSH}, "output": {}}
+            of = run(surface, poisson, cages={"count": count}, pin=[held(2, 0, -1)], **tables)
+            assert of.surface is not None
+            u = of.frames[-1].surface - of.surface
+            error = np.sqrt(area @ ((u - exact) ** 2).sum(axis=1) / (area @ (exact**2).sum(axis=1)))
+            row |= {
+                "cells": len(of.lattice.cells),
+                name: percent(error),
+                f"{name}, best factor": f"{fit(u, exact, area):.3f}",
+            }
+        yield row
+
+
+def fit(u: np.ndarray, exact: np.ndarray, area: np.ndarray) -> float:
+    """Return the factor s of the least difference s exact - u."""
+    return area @ (u * exact).sum(axis=1) / (area @ (exact**2).sum(axis=1))
+
+
+def rod_rows() -> lab.Rows:
+    """Rows of the rod and its finite elements in $MSMPETSC_SOLID."""
+    folder = Path(os.environ.get("MSMPETSC_SOLID", ""))
+    yield from scan_rows(trimesh.load(folder / "rod_cut.ply", process=False), np.load(folder / "rod_fem.npz")["U"])
+
+
+def bunny_rows() -> lab.Rows:
+    """Rows of the upper part of the bunny, clamped at the cut."""
+    whole = prepare(load("bunny", lab.SCENES), [{"simplify": 4000}])
+    low, high = whole.points[:, 2].min(), whole.points[:, 2].max()
+    base = low + CUT * (high - low)
+    solid = manifold3d.Manifold(manifold3d.Mesh(whole.points.astype("f4"), whole.triangles.astype("u4")))
+    cut = solid.trim_by_plane((0, 0, 1), base).simplify(1e-4).to_mesh()
+    surface = trimesh.Trimesh(cut.vert_properties[:, :3] - np.array([0, 0, base]), cut.tri_verts, process=False)
+    surface.vertices[np.abs(surface.vertices[:, 2]) < 1e-6, 2] = 0
+    yield from scan_rows(surface, fem_surface(surface, SCAN_E, 0.25, DENSITY * np.array(PUSH)))
+
+
+# ---- uniform strain
+
+
+def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
+    """Return P = mu (F - F^-T) + lambda (J - 1) J F^-T [Pa]."""
+    lame, mu = lame_parameters(E, poisson)
+    J, inverse = np.linalg.det(F), np.linalg.inv(F).T
+    return mu * (F - inverse) + lame * (J - 1) * J * inverse
+
+
+def stretched(poisson: float, s: float, sides: int) -> np.ndarray:
+    """Return the deformation gradient of stretches s along all axes but the last so many, whose faces are free."""
+
+    def shape(free: float) -> np.ndarray:
+        return np.diag([*(3 - sides) * [s], *sides * [free]])
+
+    return shape(brentq(lambda free: textbook(shape(free), poisson)[2, 2], 0.1, 10, xtol=1e-15))
+
+
+def strains(poisson: float) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield names and deformation gradients."""
+    for s in (0.5, 1.5):
+        yield f"uniaxial, {s}", stretched(poisson, s, 2)
+        yield f"equibiaxial, {s}", stretched(poisson, s, 1)
+        yield f"shear, {s}", np.array([[1, s, 0], [0, 1, 0], [0, 0, 1.0]])
+    yield "confined, 0.7", np.diag([0.7, 1, 1])
+
+
+def strain_error(poisson: float, F: np.ndarray) -> float:
+    """Return the greatest error of the forces on the faces and inside of a block, relative to E times a face."""
+    cells, h = np.array([4, 3, 2]), 0.125
+    lattice = lattice_of(box(*cells * h), h, poisson=poisson)
+    force, sides = np.zeros_like(lattice.nodes), cells * h
+    Elasticity(COMM, lattice).add_gradient(lattice.nodes @ F.T, force)
+    exact, P = np.zeros_like(force), textbook(F, poisson)
+    for axis in range(3):
+        across = np.delete(np.arange(3), axis)
+        ends = np.where(
+            np.isclose(lattice.nodes[:, across], 0) | np.isclose(lattice.nodes[:, across], sides[across]), 0.5, 1
+        )
+        for sign, at in ((-1, 0), (1, sides[axis])):
+            on = np.isclose(lattice.nodes[:, axis], at)
+            exact[on] += sign * h**2 * ends[on].prod(axis=1)[:, None] * P[:, axis]
+    return np.abs(force - exact).max() / np.abs(exact).max()
+
+
+def strain_rows() -> lab.Rows:
+    names = [name for name, _ in strains(0.25)]
+    for name in names:
+        yield {"uniform strain": name} | {
+            f"nu {poisson}": f"{strain_error(poisson, dict(strains(poisson))[name]):.0e}" for poisson in POISSON
+        }
+
+
+# ---- nearly incompressible blocks, pressed
+
+
+WIDE, PRESSED = 2.0, 1e-3  # of the block of height 1 [m], and by how much it is pressed [m]
+
+
+def graded(start: float, stop: float, count: int) -> np.ndarray:
+    """Return places from ``start`` to ``stop``, where they are dense: the stress at an edge of a plate has no bound."""
+    return stop + (start - stop) * np.linspace(1, 0, count + 1) ** 3
+
+
+def fem_force(poisson: float, half: float) -> float:
+    """Return the force [N] on a bonded plate so wide by half, by quadratic hexahedra of a quarter of the block."""
+    x = np.unique(np.concatenate([graded(0, half, 4), graded(WIDE / 2, half, 4 if half < WIDE / 2 else 0)]))
+    z = np.unique(np.concatenate([graded(0.5, 0, 3), graded(0.5, 1, 4)]))
+    mesh = skfem.MeshHex.init_tensor(x, x, z)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=5)
+    K = linear_elasticity(*lame_parameters(E, poisson)).assemble(basis)
+    bottom = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[2], 0)))
+    middles = [
+        basis.get_dofs(mesh.facets_satisfying(lambda x, k=k: np.isclose(x[k], 0))).all(f"u^{k + 1}") for k in (0, 1)
+    ]
+    plate = basis.get_dofs(mesh.facets_satisfying(lambda x: np.isclose(x[2], 1) & (x[0] < half) & (x[1] < half)))
+    u = basis.zeros()
+    u[plate.all("u^3")] = -PRESSED
+    fixed = np.unique(np.concatenate([bottom.all(), plate.all(), *middles]))
+    u = skfem.solve(*skfem.condense(K, basis.zeros(), x=u, D=fixed), solver=cholesky)
+    return -4 * (K @ u)[plate.all("u^3")].sum()
+
+
+def force(poisson: float | None, half: float, high: int) -> float:
+    """Return the force [N] on the plate by a lattice ``high`` cells high."""
+    corners = [[WIDE / 2 - half, WIDE / 2 - half, 1 - 1e-6], [WIDE / 2 + half, WIDE / 2 + half, 1 + 1e-6]]
+    anchor = {"region": {"box": corners}, "path": [{"time": 1, "by": [0, 0, -PRESSED]}]}
+    tables = {"pin": [held(2, 0, -1)], "anchor": [anchor], "time": {"integrator": "static", "step": 1, "duration": 1}}
+    of = run(box(WIDE, WIDE, 1), poisson, cages={"cell_size": 1 / high}, **tables)
+    gradient = np.zeros_like(of.lattice.nodes)
+    Elasticity(COMM, of.lattice).add_gradient(of.frames[-1].position, gradient)
+    return -gradient[np.isclose(of.lattice.nodes[:, 2], 1), 2].sum()
+
+
+def pressed_rows(half: float) -> lab.Rows:
+    for poisson in (0.45, 0.49):
+        exact = fem_force(poisson, half)
+        row = {
+            "Poisson's ratio": str(poisson),
+            "quadratic FEM [N]": exact,
+            "springs, 8 cells": percent(force(SPRINGS, half, 8) / exact - 1),
+        }
+        yield row | {f"{high} cells": percent(force(poisson, half, high) / exact - 1) for high in (4, 8, 16)}
+
+
+# ---- starts from which a body has to come back
+
+
+STARTS: dict[str, Tables] = {
+    "twisted by 720 degrees": {"twist": {"axis": [1, 0, 0], "degrees": 720}},
+    "pressed to 30%": {"scale": [0.3, 1, 1]},
+    "mirrored": {"scale": [-1, 1, 1]},
+    "scattered": {"scatter": 1.0},
+    "collapsed": {"scale": [0, 0, 0]},
+}
+FALL = {"time": {"step": 1 / 20, "duration": 60, "until": "rest"}, "solver": {"error": 1e-3}}
+
+
+def start_rows(tables: Tables) -> lab.Rows:
+    """A clamped bar of 4 x 1 x 1 m without a load: what becomes of it, by Poisson's ratio."""
+    for name, start in STARTS.items():
+        yield {"start": name} | {f"nu {nu}": came_back(nu, tables | {"start": start}) for nu in (0.25, 0.45, 0.49)}
+
+
+def clamped_bar(poisson: float, tables: Tables) -> Run:
+    return run(box(4, 1, 1), poisson, cages={"cell_size": 1 / 2}, pin=[held(0, 0, -1)], **tables)
+
+
+def came_back(poisson: float, tables: Tables) -> str:
+    """Return how far the farthest node is from rest [cells], after how many steps and iterations."""
+    try:
+        of = clamped_bar(poisson, tables)
+    except StepFailed as failure:
+        return f"failed: {failure}"[:120]
+    far = np.linalg.norm(of.frames[-1].position - of.lattice.nodes, axis=1).max() * 2
+    last = of.frames[-1]
+    return f"{far:.0e}; {of.iterations} its in {last.index} steps; {last.inverted} inside out"
+
+
+# ---- the soft beam
+
+
+BEAM = lab.SCENES / "studies" / "beam.obj"
+
+
+def beam(poisson: float | None, h: float, time: Tables, g: float = G, error: float = 1e-6) -> Run:
+    tables = {"gravity": {"acceleration": [0, 0, -g]}, "pin": [held(0, 0, -1)], "material": {"young_modulus": 5e5}}
+    return run(BEAM, poisson, cages={"cell_size": h}, time=time, solver={"error": error}, **tables)
+
+
+def rest_rows(*sizes: int) -> lab.Rows:
+    """Of so many cells a depth."""
+    for cells in sizes:
+        for g, poisson in ((1, 0.25), (2, 0.25), (1, 0.45), (2, 0.45)):
+            of = beam(poisson, 0.5 / cells, {"integrator": "static"}, g * G)
+            yield {
+                "g": g,
+                "Poisson's ratio": str(poisson),
+                "h / depth": f"1/{cells}",
+                "cells": len(of.lattice.cells),
+                "tip [m]": f"{-of.moved(1.25)[2]:.4f}",
+                "Newton iterations": of.iterations,
+                "CG": of.frames[-1].ksp_its,
+                "inside out": of.frames[-1].inverted,
+                "seconds": of.frames[-1].wall_time,
+            }
+
+
+def swing_rows() -> lab.Rows:
+    time = {"step": 1 / 60, "duration": 0.5}  # as in scenes/studies/beam_soft.toml
+    for poisson, sizes in ((SPRINGS, (1 / 32,)), (0.25, (1 / 32, 1.25 / 87)), (0.45, (1 / 32, 1.25 / 87))):
+        for h in sizes:
+            of = beam(poisson, h, time, error=1e-3)
+            its = [frame.iterations for frame in of.frames[1:]]
+            yield {
+                "Poisson's ratio": name_of(poisson),
+                "cells": len(of.lattice.cells),
+                "Newton iterations a frame: mean": float(np.mean(its)),
+                "most": max(its),
+                "most cells inside out": max(frame.inverted for frame in of.frames),
+                "tip at the end [m]": f"{-of.moved(1.25)[2]:.4f}",
+                "lowest [m]": f"{-min(tip(of, frame) for frame in of.frames):.4f}",
+                "seconds a frame": float(np.mean([frame.wall_time for frame in of.frames[1:]])),
+            }
+
+
+def tip(of: Run, frame: Frame) -> float:
+    return of._replace(frames=[frame]).moved(1.25)[2]
+
+
+TABLES: dict[str, Callable[[], lab.Rows]] = {
+    "cantilever": cantilever_rows,
+    "elastica": elastica_rows,
+    "rod": rod_rows,
+    "bunny": bunny_rows,
+    "strain": strain_rows,
+    "pad": lambda: pressed_rows(WIDE / 2),
+    "punch": lambda: pressed_rows(WIDE / 4),
+    "starts": lambda: start_rows(FALL),
+    "statics": lambda: start_rows({}),
+    "rest": lambda: rest_rows(16, 32),
+    "fine": lambda: rest_rows(64),
+    "swing": swing_rows,
+}
+
+
+def main() -> None:
+    lab.tables(__doc__, TABLES)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""Uniform strains of a lattice at rest, and what an isotropic solid of Poisson's ratio 1/4 has of them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from material_study import DENSITY, E, hessian
+
+from msmpetsc.lattice.lattice import Lattice
+
+C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E  # [Pa]
+
+
+def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> float:
+    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3, 3)."""
+    u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
+    return u @ (hessian(lattice) @ v) * DENSITY / lattice.mass.sum()
+
+
+def uniform_strains() -> Iterator[tuple[str, np.ndarray, np.ndarray, float]]:
+    """Name, two displacement gradients, and what u^T H v / volume is in an isotropic solid of nu = 1/4 [Pa]."""
+    x, y, z = np.eye(3)
+    yield "C11: stretch along an edge", np.outer(x, x), np.outer(x, x), C11
+    yield "C12: stretch along one edge against another", np.outer(x, x), np.outer(y, y), C12
+    yield "C44: shear", np.outer(x, y), np.outer(x, y), C44
+    turned = {"(1,1,0)": (x + y, z), "(1,1,1)": (x + y + z, x - y), "(3,2,6)": (3 * x + 2 * y + 6 * z, 2 * x - 3 * y)}
+    for name, pair in turned.items():
+        d, across = (direction / np.linalg.norm(direction) for direction in pair)
+        yield f"C11 along {name}", np.outer(d, d), np.outer(d, d), C11
+        yield f"C12 along {name}", np.outer(d, d), np.outer(across, across), C12
+        yield f"C44 along {name}", np.outer(d, across), np.outer(d, across), C44

@@ -182,6 +182,7 @@ def to_device(model: Model, send: Callable[[Array], Array]) -> Model:
         ),
         loads=[replace(load, force=send(load.force)) for load in model.loads],
         anchors=[replace(anchor, where=send(anchor.where)) for anchor in model.anchors],
+        holders=replace(model.holders, number=send(model.holders.number)),
         exchanges=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.exchanges],
         penalties=[replace(contact, obstacle=contact.obstacle.sent(send)) for contact in model.penalties],
         start=(send(positions), send(velocities)),

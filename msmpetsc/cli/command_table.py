@@ -272,7 +272,7 @@ COMMANDS = {
     ),
     "series": Command(
         "print energies, forces and places of probes of a result, a row a frame",
-        ("msmpetsc series out/my.h5 -o out/my.csv", "msmpetsc series out/my.h5 | cut -d, -f1,3"),
+        ("msmpetsc series out/my.h5 -o out/my.csv", "msmpetsc series out/my.h5 > out/my.csv"),
         (
             argument("result", metavar="OUT.h5", type=checked_file),
             argument("-o", "--output", metavar="FILE.csv", type=checked_file, help="default: print them"),

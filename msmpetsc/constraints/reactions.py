@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Mask, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Rows, to_host
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class Holders:
 
 
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
-    """Return the sums (count, 3) of vectors (n, 3) by their numbers (n,); those of other numbers are left out."""
-    sums: Rows = np.stack([np.bincount(number, column, count + 1)[:count] for column in vectors.T], axis=1, dtype=float)
+    """Return the sums (count, 3) of vectors (n, 3) by their numbers (n,), which are where these are."""
+    sums = np.zeros((count, 3))
+    for which in range(count):
+        sums[which] = to_host(vectors[number == which].sum(axis=0))
     return sums

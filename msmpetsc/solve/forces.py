@@ -43,7 +43,7 @@ class Forces:
         if step and problem:
             held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
         held *= environment.fixed_at(time)[:owned, None]
-        sums = {"reaction": self.model.holders.totals(to_host(held)), "load": to_host(load).sum(axis=0), **pushes}
+        sums = {"reaction": self.model.holders.totals(held), "load": to_host(load.sum(axis=0)), **pushes}
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
@@ -54,9 +54,11 @@ class Forces:
             which = next(k for k, penalty in enumerate(penalties) if penalty.obstacle is state.obstacle)
             gradient = np.zeros_like(q[:owned])
             state.add_gradient(q[:owned], gradient)
-            push[self.pushing[which]] -= to_host(gradient).sum(axis=0)
-        own = np.zeros_like(q[:owned])
-        if contact and contact.surface:
-            contact.surface.add_gradient(q, own)
+            push[self.pushing[which]] -= to_host(gradient.sum(axis=0))
         bodies = len(lattice.first_of_body)
-        return {"push": push, "contact_push": -sums_by(lattice.body[:owned], to_host(own), bodies)}
+        touching = np.zeros((bodies, 3))
+        if contact and contact.surface:
+            own = np.zeros_like(q[:owned])
+            contact.surface.add_gradient(q, own)
+            touching -= sums_by(lattice.body[:owned], own, bodies)
+        return {"push": push, "contact_push": touching}

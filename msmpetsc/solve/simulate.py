@@ -105,6 +105,10 @@ class TimeLoop:
         self.steps, self.every, self.step = scene.time.steps, scene.output.every, 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
         self.trace: dict | None = None
+        points = [probe.point for probe in scene.output.probe]
+        self.probe = (
+            ProbePoints(comm, model.lattice, points) if points else None
+        )  # or refused, before PETSc has objects
         self.environment, self.elasticity = Environment(model), Elasticity(comm, model.lattice)
         make = partial(make_integrator, comm, self.environment)
         swings = scene.time.integrator != "implicit-euler"
@@ -118,8 +122,6 @@ class TimeLoop:
         self.monitors = Monitors(comm, model.lattice)
         self.rest = Rest(comm, scene, model, self.environment) if scene.time.until == "rest" else None
         self.surface = SurfaceMotion(comm, model.lattice, model.embedding) if model.embedding else None
-        points = [probe.point for probe in scene.output.probe]
-        self.probe = ProbePoints(comm, model.lattice, points) if points else None
         self.forces = Forces(scene, model, self.environment, self.elasticity)
         solid = self.elasticity.solid if scene.output.stress else None
         self.stress = StressField(model.lattice, solid) if solid else None

@@ -26,7 +26,7 @@ from msmpetsc.cli.main import main  # noqa: E402
 from msmpetsc.results.reader import finished  # noqa: E402
 from msmpetsc.results.writer import ResultFile  # noqa: E402
 from msmpetsc.scene.reading import load_scene  # noqa: E402
-from msmpetsc.solve.simulate import TimeLoop  # noqa: E402, F401
+from msmpetsc.solve.simulate import REMEMBERED, TimeLoop  # noqa: E402, F401
 
 stored = Value("i", 0, lock=False)  # frames that the child's file had when `append` returned
 append = ResultFile.append
@@ -57,6 +57,11 @@ def run(arguments: list[str], limit: float | None = None) -> int | None:
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return None
+
+
+def kept(frames: int, every: int) -> int:
+    """Of so many frames those that a run keeps as it goes on: what comes after its checkpoint it takes again."""
+    return (frames - 1) * every // REMEMBERED * REMEMBERED // every + 1 if frames else 0
 
 
 def fault(path: Path, whole: Path, least: int) -> str | None:
@@ -91,7 +96,7 @@ def chain(
                 seen["kills"] += 1
                 seen["before the file"] += not path.exists()
                 seen["at frame"].append(stored.value)
-            wrong = fault(path, whole, stored.value)
+            wrong = fault(path, whole, kept(stored.value, every))
             if wrong or status:
                 seen["faults"].append(f"after {seen['kills']} kills: {wrong or status}")
         if finished(h5py.File(path, locking=False)) != finished(h5py.File(whole)):
@@ -104,7 +109,7 @@ if __name__ == "__main__":
     scene, folder, kills, seed = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
     ResultFile.append, chance = told, random.Random(seed)
     seen = {"kills": 0, "chains": 0, "before the file": 0, "at frame": [], "faults": []}
-    duration = load_scene(scene).time.duration
+    duration, every = load_scene(scene).time.duration, load_scene(scene).output.every
     longer = ["--force", "--set", f"time.duration={1.5 * duration}"]
     whole, whole_longer = folder / "whole.h5", folder / "longer.h5"
     assert run(["run", scene, "-o", str(whole)]) == 0 and run(["run", scene, "-o", str(whole_longer), *longer[1:]]) == 0

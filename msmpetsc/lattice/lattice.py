@@ -136,19 +136,10 @@ def build_lattice(
     """
     h, net = cages.grids.cell_size, topology or topology_of(cages)
     kept, cells_owned = _kept_cells(net.cells, len(net.octants), stiffening > 0 or poisson is not None)
-    solid = None
-    if poisson is None:
-        mass, of_spring, of_cell = _sums(net, h, density, stiffness or young_modulus, of_cells)
+    if poisson is not None:
+        mass, of_spring, of_cell, solid = _solid(net, h, _made_of(net, of_cells, density, young_modulus, poisson), kept)
     else:
-        assert young_modulus is not None
-        uniform = CellMaterial.uniform(len(net.cells), density, young_modulus, poisson)
-        made_of = of_cells(net.ijk[net.cells[:, 0]]) if of_cells else uniform
-        mass, of_spring, of_cell, solid = _solid(net, h, made_of)
-        solid = SolidCells(*(rows[kept] for rows in solid))
-    if stiffness is None:
-        if solid is None:
-            of_spring = calibrated_stiffness(of_spring, h, net.kind, net.sharing)
-        of_cell = edge_stiffness(of_cell, h)
+        mass, of_spring, of_cell, solid = *_of_springs(net, h, density, stiffness, young_modulus, of_cells), None
     return Lattice(
         table=net.table,
         cell_size=h,
@@ -221,6 +212,17 @@ def topology_of(cages: Cages) -> Topology:
     return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *_springs(cells, numbers, owned))
 
 
+def _of_springs(
+    net: Topology, h: float, density: float, stiffness: float | None, young_modulus: float | None,
+    of_cells: Callable[[Indices], CellMaterial] | None,
+) -> tuple[Floats, float | Floats, float | Floats]:  # fmt: skip
+    """Return the mass (owned,) [kg], and the stiffness of each spring and of an edge among cells like each [N/m]."""
+    if stiffness is not None:
+        return _sums(net, h, density, stiffness, of_cells)
+    mass, of_spring, of_cell = _sums(net, h, density, young_modulus, of_cells)
+    return mass, calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
+
+
 def _sums(
     net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[Indices], CellMaterial] | None
 ) -> tuple[Floats, float | Floats, float | Floats]:
@@ -232,7 +234,7 @@ def _sums(
     if of_cells is None and net.share is None:
         return density * h**3 / 8 * net.octants.sum(axis=1), given, given
     owned, cells = len(net.octants), len(net.cells)
-    made_of = of_cells(net.ijk[net.cells[:, 0]]) if of_cells else CellMaterial.uniform(cells, density, given)
+    made_of = _made_of(net, of_cells, density, given)
     share = np.ones((cells, 8)) if net.share is None else net.share
     of_pairs = shares_of_pairs(share)
     of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
@@ -241,9 +243,22 @@ def _sums(
     return mass, of_spring, share.mean(axis=1) * made_of.spring
 
 
-def _solid(net: Topology, h: float, made_of: CellMaterial) -> tuple[Floats, Floats, Floats, SolidCells]:
-    """Return the mass (owned,) [kg], the springs (s,) [N/m] of the constant L, Young's modulus of cells by what is
-    inside (c,) [Pa], and the cells (lattice.cell_moments).
+def _made_of(
+    net: Topology, of_cells: Callable[[Indices], CellMaterial] | None, density: float, spring: float | None,
+    poisson: float = 0.25,
+) -> CellMaterial:  # fmt: skip
+    """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
+    if of_cells:
+        return of_cells(net.ijk[net.cells[:, 0]])
+    assert spring is not None
+    return CellMaterial.uniform(len(net.cells), density, spring, poisson)
+
+
+def _solid(
+    net: Topology, h: float, made_of: CellMaterial, kept: Indices
+) -> tuple[Floats, float | Floats, float | Floats, SolidCells]:
+    """Return the mass (owned,) [kg], the springs (s,) [N/m] of the constant L, the stiffness (c,) [N/m] of an edge
+    among such cells, by what is inside, and of those that are kept what the law takes (lattice.cell_moments).
 
     As with springs each corner's mass goes as the diagonal of L.
     """
@@ -260,8 +275,8 @@ def _solid(net: Topology, h: float, made_of: CellMaterial) -> tuple[Floats, Floa
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
     of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
-    inside: Floats = volume * made_of.spring
-    return mass, of_spring, inside, SolidCells(forms, h**3 * volume, shear, lame)
+    cells = SolidCells(*(rows[kept] for rows in (forms, h**3 * volume, shear, lame)))
+    return mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells
 
 
 def _kept_cells(local_cells: Indices, owned: int, all_around: bool) -> tuple[Indices, int]:

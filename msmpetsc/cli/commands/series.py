@@ -6,7 +6,7 @@ import sys
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result, plain_damage, refuse_deadly
-from msmpetsc.results.series import series_text
+from msmpetsc.results.time_series import series_text
 from msmpetsc.view.drawable import read_scene
 
 

@@ -17,16 +17,16 @@ SERIES = (
 )  # fmt: skip
 
 
-class Column(NamedTuple):
+class NamedSeries(NamedTuple):
     """A column: its name with its unit, and a number a frame (T,)."""
 
     name: str
     values: Floats
 
 
-def columns_of(run: Result, scene: SceneFile) -> Iterator[Column]:
+def columns_of(run: Result, scene: SceneFile) -> Iterator[NamedSeries]:
     """Yield the columns of a result, the time first. Raises InputError where they are not those of the scene."""
-    yield Column("time [s]", run.frames.time[:])
+    yield NamedSeries("time [s]", run.frames.time[:])
     names = {
         "reaction": [table.key for table in held_by(scene)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
@@ -43,7 +43,7 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[Column]:
         for row, whose in enumerate(of_rows):
             for axis, letter in enumerate(axes):
                 words = " ".join(filter(None, [name, whose, letter]))
-                yield Column(f"{words} [{array.unit}]", values[:, row, axis])
+                yield NamedSeries(f"{words} [{array.unit}]", values[:, row, axis])
 
 
 def series_text(run: Result, scene: SceneFile) -> str:

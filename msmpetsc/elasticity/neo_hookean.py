@@ -74,6 +74,12 @@ def _cofactors(f: Nine) -> Nine:
 
 
 @numba.njit(cache=True, inline="always")
+def _determinant(f: Nine, n: Nine) -> float:
+    """Return det F by its first row and that of its cofactors n."""
+    return f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+
+
+@numba.njit(cache=True, inline="always")
 def _inner(a: Nine, b: Nine) -> float:
     rows = a[0] * b[0] + a[1] * b[1] + a[2] * b[2], a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
     return rows[0] + rows[1] + (a[6] * b[6] + a[7] * b[7] + a[8] * b[8])
@@ -199,7 +205,7 @@ def _gradient_lanes(w: Floats, h4: float) -> None:
         g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
         m, lame = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
         n, over = _cofactors(g), 1.0 / h4
-        j = (g[0] * n[0] + g[1] * n[1] + g[2] * n[2]) * (over * over * over)
+        j = _determinant(g, n) * (over * over * over)
         slope = over * _slopes(j, m, lame)[0]
         x = m * g[0] + slope * n[0], m * g[1] + slope * n[1], m * g[2] + slope * n[2]
         y = m * g[3] + slope * n[3], m * g[4] + slope * n[4], m * g[5] + slope * n[5]
@@ -225,7 +231,7 @@ def _state_lanes(w: Floats, over: float, projected: bool) -> None:
     for lane in range(LANES):
         f = _gradient_of(w, lane, over)
         m, lame, n = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], _cofactors(f)
-        j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+        j = _determinant(f, n)
         slope, curvature = _slopes(j, m, lame)
         if projected:
             most = m / _borne(f, j, slope, ONSET)
@@ -264,7 +270,7 @@ def energy_of_lane(w: Floats, lane: int, h4: float) -> float:
     """Return the energy [J] of a lane's cell, 0 at rest."""
     f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
     n = _cofactors(f)
-    j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+    j = _determinant(f, n)
     volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
     return 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
 
@@ -296,8 +302,8 @@ def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Po
         for lane in range(LANES):
             d, f, m = _gradient_of(w, lane, 1.0 / h4), _gradient_of(w_base, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
             n, n_d = _cofactors(f), _cofactors(d)
-            before = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
-            more = _inner(n, d) + _inner(f, n_d) + d[0] * n_d[0] + d[1] * n_d[1] + d[2] * n_d[2]
+            before = _determinant(f, n)
+            more = _inner(n, d) + _inner(f, n_d) + _determinant(d, n_d)
             if m > 0.0:
                 volume = _volume_change(before + more, before, more, m, w[CONSTANTS + 112 + lane])
                 change += _quadratic(w, w_mean, lane) + h4 * h4 * volume
@@ -345,7 +351,7 @@ def add_concavity(blocks: Blocks, h4: float, q: Positions, concavity: Floats) ->
         for lane in range(LANES):
             f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
             n = _cofactors(f)
-            j = f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
+            j = _determinant(f, n)
             slope = _slopes(j, m, w[CONSTANTS + 112 + lane])[0]
             lost = max(abs(slope) * _borne(f, j, slope, CONVEX) - m, 0.0)
             for a in range(8):

@@ -1,6 +1,8 @@
 """Selection of nodes or cells a scene means by a region, and the materials of the parts that regions make.
 
-A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is.
+A region means material: a node is where its body is nearest to it, a cell where the middle of what is inside is. Where
+skin widens from a clamp's edge, nodes just past that are nearest to skin that is free. So of nodes that lie in the
+region themselves those count, too, that have it half a cell away: else a clamp were too small by half a cell.
 """
 
 from collections.abc import Callable
@@ -16,6 +18,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
 from msmpetsc.geometry.inside import frame_of, inside_bodies
+from msmpetsc.geometry.nearest import nearest_in_bodies
 from msmpetsc.lattice.cell_fractions import CORNERS
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import CellMaterial
@@ -55,6 +58,7 @@ class Finder:
         if region.painted is None:
             where = self.inside(table, points, lattice.body)
             around = self.inside(table, lattice.nodes, lattice.body)
+            where = where | self._at_edge(table, lattice, around & ~where)
         else:
             keys = np.unique(encode_morton(self._painted_cells(table)[:, None, :] + CORNERS))
             nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
@@ -67,6 +71,16 @@ class Finder:
                 "%s.region only grazes the body: it means %d nodes, not %d that stick out into it from beside it%s",
                 table.key, found, near, self._beside(table),
             )  # fmt: skip
+        return where
+
+    def _at_edge(self, table: OfBody, lattice: Lattice, beside: Mask) -> Mask:
+        """Return which nodes beside a region's, (l,) bool, have it half a cell away along the grid (collective)."""
+        rows, sides = np.flatnonzero(beside), np.concatenate([np.eye(3), -np.eye(3)])
+        half_way = lattice.nodes[rows, None] + self.cages.grids.cell_size / 2 * sides
+        body = np.repeat(lattice.body[rows], len(sides))
+        nearest = nearest_in_bodies(self.bodies, half_way.reshape(-1, 3), body)
+        where = np.zeros_like(beside)
+        where[rows] = self.inside(table, nearest, body).reshape(-1, len(sides)).any(axis=1)
         return where
 
     def inside(self, table: OfBody, points: Positions, body: Indices) -> Mask:

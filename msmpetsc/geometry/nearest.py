@@ -11,7 +11,7 @@ from msmpetsc.geometry.surface import Surface, is_inside
 
 
 def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
-    """Return the point (n, 3) [m] of its body (n,) that each point (n, 3) is nearest to: itself, inside (collective)."""
+    """Return the point (n, 3) [m] of its body (n,) that each (n, 3) is nearest to: itself, inside (collective)."""
     to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
     nearest, of_point = to_root.send(points), to_root.send(body)
     for number in np.unique(of_point):

@@ -52,6 +52,7 @@ class Model:
     start     : positions (l, 3) [m] and velocities (l, 3) [m/s] at time 0, ghosts included
     surface   : of all bodies, one after the other
     damping   : of velocities, by the mass [1/s]
+    retardation : viscosity over stiffness [s]
     collision : the surface that meets itself, where it does
     obstacles : in the scene's order
     holders   : pins and anchors, and which nodes each has
@@ -70,6 +71,7 @@ class Model:
     bodies: tuple[BodySurface, ...] = ()
     reaches: tuple[Reach, ...] = ()
     damping: float = 0.0
+    retardation: float = 0.0
     own_forces: tuple[OwnForce, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     holders: Holders = field(default_factory=lambda: Holders((), np.zeros(0, np.int64)))
@@ -159,6 +161,7 @@ def build_model(comm: MPI.Comm, scene: Scene, shape: Geometry | None = None) -> 
         collision=collision_surface(scene.self_contact, scene, bodies, cages, lattice) if scene.self_contact else None,
         reaches=reaches,
         damping=scene.material.damping,
+        retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
         holders=Holders.of_masks({table.key: masks[table.key] for table in held_by(scene)}, lattice.owned),
     )

@@ -29,6 +29,7 @@ class Environment:
     def __init__(self, model: Model):
         self.lattice, self.loads, self.anchors = model.lattice, model.loads, model.anchors
         self.damping = model.damping  # of velocities, by the mass [1/s]
+        self.retardation = model.retardation  # viscosity over stiffness [s]
         self.pulling: list[Load | OwnForce] = [*model.loads, *model.own_forces]
         self.own_forces, self._own = model.own_forces, [np.zeros((0, 3))] * len(model.own_forces)
         self.penalties, self.exchanges = model.penalties, model.exchanges

@@ -34,6 +34,7 @@ from msmpetsc.elasticity.cell_lanes import (
     CONSTANTS,
     FAST,
     LANES,
+    RESULT,
     STATE,
     WORK,
     Blocks,
@@ -223,6 +224,58 @@ def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> Non
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         _gradient_lanes(w, h4)
+        scatter(blocks.nodes, b, w, gradient)
+
+
+@numba.njit(cache=True)
+def _turn(before: Nine, after: Nine) -> tuple[float, float, float]:
+    """Return the axis, times the sine of the angle, by which a cell turns that goes from one F to another.
+
+    Of after = R before, with B = before before^T and a small turn s, R B - (R B)^T is the matrix of (tr B - B) s.
+    """
+    b = (
+        before[0] ** 2 + before[1] ** 2 + before[2] ** 2,
+        before[0] * before[3] + before[1] * before[4] + before[2] * before[5],
+        before[0] * before[6] + before[1] * before[7] + before[2] * before[8],
+        before[3] ** 2 + before[4] ** 2 + before[5] ** 2,
+        before[3] * before[6] + before[4] * before[7] + before[5] * before[8],
+        before[6] ** 2 + before[7] ** 2 + before[8] ** 2,
+    )
+    m = b[3] + b[5], -b[1], -b[2], -b[1], b[0] + b[5], -b[4], -b[2], -b[4], b[0] + b[3]
+    n = _cofactors(m)
+    over = 1.0 / max(_determinant(m, n), 1e-300)
+    x = after[6] * before[3] + after[7] * before[4] + after[8] * before[5]
+    x -= after[3] * before[6] + after[4] * before[7] + after[5] * before[8]
+    y = after[0] * before[6] + after[1] * before[7] + after[2] * before[8]
+    y -= after[6] * before[0] + after[7] * before[1] + after[8] * before[2]
+    z = after[3] * before[0] + after[4] * before[1] + after[5] * before[2]
+    z -= after[0] * before[3] + after[1] * before[4] + after[2] * before[5]
+    return (
+        over * (n[0] * x + n[1] * y + n[2] * z),
+        over * (n[3] * x + n[4] * y + n[5] * z),
+        over * (n[6] * x + n[7] * y + n[8] * z),
+    )
+
+
+@numba.njit(cache=True)
+def add_turned_gradient(blocks: Blocks, h4: float, q: Positions, ahead: Positions, gradient: Rows) -> None:
+    """Add grad E [N] at q (l, 3) [m], each cell's part turned as the cell turns from there to ``ahead`` (l, 3)."""
+    w, w_ahead = np.zeros(WORK), np.zeros(WORK)
+    for b in range(len(blocks.nodes)):
+        for values, work in ((q, w), (ahead, w_ahead)):
+            gather(blocks.nodes, b, values, work)
+            load(blocks.constants, blocks.which[b], work, CONSTANTS)
+        _gradient_lanes(w, h4)
+        for lane in range(LANES):
+            s = _turn(_gradient_of(w, lane, 1.0 / h4), _gradient_of(w_ahead, lane, 1.0 / h4))
+            rest = 1.0 / (1.0 + math.sqrt(max(1.0 - s[0] ** 2 - s[1] ** 2 - s[2] ** 2, 0.0)))
+            for a in range(8):
+                i = RESULT + 24 * a + lane
+                x, y, z = w[i], w[i + 8], w[i + 16]
+                t = s[1] * z - s[2] * y, s[2] * x - s[0] * z, s[0] * y - s[1] * x
+                w[i] += t[0] + rest * (s[1] * t[2] - s[2] * t[1])
+                w[i + 8] += t[1] + rest * (s[2] * t[0] - s[0] * t[2])
+                w[i + 16] += t[2] + rest * (s[0] * t[1] - s[1] * t[0])
         scatter(blocks.nodes, b, w, gradient)
 
 
@@ -473,6 +526,12 @@ class NeoHookean:
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
         add_gradient(self.blocks, self.h4, q, gradient)
+
+    def turned_gradient(self, q: Positions, ahead: Positions) -> Rows:
+        """Return grad E (l, 3) [N] at q (l, 3) [m], in axes that turn with each cell from there to ``ahead`` (l, 3)."""
+        gradient = np.zeros_like(q)
+        add_turned_gradient(self.blocks, self.h4, q, ahead, gradient)
+        return gradient
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""

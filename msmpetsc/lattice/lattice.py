@@ -109,6 +109,12 @@ class Lattice:
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
+    def stiffened(self, factor: float) -> "Lattice":
+        """Return this solid's lattice with a stiffness so many times as large."""
+        assert self.solid is not None
+        solid = self.solid._replace(shear=factor * self.solid.shear, lame=factor * self.solid.lame)
+        return replace(self, stiffness=factor * self.stiffness, solid=solid)
+
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""
         return replace(self, pinned=self.pinned | where)

@@ -110,9 +110,12 @@ class Material(Table):
     damping: NotNegative = Field(
         0.0, description="of velocities, by the mass: what nothing else moves slows down as exp(-damping t) [1/s]"
     )
+    retardation_time: NotNegative = Field(
+        0.0, description='of law = "neo-hookean": its viscosity over its stiffness, as of Kelvin and Voigt\'s solid [s]'
+    )
 
     _has_a_use = field_validator("stiffening")(only_for("law", "stiffening"))
-    _is_of_solids = field_validator("poisson_ratio")(only_for("law", "neo-hookean"))
+    _is_of_solids = field_validator("poisson_ratio", "retardation_time")(only_for("law", "neo-hookean"))
 
     @model_validator(mode="after")
     def _solids_have_no_springs(self) -> Self:

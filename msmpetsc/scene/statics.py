@@ -40,6 +40,9 @@ def _changes(load: dict[str, Any]) -> bool:
 def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
     """Yield the rules that tables of a scene break by its integrator."""
     integrator = scene.time.integrator
+    if scene.material.retardation_time and integrator not in IMPLICIT:
+        words = f'may not have integrator = "{integrator}" where material.retardation_time is given: '
+        yield "time", rule(f'{words}"implicit-euler" and "bdf2" have', "material")
     if integrator == STATIC:
         yield from _moving(scene)
     if scene.self_contact and integrator not in IMPLICIT:

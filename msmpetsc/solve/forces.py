@@ -37,9 +37,11 @@ class Forces:
         held, load = np.zeros_like(q), environment.load(time)
         pushes = self._pushes(q, contact)
         self.elasticity.add_gradient(q, held)
+        if step:
+            held *= step.counts
         if contact:
             contact.add_gradient(q, held)
-        held = held[:owned] - load
+        held = held[:owned] - (problem.load if problem else load)
         if step and problem:
             held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
         held *= environment.fixed_at(time)[:owned, None]

@@ -41,12 +41,13 @@ def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
-@pytest.mark.parametrize("damping", [0.0, 3.0])
-def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping):
+@pytest.mark.parametrize(("damping", "retardation_time"), [(0.0, 0.0), (3.0, 0.0), (3.0, 0.02)])
+def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping, retardation_time):
     """Lifted against a plate that rubs: of implicit Euler the change of momentum; damping takes its part."""
     scene = block_scene(
-        tmp_path, **TIGHT, material=SOLID | {"damping": damping}, anchor=LIFT, obstacle=[PLATE],
+        tmp_path, **TIGHT, anchor=LIFT, obstacle=[PLATE],
         time={"step": 0.01, "duration": 0.03, "integrator": integrator},
+        material=SOLID | {"damping": damping, "retardation_time": retardation_time},
     )  # fmt: skip
     _, frames = play(scene)
     p = [frame.momentum for frame in frames]

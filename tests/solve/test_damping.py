@@ -1,10 +1,12 @@
-"""Damping by the mass: decay in free flight, the speed of a fall, a swing's energy, the equation of a step."""
+"""Damping by the mass, and by viscosity: decay in free flight, a swing's energy, creep, a solid that spins."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 from block_scene import block_scene, play
+
+from msmpetsc.errors import InputError
 
 ALPHA, STEP = 3.0, 1 / 64  # [1/s], [s]
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
@@ -53,3 +55,44 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
     expected = np.exp(-ALPHA * np.arange(60, 121) / 400)
     assert np.abs(ratio / expected - 1).max() < 0.1
     assert "nowhere" not in caplog.text
+
+
+SOLID = {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"}
+RETARDATION = 0.1  # [s]
+
+
+def viscous(folder: Path, integrator: str, step: float, duration: float, retardation: float, **tables) -> Path:
+    time = {"step": step, "duration": duration, "integrator": integrator}
+    return block_scene(folder, time=time, material=SOLID | {"retardation_time": retardation}, **tables)
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
+    """Under a force that comes at once it gives as 1 - exp(-t / beta); its inertia takes 1/70 of beta."""
+    top = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
+    pulled = {"pin": [{"region": FOOT}], "force": [{"region": top, "total": [0, 0, 50.0]}]}
+    model, frames = play(viscous(tmp_path, integrator, RETARDATION / 50, 3 * RETARDATION, RETARDATION, **pulled))
+    at_rest = play(block_scene(tmp_path, material=SOLID, time={"integrator": "static"}, **pulled))[1][-1]
+    moved = [model.lattice.mass @ (frame.position - model.lattice.nodes)[:, 2] for frame in (*frames, at_rest)]
+    given = np.array(moved[:-1]) / moved[-1]
+    expected = 1 - np.exp(-np.array([frame.time for frame in frames]) / RETARDATION)
+    assert np.abs(given - expected).max() < 0.03 and abs(given[-1] - expected[-1]) < 0.002
+
+
+def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
+    """Stretched by its spin of 20 / s: forces that did not turn along took 87% of it; these err by t^2."""
+    model, frames = play(viscous(tmp_path, "bdf2", 1 / 400, 0.25, RETARDATION, start={"spin": [0, 0, 20.0]}))
+
+    def angular(k: int) -> float:
+        v = (3 * frames[k].position - 4 * frames[k - 1].position + frames[k - 2].position) / (2 / 400)
+        x = frames[k].position - np.average(frames[k].position, axis=0, weights=model.lattice.mass)
+        return model.lattice.mass @ np.cross(x, v)[:, 2]
+
+    assert angular(len(frames) - 1) == pytest.approx(angular(2), rel=1e-2)
+    assert (np.diff([frame.elastic for frame in frames[2:]]) > 0).all()  # it creeps, without a swing
+
+
+@pytest.mark.parametrize("integrator", ["verlet", "static"])
+def test_viscosity_is_of_implicit_steps(tmp_path: Path, integrator: str):
+    with pytest.raises(InputError, match=r"retardation_time"):
+        play(viscous(tmp_path, integrator, 0.01, 0.01, RETARDATION))

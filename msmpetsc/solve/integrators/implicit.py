@@ -10,6 +10,10 @@ to x, and y = c + tau w
 
 which is the same problem after division by 1 + alpha tau: of y = c + tau w / (1 + alpha tau), and with
 tau^2 / (1 + alpha tau) for tau^2. So a step costs as much, and what nothing else moves slows down by 1 + alpha tau.
+
+A solid of Kelvin and Voigt has in each cell beta times the rate of its stress beside that, beta its retardation time.
+The forces are beta d/dt grad E, in axes that turn with the cell: to turn costs nothing. With (grad E(x) - c) / tau for
+that, c of grad E as y is of q, E counts 1 + beta / tau times, and beta / tau c is one more load: the same problem.
 """
 
 from dataclasses import replace
@@ -51,7 +55,7 @@ class ImplicitEuler(Integrator):
     ):
         self.comm, self.environment, self.solver, self.probes, self.prefix = comm, environment, solver, probes, prefix
         self.time_step = time.step
-        self.damping = environment.damping
+        self.damping, self.retardation = environment.damping, environment.retardation
         self.tau = self._first_tau()
         self.anchors = environment.anchors_at(self.time_step)
         self.stepper = self._new_stepper(self.time_step)
@@ -66,6 +70,21 @@ class ImplicitEuler(Integrator):
     def damped_tau(self) -> float:
         """The tau of the problem that is solved, tau where nothing is damped [s]."""
         return self.tau / float(np.sqrt(1 + self.damping * self.tau))
+
+    @property
+    def counts(self) -> float:
+        """How many times E counts in the problem that is solved."""
+        return 1 + self.retardation / self.tau if self.retardation else 1.0
+
+    def _viscous_load(self, problem: StepProblem, q_before: Positions | None) -> Rows:
+        """Return what viscosity carries on of the stress of the states before (owned, 3) [N]."""
+        elasticity = self.stepper.functional.elasticity  # of E as often as it counts
+        assert elasticity.solid is not None
+        carried = elasticity.solid.turned_gradient(problem.q, problem.y)
+        if q_before is not None:
+            carried = (4 * carried - elasticity.solid.turned_gradient(q_before, problem.y)) / 3
+        share: Rows = (1 - 1 / self.counts) * carried[: len(problem.load)]
+        return problem.load + share
 
     def _carried(self, duration: float) -> float:
         """Return how far a velocity carries in a time step [s] under damping."""
@@ -104,10 +123,12 @@ class ImplicitEuler(Integrator):
         begun = self.stepper.work_so_far()
         while not faces.is_settled:
             self.problem = faces.problem()
+            if self.retardation:
+                self.problem = replace(self.problem, load=self._viscous_load(self.problem, q_before))
             result = self.stepper.step(self.problem)
             faces.compare(result.position)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        return replace(result, cost=cost, problem=self.problem, tau=self.damped_tau), faces.sides
+        return replace(result, cost=cost, problem=self.problem, tau=self.damped_tau, counts=self.counts), faces.sides
 
     def follow(self) -> None:
         self.trace = Trace()
@@ -127,10 +148,10 @@ class ImplicitEuler(Integrator):
 
     def _new_stepper(self, time: float) -> Stepper:
         """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""
-        solver = self.solver
+        solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
         return Stepper(
             self.comm,
-            self.environment.lattice.pin(self.environment.fixed_at(time)),
+            lattice.stiffened(self.counts) if self.retardation else lattice,
             self.damped_tau,
             find_preset(solver.preset),
             solver.error,

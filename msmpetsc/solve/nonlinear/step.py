@@ -49,6 +49,7 @@ class StepResult:
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     problem    : that was solved, of F = M (x - y) + tau^2 (grad E - f_ext); None of explicit steps. Statics have no M
+    counts     : how many times E counts in it
     """
 
     position: Positions  # (l, 3) [m], ghosts included
@@ -61,6 +62,7 @@ class StepResult:
     time_error: float = np.nan
     problem: StepProblem | None = None
     tau: float = np.inf  # [s]
+    counts: float = 1.0
 
 
 @dataclass(eq=False)

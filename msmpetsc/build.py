@@ -29,7 +29,7 @@ from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of, check_encloses, compact, examine, joined
 from msmpetsc.lattice.initial_state import InitialState, initial_state
-from msmpetsc.lattice.lattice import Lattice, build_lattice, topology_of
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice, topology_of
 from msmpetsc.lattice.region import Finder, cell_materials
 from msmpetsc.scene.bodies import OfBody, held_by
 from msmpetsc.scene.motion import ForceTable, Gravity
@@ -257,17 +257,11 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 
 
 def _lattice(scene: Scene, shape: Geometry, finder: Finder) -> Lattice:
-    material = scene.material
-    return build_lattice(
-        shape.cages,
-        material.density,
-        young_modulus=material.young_modulus,
-        stiffness=material.stiffness,
-        stiffening=material.law_stiffening,
-        of_cells=cell_materials(scene, finder),
-        topology=shape.topology,
-        poisson=material.poisson,
+    own = scene.material
+    material = LatticeMaterial(
+        own.density, own.young_modulus, own.stiffness, own.law_stiffening, own.poisson, cell_materials(scene, finder)
     )
+    return build_lattice(shape.cages, material, shape.topology)
 
 
 def _anchors(tables: Iterable[OfBody], lattice: Lattice, masks: Regions) -> list[Anchor]:

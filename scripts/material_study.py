@@ -28,7 +28,7 @@ from scipy.special import spherical_jn
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -60,7 +60,7 @@ def lattice_of(
     surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
     bounds = np.array([surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)])
     cages = fill([BodySurface(COMM, surface, examine(surface), bounds)], h, boundary=boundary)
-    return build_lattice(cages, DENSITY, young_modulus=E, poisson=poisson)
+    return build_lattice(cages, LatticeMaterial(DENSITY, young_modulus=E, poisson=poisson))
 
 
 def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS) -> Lattice:

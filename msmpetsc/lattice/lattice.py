@@ -120,52 +120,53 @@ class Lattice:
         return replace(self, pinned=self.pinned | where)
 
 
-def build_lattice(
-    cages: Cages,
-    density: float,
-    young_modulus: float | None = None,
-    stiffness: float | None = None,
-    stiffening: float = 0.0,
-    of_cells: Callable[[Indices], CellMaterial] | None = None,
-    topology: "Topology | None" = None,
-    poisson: float | None = None,
-) -> Lattice:
-    """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
+class LatticeMaterial(NamedTuple):
+    """What a lattice is made of.
 
     density       : [kg/m^3]; a whole cell gives an eighth of its mass to each corner
     young_modulus : [Pa] for calibrated springs (material.calibrated_stiffness), or
     stiffness     : [N/m] for every spring, as in the paper
     stiffening    : of the springs' law (elasticity.springs) [-]
-    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (lattice.region)
-    topology      : that of the cages, where it is known already
     poisson       : Poisson's ratio of a neo-Hookean solid [-]; None for springs
+    of_cells      : from the grid index (c, 3) of cells to what each is made of, in place of the above (lattice.region)
     """
-    h, net = cages.grids.cell_size, topology or topology_of(cages)
-    kept, cells_owned = _kept_cells(net.cells, len(net.octants), stiffening > 0 or poisson is not None)
-    if poisson is not None:
-        mass, of_spring, of_cell, solid = _solid(net, h, _made_of(net, of_cells, density, young_modulus, poisson), kept)
-    else:
-        mass, of_spring, of_cell, solid = *_of_springs(net, h, density, stiffness, young_modulus, of_cells), None
+
+    density: float
+    young_modulus: float | None = None
+    stiffness: float | None = None
+    stiffening: float = 0.0
+    poisson: float | None = None
+    of_cells: Callable[[Indices], CellMaterial] | None = None
+
+
+def build_lattice(cages: Cages, material: LatticeMaterial, topology: "Topology | None" = None) -> Lattice:
+    """Build masses and springs of the valid cells, of a boundary cell what is inside (boundary_cells) (collective).
+
+    topology : that of the cages, where it is known already
+    """
+    h, net, is_solid = cages.grids.cell_size, topology or topology_of(cages), material.poisson is not None
+    kept, cells_owned = _kept_cells(net.cells, len(net.octants), material.stiffening > 0 or is_solid)
+    law = _solid(net, h, material, kept) if is_solid else _of_springs(net, h, material)
     return Lattice(
         table=net.table,
         cell_size=h,
         nodes=cages.grids.node_positions(net.ijk),
         ghosts=net.ghosts,
-        mass=mass,
+        mass=law.mass,
         cells=net.corners,
         cell_kind=cages.kind,
         cell_share=np.ones(len(cages.kind)) if cages.share is None else cages.share.mean(axis=(1, 2, 3)),
         springs=net.springs,
         springs_owned=net.springs_owned,
         rest_length=h * np.sqrt(net.kind),
-        stiffness=np.broadcast_to(of_spring, len(net.springs)).copy(),
+        stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
         pinned=np.zeros(len(net.ijk), bool),
-        stiffening=stiffening,
+        stiffening=material.stiffening,
         local_cells=net.cells[kept],
         cells_owned=cells_owned,
-        cell_stiffness=np.broadcast_to(of_cell, len(net.cells))[kept],
-        first_of_body=_first_of_body(cages, net.ijk[: len(mass)]),
-        solid=solid,
+        cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
+        first_of_body=_first_of_body(cages, net.ijk[: len(law.mass)]),
+        solid=law.solid,
     )
 
 
@@ -218,57 +219,57 @@ def topology_of(cages: Cages) -> Topology:
     return Topology(table, corners, ijk, octants, ghosts, cells, share, squares, *_springs(cells, numbers, owned))
 
 
-def _of_springs(
-    net: Topology, h: float, density: float, stiffness: float | None, young_modulus: float | None,
-    of_cells: Callable[[Indices], CellMaterial] | None,
-) -> tuple[Floats, float | Floats, float | Floats]:  # fmt: skip
-    """Return the mass (owned,) [kg], and the stiffness of each spring and of an edge among cells like each [N/m]."""
-    if stiffness is not None:
-        return _sums(net, h, density, stiffness, of_cells)
-    mass, of_spring, of_cell = _sums(net, h, density, young_modulus, of_cells)
-    return mass, calibrated_stiffness(of_spring, h, net.kind, net.sharing), edge_stiffness(of_cell, h)
+class LawConstants(NamedTuple):
+    """What a lattice has of its material, of all cells around a rank's nodes.
 
-
-def _sums(
-    net: Topology, h: float, density: float, given: float | None, of_cells: Callable[[Indices], CellMaterial] | None
-) -> tuple[Floats, float | Floats, float | Floats]:
-    """Return the mass (owned,) [kg], and what the material gives for springs, of each spring and of each cell.
-
-    given : Young's modulus [Pa] or stiffness [N/m], where all cells are alike that of all springs and cells
+    mass    : (owned,) [kg]
+    springs : (s,) stiffness [N/m], or one for all; of a solid that of the constant L
+    cells   : (c,) stiffness [N/m] of an edge among cells like each, or one for all
+    solid   : of the cells that are kept; None of springs
     """
-    assert given is not None
-    if of_cells is None and net.share is None:
-        return density * h**3 / 8 * net.octants.sum(axis=1), given, given
+
+    mass: Floats
+    springs: float | Floats
+    cells: float | Floats
+    solid: SolidCells | None = None
+
+
+def _of_springs(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
+    law = _sums(net, h, material)
+    if material.stiffness is not None:
+        return law
+    springs = calibrated_stiffness(law.springs, h, net.kind, net.sharing)
+    return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
+
+
+def _sums(net: Topology, h: float, material: LatticeMaterial) -> LawConstants:
+    """Return the mass, and what the material gives for springs: Young's modulus [Pa] or stiffness [N/m]."""
+    if material.of_cells is None and net.share is None:
+        given = material.stiffness or material.young_modulus
+        assert given is not None
+        return LawConstants(material.density * h**3 / 8 * net.octants.sum(axis=1), given, given)
     owned, cells = len(net.octants), len(net.cells)
-    made_of = _made_of(net, of_cells, density, given)
+    made_of = _made_of(net, material)
     share = np.ones((cells, 8)) if net.share is None else net.share
     of_pairs = shares_of_pairs(share)
     of_corners = made_of.density[:, None] * shares_of_mass(of_pairs)
     mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     of_spring = _sums_of_springs(net.cells, made_of.spring, of_pairs, net.ijk, net.springs, owned) / net.sharing
-    return mass, of_spring, share.mean(axis=1) * made_of.spring
+    return LawConstants(mass, of_spring, share.mean(axis=1) * made_of.spring)
 
 
-def _made_of(
-    net: Topology, of_cells: Callable[[Indices], CellMaterial] | None, density: float, spring: float | None,
-    poisson: float = 0.25,
-) -> CellMaterial:  # fmt: skip
+def _made_of(net: Topology, material: LatticeMaterial) -> CellMaterial:
     """Return what the cells around a rank's nodes are made of, all alike where no function tells."""
-    if of_cells:
-        return of_cells(net.ijk[net.cells[:, 0]])
+    if material.of_cells:
+        return material.of_cells(net.ijk[net.cells[:, 0]])
+    spring = material.stiffness or material.young_modulus
     assert spring is not None
-    return CellMaterial.uniform(len(net.cells), density, spring, poisson)
+    return CellMaterial.uniform(len(net.cells), material.density, spring, material.poisson or 0.0)
 
 
-def _solid(
-    net: Topology, h: float, made_of: CellMaterial, kept: Indices
-) -> tuple[Floats, float | Floats, float | Floats, SolidCells]:
-    """Return the mass (owned,) [kg], the springs (s,) [N/m] of the constant L, the stiffness (c,) [N/m] of an edge
-    among such cells, by what is inside, and of those that are kept what the law takes (lattice.cell_moments).
-
-    As with springs each corner's mass goes as the diagonal of L.
-    """
-    owned, count = len(net.octants), len(net.cells)
+def _solid(net: Topology, h: float, material: LatticeMaterial, kept: Indices) -> LawConstants:
+    """Return the constants of a solid: as with springs each corner's mass goes as the diagonal of L."""
+    owned, count, made_of = len(net.octants), len(net.cells), _made_of(net, material)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
     if net.share is None or net.squares is None:
         forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
@@ -282,7 +283,7 @@ def _solid(
     most = 2 * shear + 3 * lame  # of |grad u|^2 in the second variation at rest
     of_spring = _sums_of_springs(net.cells, -h * most, pairs, net.ijk, net.springs, owned)
     cells = SolidCells(*(rows[kept] for rows in (forms, h**3 * volume, shear, lame)))
-    return mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells
+    return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
 
 
 def _kept_cells(local_cells: Indices, owned: int, all_around: bool) -> tuple[Indices, int]:

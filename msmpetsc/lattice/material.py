@@ -32,7 +32,7 @@ class CellMaterial:
     poisson: Floats
 
     @classmethod
-    def uniform(cls, count: int, density: float, spring: float, poisson: float = 0.25) -> "CellMaterial":
+    def uniform(cls, count: int, density: float, spring: float, poisson: float) -> "CellMaterial":
         """Return that of cells that are all alike."""
         return cls(np.full(count, density), np.full(count, spring), np.full(count, poisson))
 

@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.comm import sample_of, splitters_of
 from msmpetsc.geometry.cages import BodySurface, Cages, choose_cell_size, fill
 from msmpetsc.geometry.interior import Slab
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.scene.body import CagesTable
 
 MOST = 1 << 40  # cells: the scene's own limit is for runs
@@ -102,7 +102,7 @@ def partition_of(bodies: Sequence[BodySurface], wanted: CagesTable, ranks: int, 
     else:
         size = choose_cell_size(bodies, min(wanted.count or most, most), wanted.method, MOST, wanted.boundary)
     cages = fill(bodies, size, wanted.method, MOST, wanted.boundary)
-    partition = count_partition(bodies, cages, build_lattice(cages, 1.0, 1.0), ranks)
+    partition = count_partition(bodies, cages, build_lattice(cages, LatticeMaterial(1.0, 1.0)), ranks)
     counted = int(partition.cells.sum())
     if guess > most:
         cells = wanted.count

@@ -20,7 +20,7 @@ from msmpetsc.elasticity.cell_volume import (
 )
 from msmpetsc.elasticity.energy import ONSET, RESISTANCE, Elasticity
 from msmpetsc.errors import StepFailed
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.lattice.material import edge_stiffness
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -32,7 +32,9 @@ STIFFENING = 10.0
 
 
 def lattice_of(*sides: int, stiffening: float = STIFFENING) -> Lattice:
-    return build_lattice(cages_of(block(*sides), H), DENSITY, young_modulus=YOUNG, stiffening=stiffening)
+    return build_lattice(
+        cages_of(block(*sides), H), LatticeMaterial(DENSITY, young_modulus=YOUNG, stiffening=stiffening)
+    )
 
 
 SMALL = lattice_of(2, 2, 1)

@@ -10,7 +10,7 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.elasticity.neo_hookean import ONSET
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes, volume_ratios
-from msmpetsc.lattice.lattice import Lattice, SolidCells, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, SolidCells, build_lattice
 
 RNG = np.random.default_rng(30)
 YOUNG, H = 3e4, 0.1
@@ -30,7 +30,7 @@ def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 def solid(*sides: int, poisson: float, cut: bool = False) -> Lattice:
     """A block of whole or of randomly cut cells."""
-    lattice = build_lattice(cages_of(block(*sides), H), 1000.0, young_modulus=YOUNG, poisson=poisson)
+    lattice = build_lattice(cages_of(block(*sides), H), LatticeMaterial(1000.0, young_modulus=YOUNG, poisson=poisson))
     if not cut:
         return lattice
     share, squares = map(
@@ -152,7 +152,7 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
     """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are 1."""
-    lattice = build_lattice(cages_of(block(1, 1, 1), H), 1000.0, young_modulus=2.5, poisson=0.25)
+    lattice = build_lattice(cages_of(block(1, 1, 1), H), LatticeMaterial(1000.0, young_modulus=2.5, poisson=0.25))
     kind = np.rint((lattice.rest_length / H) ** 2).astype(int)
     np.testing.assert_allclose(lattice.stiffness, np.array([0, 0, 5, 5])[kind] * H / 12, atol=1e-17)
 

@@ -15,7 +15,7 @@ from msmpetsc.comm import SortedKeys
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import BodyGrids, Grid, encode_morton
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.lattice.material import CellMaterial
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -104,7 +104,9 @@ def build(
         return replace(uniform, spring=np.where(ijk[:, 0] > middle, contrast, 1.0) * young)
 
     more = {"stiffening": stiffening, "poisson": poisson}
-    lattice = build_lattice(cages, density, young, of_cells=of_cells if contrast != 1 else None, **more)
+    lattice = build_lattice(
+        cages, LatticeMaterial(density, young, of_cells=of_cells if contrast != 1 else None, **more)
+    )
     low = comm.allreduce(lattice.nodes[:, 0].min(initial=np.inf), MPI.MIN)
     return lattice.pin(lattice.nodes[:, 0] < low + 0.01 * CELL) if pins else lattice
 

@@ -15,7 +15,7 @@ from msmpetsc.contact.obstacles.outside import distance_outside, nearest_of_body
 from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.lattice.cell_fractions import CORNERS, shares_of_mass, shares_of_pairs
-from msmpetsc.lattice.lattice import build_lattice
+from msmpetsc.lattice.lattice import LatticeMaterial, build_lattice
 
 E, DENSITY = study.E, study.DENSITY
 bar_errors = cache(lambda name, size: study.bar_errors(*BARS[name], size * study.RADIUS, "fill")[1])
@@ -89,7 +89,7 @@ def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_do
     surface = Surface(*(np.array(part) for part in (BALL.vertices, BALL.faces)))
     body = BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(BALL.bounds))
     cages = fill([body], 0.2)
-    lattice = build_lattice(cages, DENSITY, E)
+    lattice = build_lattice(cages, LatticeMaterial(DENSITY, E))
     outside = distance_outside(lattice, nearest_of_body([body], cages, lattice))
     np.testing.assert_allclose(outside, np.maximum(np.linalg.norm(lattice.nodes, axis=1) - 1, 0), atol=2e-3)
     for normal in np.random.default_rng(0).standard_normal((50, 3)):

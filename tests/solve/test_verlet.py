@@ -15,7 +15,7 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.initial_state import at_rest
-from msmpetsc.lattice.lattice import Lattice, build_lattice
+from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
@@ -54,7 +54,7 @@ def velocity(state: State) -> np.ndarray:
 
 def cube(**settings: float) -> Lattice:
     """2 x 2 x 2 cells of 0.1 m."""
-    return build_lattice(cages_of(block(2, 2, 2), 0.1), 1000.0, **{"young_modulus": 2e4} | settings)
+    return build_lattice(cages_of(block(2, 2, 2), 0.1), LatticeMaterial(1000.0, **{"young_modulus": 2e4} | settings))
 
 
 def shaken(lattice: Lattice, size: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from hierarchies import COMM, SHAPES, block
 from lattices import cages_of
 
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.lattice.lattice import build_lattice
+from msmpetsc.lattice.lattice import LatticeMaterial, build_lattice
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.preconditioning import WORTH, LatticePreconditioner
 
@@ -13,7 +13,7 @@ from msmpetsc.solve.nonlinear.preconditioning import WORTH, LatticePreconditione
 @pytest.fixture
 def kept(petsc_options):
     """A preconditioner with a hierarchy of the lattice at rest, and another one asked for at turned positions."""
-    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), 1000.0, young_modulus=2e5)
+    lattice = build_lattice(cages_of(block(4, 3, 3), 0.1), LatticeMaterial(1000.0, young_modulus=2e5))
     unknowns = Unknowns(COMM, lattice)
     one = LatticePreconditioner(unknowns, Elasticity(COMM, lattice), 0.02, "")
     one.prepare(lattice.nodes, None)

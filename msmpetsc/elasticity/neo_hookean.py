@@ -319,7 +319,7 @@ def _quadratic(w: Floats, other: Floats, lane: int) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def energy_of_lane(w: Floats, lane: int, h4: float) -> float:
+def _energy_of_lane(w: Floats, lane: int, h4: float) -> float:
     """Return the energy [J] of a lane's cell, 0 at rest."""
     f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
     n = _cofactors(f)
@@ -329,15 +329,14 @@ def energy_of_lane(w: Floats, lane: int, h4: float) -> float:
 
 
 @numba.njit(cache=True)
-def elastic_energy(blocks: Blocks, owned: int, h4: float, q: Positions) -> float:
-    """Return E [J] of the first ``owned`` blocks, 0 at rest."""
-    w, energy = np.zeros(WORK), 0.0
-    for b in range(owned):
+def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
+    """Write the energy of cells [J] at q (l, 3) [m] into ``energies`` (b, LANES), of the first b blocks."""
+    w = np.zeros(WORK)
+    for b in range(len(energies)):
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            energy += energy_of_lane(w, lane, h4)
-    return energy
+            energies[b, lane] = _energy_of_lane(w, lane, h4)
 
 
 @numba.njit(cache=True)
@@ -517,7 +516,9 @@ class NeoHookean:
 
     def energy(self, q: Positions) -> float:
         """Return E [J] of the cells that this rank owns."""
-        return elastic_energy(self.blocks, self.owned, self.h4, q)
+        energies = np.empty((self.owned, LANES))
+        cell_energies(self.blocks, self.h4, q, energies)
+        return float(energies.sum())
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return E(q) - E(base) [J] of the cells that this rank owns."""

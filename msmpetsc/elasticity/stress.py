@@ -11,13 +11,12 @@ volume at rest. It is what to look at where a solid is nearly incompressible: pr
 
 from typing import Any
 
-import numba
 import numpy as np
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
-from msmpetsc.elasticity.cell_lanes import CONSTANTS, LANES, STATE, WORK, Blocks, gather, load
-from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean, energy_of_lane
+from msmpetsc.elasticity.cell_lanes import LANES, STATE
+from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean, cell_energies
 from msmpetsc.lattice.lattice import Lattice
 
 UPPER = np.array([0, 4, 8, 1, 5, 2])  # xx, yy, zz, xy, yz, xz of a tensor's nine
@@ -73,14 +72,3 @@ def _fields(stress: Rows, energy: Floats) -> dict[str, Any]:
     deviator = np.concatenate([stress[:, :3] + pressure[:, None], np.sqrt(2) * stress[:, 3:]], axis=1)
     von_mises = np.sqrt(1.5) * np.linalg.norm(deviator, axis=1)
     return {"stress": stress, "von_mises": von_mises, "pressure": pressure, "strain_energy": energy}
-
-
-@numba.njit(cache=True)
-def cell_energies(blocks: Blocks, h4: float, q: Positions, energies: Rows) -> None:
-    """Write the energy of each cell [J] at q (l, 3) [m] into ``energies`` (b, LANES)."""
-    w = np.zeros(WORK)
-    for b in range(len(blocks.nodes)):
-        gather(blocks.nodes, b, q, w)
-        load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        for lane in range(LANES):
-            energies[b, lane] = energy_of_lane(w, lane, h4)

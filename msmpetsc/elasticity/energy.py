@@ -9,6 +9,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, on_
 from msmpetsc.elasticity.cell_volume import CellGather, CellScatter, least_volumes
 from msmpetsc.elasticity.neo_hookean import NeoHookean
 from msmpetsc.elasticity.springs import Product, SpringGather, SpringScatter
+from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 
@@ -49,7 +50,7 @@ class Flops:
         """Return those of a lattice, M included."""
         springs, stiffens, owned = len(lattice.springs), lattice.stiffening > 0, lattice.owned
         if lattice.solid is not None:
-            around = len(lattice.local_cells)
+            around = len(lattice.local_cells) * (2 if lattice.viscous else 1)
             return cls(
                 SOLID_GRADIENT * around + GRADIENT_ROW * owned,
                 SOLID_CHANGE * lattice.cells_owned + CHANGE_ROW * owned,
@@ -73,7 +74,8 @@ class Elasticity:
     that law stiffens, of stiffening ones and of cells that resist being turned inside out (elasticity.cell_volume).
 
     Positions are local (l, 3) [m]. Energies are of what this rank owns; gradients and products are right at the owned
-    nodes. ``springs``, ``cells`` and ``solid`` are None where the law has none; ``flops`` are of one call.
+    nodes. ``springs``, ``cells``, ``solid`` and ``viscosity`` are None where the law has none; ``flops`` are of one
+    call. Where there is viscosity E has its D, of the step that it was given last.
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
@@ -84,6 +86,9 @@ class Elasticity:
         if lattice.solid is not None and not on_cpu:
             raise InputError('material.law = "neo-hookean" is computed on CPUs: --device cpu')
         self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
+        self.viscosity: Viscosity | None = None
+        if self.solid and lattice.viscous:
+            self.viscosity = Viscosity.of_solid(self.solid, lattice.viscous, lattice.nodes)
         if self.solid is None:
             self.springs = (SpringScatter if on_cpu else SpringGather).of_lattice(lattice)
         if lattice.stiffening > 0:
@@ -91,7 +96,7 @@ class Elasticity:
             self.cells = (CellScatter if on_cpu else CellGather).of_lattice(
                 lattice, RESISTANCE * resistance, ONSET * volume
             )
-        self.parts = [part for part in (self.solid, self.springs, self.cells) if part]
+        self.parts = [part for part in (self.solid, self.springs, self.cells, self.viscosity) if part]
 
     def energy(self, q: Positions) -> float:
         """Return E [J] of what this rank owns."""

@@ -34,7 +34,6 @@ from msmpetsc.elasticity.cell_lanes import (
     CONSTANTS,
     FAST,
     LANES,
-    RESULT,
     STATE,
     WORK,
     Blocks,
@@ -59,7 +58,7 @@ Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @numba.njit(cache=True, inline="always")
-def _cofactors(f: Nine) -> Nine:
+def cofactors(f: Nine) -> Nine:
     """Return cof F by rows."""
     return (
         f[4] * f[8] - f[5] * f[7],
@@ -75,7 +74,7 @@ def _cofactors(f: Nine) -> Nine:
 
 
 @numba.njit(cache=True, inline="always")
-def _determinant(f: Nine, n: Nine) -> float:
+def determinant(f: Nine, n: Nine) -> float:
     """Return det F by its first row and that of its cofactors n."""
     return f[0] * n[0] + f[1] * n[1] + f[2] * n[2]
 
@@ -148,7 +147,7 @@ def _borne(f: Nine, j: float, slope: float, least: float) -> float:
 
 
 @numba.njit(cache=True, inline="always")
-def _gradient_of(w: Floats, lane: int, over: float) -> Nine:
+def gradient_of(w: Floats, lane: int, over: float) -> Nine:
     """Return F of a lane whose corners' positions are in the work array; ``over`` is 1 / (4 h)."""
     a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
     return (
@@ -165,7 +164,7 @@ def _product_lanes(w: Floats) -> None:
         g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
         s = AT_STATE + lane
         f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
-        m, slope, n = w[CONSTANTS + 104 + lane], w[s + 72], _cofactors(f)
+        m, slope, n = w[CONSTANTS + 104 + lane], w[s + 72], cofactors(f)
         along, t = w[s + 80] * _inner(n, g), _change_of_cofactors(f, g)
         x = (
             m * g[0] + along * n[0] + slope * t[0],
@@ -205,8 +204,8 @@ def _gradient_lanes(w: Floats, h4: float) -> None:
         a, b, c = strain(w, 0, lane), strain(w, 8, lane), strain(w, 16, lane)
         g = a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
         m, lame = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane]
-        n, over = _cofactors(g), 1.0 / h4
-        j = _determinant(g, n) * (over * over * over)
+        n, over = cofactors(g), 1.0 / h4
+        j = determinant(g, n) * (over * over * over)
         slope = over * _slopes(j, m, lame)[0]
         x = m * g[0] + slope * n[0], m * g[1] + slope * n[1], m * g[2] + slope * n[2]
         y = m * g[3] + slope * n[3], m * g[4] + slope * n[4], m * g[5] + slope * n[5]
@@ -227,64 +226,12 @@ def add_gradient(blocks: Blocks, h4: float, q: Positions, gradient: Rows) -> Non
         scatter(blocks.nodes, b, w, gradient)
 
 
-@numba.njit(cache=True)
-def _turn(before: Nine, after: Nine) -> tuple[float, float, float]:
-    """Return the axis, times the sine of the angle, by which a cell turns that goes from one F to another.
-
-    Of after = R before, with B = before before^T and a small turn s, R B - (R B)^T is the matrix of (tr B - B) s.
-    """
-    b = (
-        before[0] ** 2 + before[1] ** 2 + before[2] ** 2,
-        before[0] * before[3] + before[1] * before[4] + before[2] * before[5],
-        before[0] * before[6] + before[1] * before[7] + before[2] * before[8],
-        before[3] ** 2 + before[4] ** 2 + before[5] ** 2,
-        before[3] * before[6] + before[4] * before[7] + before[5] * before[8],
-        before[6] ** 2 + before[7] ** 2 + before[8] ** 2,
-    )
-    m = b[3] + b[5], -b[1], -b[2], -b[1], b[0] + b[5], -b[4], -b[2], -b[4], b[0] + b[3]
-    n = _cofactors(m)
-    over = 1.0 / max(_determinant(m, n), 1e-300)
-    x = after[6] * before[3] + after[7] * before[4] + after[8] * before[5]
-    x -= after[3] * before[6] + after[4] * before[7] + after[5] * before[8]
-    y = after[0] * before[6] + after[1] * before[7] + after[2] * before[8]
-    y -= after[6] * before[0] + after[7] * before[1] + after[8] * before[2]
-    z = after[3] * before[0] + after[4] * before[1] + after[5] * before[2]
-    z -= after[0] * before[3] + after[1] * before[4] + after[2] * before[5]
-    return (
-        over * (n[0] * x + n[1] * y + n[2] * z),
-        over * (n[3] * x + n[4] * y + n[5] * z),
-        over * (n[6] * x + n[7] * y + n[8] * z),
-    )
-
-
-@numba.njit(cache=True)
-def add_turned_gradient(blocks: Blocks, h4: float, q: Positions, ahead: Positions, gradient: Rows) -> None:
-    """Add grad E [N] at q (l, 3) [m], each cell's part turned as the cell turns from there to ``ahead`` (l, 3)."""
-    w, w_ahead = np.zeros(WORK), np.zeros(WORK)
-    for b in range(len(blocks.nodes)):
-        for values, work in ((q, w), (ahead, w_ahead)):
-            gather(blocks.nodes, b, values, work)
-            load(blocks.constants, blocks.which[b], work, CONSTANTS)
-        _gradient_lanes(w, h4)
-        for lane in range(LANES):
-            s = _turn(_gradient_of(w, lane, 1.0 / h4), _gradient_of(w_ahead, lane, 1.0 / h4))
-            rest = 1.0 / (1.0 + math.sqrt(max(1.0 - s[0] ** 2 - s[1] ** 2 - s[2] ** 2, 0.0)))
-            for a in range(8):
-                i = RESULT + 24 * a + lane
-                x, y, z = w[i], w[i + 8], w[i + 16]
-                t = s[1] * z - s[2] * y, s[2] * x - s[0] * z, s[0] * y - s[1] * x
-                w[i] += t[0] + rest * (s[1] * t[2] - s[2] * t[1])
-                w[i + 8] += t[1] + rest * (s[2] * t[0] - s[0] * t[2])
-                w[i + 16] += t[2] + rest * (s[0] * t[1] - s[1] * t[0])
-        scatter(blocks.nodes, b, w, gradient)
-
-
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _state_lanes(w: Floats, over: float, projected: bool) -> None:
     for lane in range(LANES):
-        f = _gradient_of(w, lane, over)
-        m, lame, n = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], _cofactors(f)
-        j = _determinant(f, n)
+        f = gradient_of(w, lane, over)
+        m, lame, n = w[CONSTANTS + 104 + lane], w[CONSTANTS + 112 + lane], cofactors(f)
+        j = determinant(f, n)
         slope, curvature = _slopes(j, m, lame)
         if projected:
             most = m / _borne(f, j, slope, ONSET)
@@ -321,9 +268,9 @@ def _quadratic(w: Floats, other: Floats, lane: int) -> float:
 @numba.njit(cache=True, inline="always")
 def _energy_of_lane(w: Floats, lane: int, h4: float) -> float:
     """Return the energy [J] of a lane's cell, 0 at rest."""
-    f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-    n = _cofactors(f)
-    j = _determinant(f, n)
+    f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+    n = cofactors(f)
+    j = determinant(f, n)
     volume = _volume_energy(j, m, w[CONSTANTS + 112 + lane]) if m > 0.0 else 0.0
     return 0.5 * _quadratic(w, w, lane) + h4 * h4 * (volume - 1.5 * m)
 
@@ -352,10 +299,10 @@ def elastic_change(blocks: Blocks, owned: int, h4: float, q: Positions, base: Po
             gather(blocks.nodes, b, values, work)
             load(blocks.constants, blocks.which[b], work, CONSTANTS)
         for lane in range(LANES):
-            d, f, m = _gradient_of(w, lane, 1.0 / h4), _gradient_of(w_base, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-            n, n_d = _cofactors(f), _cofactors(d)
-            before = _determinant(f, n)
-            more = _inner(n, d) + _inner(f, n_d) + _determinant(d, n_d)
+            d, f, m = gradient_of(w, lane, 1.0 / h4), gradient_of(w_base, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            n, n_d = cofactors(f), cofactors(d)
+            before = determinant(f, n)
+            more = _inner(n, d) + _inner(f, n_d) + determinant(d, n_d)
             if m > 0.0:
                 volume = _volume_change(before + more, before, more, m, w[CONSTANTS + 112 + lane])
                 change += _quadratic(w, w_mean, lane) + h4 * h4 * volume
@@ -371,9 +318,7 @@ def add_diagonal(blocks: Blocks, state: Rows, diagonal: Rows) -> None:
         load(state, b, w, AT_STATE)
         for lane in range(LANES):
             s = AT_STATE + lane
-            n = _cofactors(
-                (w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64])
-            )
+            n = cofactors((w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]))
             for a in range(8):
                 g, block = corner_strain(w, a, lane), diagonal[blocks.nodes[b, lane, a]]
                 x, y, z, v = modes_forces(w, lane, g[3], g[4], g[5], g[6])
@@ -401,9 +346,9 @@ def add_concavity(blocks: Blocks, h4: float, q: Positions, concavity: Floats) ->
         gather(blocks.nodes, b, q, w)
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
-            f, m = _gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
-            n = _cofactors(f)
-            j = _determinant(f, n)
+            f, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + 104 + lane]
+            n = cofactors(f)
+            j = determinant(f, n)
             slope = _slopes(j, m, w[CONSTANTS + 112 + lane])[0]
             lost = max(abs(slope) * _borne(f, j, slope, CONVEX) - m, 0.0)
             for a in range(8):
@@ -434,7 +379,7 @@ def add_coarse(
             load(state, b, w, AT_STATE)
             s, m = AT_STATE + lane, t2 * w[CONSTANTS + 104 + lane]
             of_f = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
-            slope, curvature, k = t2 * w[s + 72], t2 * w[s + 80], _cofactors(of_f)
+            slope, curvature, k = t2 * w[s + 72], t2 * w[s + 80], cofactors(of_f)
             for r in range(9):
                 f[r // 3, r % 3] = of_f[r]
             for a in range(8):
@@ -527,12 +472,6 @@ class NeoHookean:
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
         add_gradient(self.blocks, self.h4, q, gradient)
-
-    def turned_gradient(self, q: Positions, ahead: Positions) -> Rows:
-        """Return grad E (l, 3) [N] at q (l, 3) [m], in axes that turn with each cell from there to ``ahead`` (l, 3)."""
-        gradient = np.zeros_like(q)
-        add_turned_gradient(self.blocks, self.h4, q, ahead, gradient)
-        return gradient
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add to ``concavity`` (l,) [N/m] how much less than 0 the Hessian may be."""

@@ -63,6 +63,7 @@ class Lattice:
     cell_share  : (c,) of each of ``cells`` that lies inside the surface, and so counts [-]
     first_of_body : (b,) global number of the first node of each body; a body's nodes follow each other
     solid       : where the law is neo-Hookean; None where it is of springs
+    viscous     : viscosity of a solid in its steps over its stiffness, beta / tau (elasticity.viscosity) [-]
     """
 
     table: SortedKeys
@@ -84,6 +85,7 @@ class Lattice:
     cell_share: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
     solid: SolidCells | None = None
+    viscous: float = 0.0
 
     @property
     def owned(self) -> int:
@@ -109,11 +111,9 @@ class Lattice:
         stiffness = self.stiffness if self.solid is None else self.cell_stiffness
         return float(comm.allreduce(stiffness.max(initial=0), MPI.MAX))
 
-    def stiffened(self, factor: float) -> "Lattice":
-        """Return this solid's lattice with a stiffness so many times as large."""
-        assert self.solid is not None
-        solid = self.solid._replace(shear=factor * self.solid.shear, lame=factor * self.solid.lame)
-        return replace(self, stiffness=factor * self.stiffness, solid=solid)
+    def with_viscosity(self, factor: float) -> "Lattice":
+        """Return this solid's lattice for steps whose viscosity is so many times its stiffness."""
+        return replace(self, stiffness=(1 + factor) * self.stiffness, viscous=factor)
 
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes ``where`` (l,) bool held fast."""

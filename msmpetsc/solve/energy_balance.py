@@ -195,9 +195,8 @@ class EnergyBalance:
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned])
-            + environment.friction_work_bound(
-                (q[owned], sides), (result.position[owned], after.sides), time, time_step
-            ),
+            + environment.friction_work_bound((q[owned], sides), (result.position[owned], after.sides), time, time_step)
+            + result.viscous_work,
             result.work,
             result.swing,
         )

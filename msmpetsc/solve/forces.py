@@ -37,11 +37,11 @@ class Forces:
         held, load = np.zeros_like(q), environment.load(time)
         pushes = self._pushes(q, contact)
         self.elasticity.add_gradient(q, held)
-        if step:
-            held *= step.counts
         if contact:
             contact.add_gradient(q, held)
-        held = held[:owned] - (problem.load if problem else load)
+        held = held[:owned] - load
+        if step and step.viscous is not None:
+            held += step.viscous
         if step and problem:
             held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
         held *= environment.fixed_at(time)[:owned, None]

@@ -80,7 +80,7 @@ def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
 
 
 def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
-    """Stretched by its spin of 20 / s: forces that did not turn along took 87% of it; these err by t^2."""
+    """Stretched by its spin of 20 / s: rates in axes that did not turn along took 87% of it."""
     model, frames = play(viscous(tmp_path, "bdf2", 1 / 400, 0.25, RETARDATION, start={"spin": [0, 0, 20.0]}))
 
     def angular(k: int) -> float:
@@ -88,7 +88,7 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
         x = frames[k].position - np.average(frames[k].position, axis=0, weights=model.lattice.mass)
         return model.lattice.mass @ np.cross(x, v)[:, 2]
 
-    assert angular(len(frames) - 1) == pytest.approx(angular(2), rel=1e-2)
+    assert angular(len(frames) - 1) == pytest.approx(angular(2), rel=5e-3)
     assert (np.diff([frame.elastic for frame in frames[2:]]) > 0).all()  # it creeps, without a swing
 
 
@@ -96,3 +96,17 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
 def test_viscosity_is_of_implicit_steps(tmp_path: Path, integrator: str):
     with pytest.raises(InputError, match=r"retardation_time"):
         play(viscous(tmp_path, integrator, 0.01, 0.01, RETARDATION))
+
+
+def test_a_bent_solid_that_is_let_go_creeps_back_and_gains_nothing(tmp_path: Path, caplog):
+    """Of so much viscosity that inertia is nothing; the work of what led it counts."""
+    top = {"box": [[-1, -1, 0.49], [1, 1, 0.51]]}
+    anchor = {"region": top, "path": [{"time": 0.05, "by": [0.1, 0, 0]}], "stop": 0.1}
+    scene = viscous(
+        tmp_path, "implicit-euler", 0.01, 0.4, 2.0, sides=[0.25, 0.25, 0.5], pin=[{"region": FOOT}], anchor=[anchor]
+    )
+    _, frames = play(scene)
+    elastic = np.array([frame.elastic for frame in frames[10:]])
+    assert elastic[1] < 0.99 * elastic[0]
+    assert (np.diff(elastic) < 0).all() and max(frame.kinetic for frame in frames[10:]) < 0.01 * elastic[0]
+    assert "nowhere" not in caplog.text

@@ -11,9 +11,8 @@ to x, and y = c + tau w
 which is the same problem after division by 1 + alpha tau: of y = c + tau w / (1 + alpha tau), and with
 tau^2 / (1 + alpha tau) for tau^2. So a step costs as much, and what nothing else moves slows down by 1 + alpha tau.
 
-A solid of Kelvin and Voigt has in each cell beta times the rate of its stress beside that, beta its retardation time.
-The forces are beta d/dt grad E, in axes that turn with the cell: to turn costs nothing. With (grad E(x) - c) / tau for
-that, c of grad E as y is of q, E counts 1 + beta / tau times, and beta / tau c is one more load: the same problem.
+A viscous solid has its dissipation over the step beside E (elasticity.viscosity), with x^ = c, so that v is that of x.
+Euler's difference of two positions is that of the turn half way between; BDF2's is of the step's end.
 """
 
 from dataclasses import replace
@@ -71,20 +70,11 @@ class ImplicitEuler(Integrator):
         """The tau of the problem that is solved, tau where nothing is damped [s]."""
         return self.tau / float(np.sqrt(1 + self.damping * self.tau))
 
-    @property
-    def counts(self) -> float:
-        """How many times E counts in the problem that is solved."""
-        return 1 + self.retardation / self.tau if self.retardation else 1.0
-
-    def _viscous_load(self, problem: StepProblem, q_before: Positions | None) -> Rows:
-        """Return what viscosity carries on of the stress of the states before (owned, 3) [N]."""
-        elasticity = self.stepper.functional.elasticity  # of E as often as it counts
-        assert elasticity.solid is not None
-        carried = elasticity.solid.turned_gradient(problem.q, problem.y)
-        if q_before is not None:
-            carried = (4 * carried - elasticity.solid.turned_gradient(q_before, problem.y)) / 3
-        share: Rows = (1 - 1 / self.counts) * carried[: len(problem.load)]
-        return problem.load + share
+    def _rates(self, q: Positions, y: Positions, q_before: Positions | None) -> tuple[Positions, Positions] | None:
+        """Return what a viscous solid's rates are of: x^, and positions that have turned as the rates have."""
+        if not self.retardation:
+            return None
+        return (q, 0.5 * (q + y)) if q_before is None else ((4 * q - q_before) / 3, y)
 
     def _carried(self, duration: float) -> float:
         """Return how far a velocity carries in a time step [s] under damping."""
@@ -120,15 +110,24 @@ class ImplicitEuler(Integrator):
         """
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.comm, self.environment, state.q, y, time, time_step, state.sides, fixed, q_before)
-        begun = self.stepper.work_so_far()
+        begun, rates = self.stepper.work_so_far(), self._rates(state.q, y, q_before)
         while not faces.is_settled:
-            self.problem = faces.problem()
-            if self.retardation:
-                self.problem = replace(self.problem, load=self._viscous_load(self.problem, q_before))
+            self.problem = replace(faces.problem(), rates=rates)
             result = self.stepper.step(self.problem)
             faces.compare(result.position)
         cost = replace(self.stepper.work_so_far() - begun, steps=1, step_error=result.cost.step_error)
-        return replace(result, cost=cost, problem=self.problem, tau=self.damped_tau, counts=self.counts), faces.sides
+        result = replace(result, cost=cost, problem=self.problem, tau=self.damped_tau)
+        return self._with_viscosity(result), faces.sides
+
+    def _with_viscosity(self, result: StepResult) -> StepResult:
+        """Return a step's result with the forces of viscosity, and what these took in where anchors led on."""
+        viscosity, problem = self.stepper.functional.elasticity.viscosity, result.problem
+        if viscosity is None or problem is None:
+            return result
+        forces = np.zeros_like(result.position)
+        viscosity.add_gradient(result.position, forces)
+        taken = -viscosity.change(result.position, problem.fixed)
+        return replace(result, viscous=forces[: len(problem.load)], viscous_work=taken)
 
     def follow(self) -> None:
         self.trace = Trace()
@@ -151,7 +150,7 @@ class ImplicitEuler(Integrator):
         solver, lattice = self.solver, self.environment.lattice.pin(self.environment.fixed_at(time))
         return Stepper(
             self.comm,
-            lattice.stiffened(self.counts) if self.retardation else lattice,
+            lattice.with_viscosity(self.retardation / self.tau) if self.retardation else lattice,
             self.damped_tau,
             find_preset(solver.preset),
             solver.error,

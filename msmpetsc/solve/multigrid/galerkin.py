@@ -143,6 +143,8 @@ class GalerkinSum:
         values = symmetric[:, self.full]
         if solid:
             add_coarse(*self.cells, solid.blocks, solid.state(q, True), self.t2, self.weights, self.places, values)
+        if viscosity := self.elasticity.viscosity:
+            add_coarse(*self.cells, viscosity.blocks, viscosity.state, self.t2, self.weights, self.places, values)
         if self.elasticity.cells:
             law = self.elasticity.cells.law
             add_resistance(count, q, *self.cells, *law, self.t2, self.weights, self.places, values)

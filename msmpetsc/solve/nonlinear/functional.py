@@ -22,6 +22,7 @@ class StepProblem:
     """Data of one implicit step.
 
     prescribed : q_n with the anchored nodes where they will be (l, 3) [m]; None if they stay
+    rates      : what those of a viscous solid are of, (l, 3) [m] each (elasticity.viscosity.Viscosity.begin)
     """
 
     q: Positions  # q_n (l, 3) [m], ghosts included
@@ -29,6 +30,7 @@ class StepProblem:
     load: Rows  # f_ext (owned, 3) [N]
     contact: Contact | None = None  # penalties that press on the nodes in this step
     prescribed: Positions | None = None
+    rates: tuple[Positions, Positions] | None = None
 
     @property
     def fixed(self) -> Positions:
@@ -64,6 +66,8 @@ class StepFunctional:
     def begin(self, problem: StepProblem) -> None:
         """Take the data of a new step."""
         self.problem = problem
+        if self.elasticity.viscosity and problem.rates:
+            self.elasticity.viscosity.begin(*problem.rates)
         self.extent = self.comm.allreduce(greatest(np.abs(problem.q)), MPI.MAX)
 
     def positions(self, x: PETSc.Vec) -> Positions:

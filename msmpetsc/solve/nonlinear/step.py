@@ -49,7 +49,7 @@ class StepResult:
     swing      : by how much the energy of this rank's nodes changed that comes back (solve.energy_balance) [J]
     time_error : estimated error of the trajectory so far; NaN where there is no estimate
     problem    : that was solved, of F = M (x - y) + tau^2 (grad E - f_ext); None of explicit steps. Statics have no M
-    counts     : how many times E counts in it
+    viscous    : forces of viscosity (owned, 3) [N]; its work is what it took in of this rank's cells [J]
     """
 
     position: Positions  # (l, 3) [m], ghosts included
@@ -62,7 +62,8 @@ class StepResult:
     time_error: float = np.nan
     problem: StepProblem | None = None
     tau: float = np.inf  # [s]
-    counts: float = 1.0
+    viscous: Rows | None = None
+    viscous_work: float = 0.0
 
 
 @dataclass(eq=False)

@@ -17,7 +17,15 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.elasticity.cell_lanes import AT_STATE, CONSTANTS, LANES, ROWS, STATE, WORK, Blocks, gather, load
-from msmpetsc.elasticity.neo_hookean import NeoHookean, add_diagonal, add_product, cofactors, determinant, gradient_of
+from msmpetsc.elasticity.neo_hookean import (
+    ONSET,
+    NeoHookean,
+    add_diagonal,
+    add_product,
+    cofactors,
+    determinant,
+    gradient_of,
+)
 from msmpetsc.elasticity.springs import Product
 
 TURNS = 30  # iterations towards a cell's rotation
@@ -28,8 +36,8 @@ TURNED = 1e-12  # how little the last one changes of it
 def turned_state(blocks: Blocks, h4: float, q: Positions, state: Rows) -> None:
     """Write what a Hessian keeps of cells at rest, turned as those at q (l, 3) [m], into ``state`` (b, STATE * LANES).
 
-    The rotation of F comes by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986). Cells that are inside out, or
-    flat, have none: theirs is the part of K that is semidefinite for any F.
+    The rotation of F comes by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986). Cells that are flat or inside out
+    (J below J_0 of their law) have none: K is not turned then, nor does it forgive a turn.
     """
     w = np.zeros(WORK)
     for b in range(len(blocks.nodes)):
@@ -37,19 +45,21 @@ def turned_state(blocks: Blocks, h4: float, q: Positions, state: Rows) -> None:
         load(blocks.constants, blocks.which[b], w, CONSTANTS)
         for lane in range(LANES):
             r, m = gradient_of(w, lane, 1.0 / h4), w[CONSTANTS + (ROWS - 2) * LANES + lane]
-            slope, change = 0.0, 1.0
+            turns = determinant(r, cofactors(r)) > ONSET
+            if not turns:
+                r = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+            change = 1.0
             for _ in range(TURNS):
                 n = cofactors(r)
-                over, change = 0.5 / max(determinant(r, n), 1e-30), 0.0
+                over, change = 0.5 / determinant(r, n), 0.0
                 for i in range(9):
                     w[AT_STATE + LANES * i + lane] = 0.5 * r[i] + over * n[i]
                     change = max(change, abs(0.5 * r[i] - over * n[i]))
                 s = AT_STATE + lane
                 r = w[s], w[s + 8], w[s + 16], w[s + 24], w[s + 32], w[s + 40], w[s + 48], w[s + 56], w[s + 64]
                 if not change > TURNED:
-                    slope = -m
                     break
-            w[AT_STATE + (STATE - 2) * LANES + lane] = slope
+            w[AT_STATE + (STATE - 2) * LANES + lane] = -m if turns else 0.0
             w[AT_STATE + (STATE - 1) * LANES + lane] = m + w[CONSTANTS + (ROWS - 1) * LANES + lane]
         for i in range(STATE * LANES):
             state[b, i] = w[AT_STATE + i]

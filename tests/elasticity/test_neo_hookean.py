@@ -8,9 +8,11 @@ from scipy.spatial.transform import Rotation
 from msmpetsc.elasticity.cell_volume import least_volumes
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import worst_inverted
-from msmpetsc.elasticity.neo_hookean import ONSET
+from msmpetsc.elasticity.neo_hookean import ONSET, NeoHookean
+from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes, volume_ratios
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, SolidCells, build_lattice
+from msmpetsc.lattice.material import lame_constants
 
 RNG = np.random.default_rng(30)
 YOUNG, H = 3e4, 0.1
@@ -193,3 +195,21 @@ def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
     for each in (sliver, lattice):
         ratio = volume_ratios(each.solid.forms, moved[lattice.local_cells], H)
         np.testing.assert_allclose(ratio, np.linalg.det(turn), rtol=1e-13)
+
+
+def test_viscosity_turns_with_its_cells_and_is_semidefinite_where_they_are_inside_out():
+    """A turn's rate costs nothing; a stretch of turned cells what it does at rest: 2 mu |eps|^2 + lambda (tr eps)^2."""
+    lattice = solid(3, 2, 2, poisson=0.45)
+    viscosity = Viscosity.of_solid(NeoHookean.of_lattice(lattice), 3.0, lattice.nodes)
+    turn, rest = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix(), lattice.nodes
+    viscosity.begin(rest @ turn.T, rest @ turn.T)
+    spin, strain = np.cross([1.0, 2.0, 3.0], rest @ turn.T), RNG.normal(size=(3, 3))
+    strain += strain.T
+    shear, lame = lame_constants(YOUNG, 0.45)
+    density = shear * (strain**2).sum() + lame / 2 * np.trace(strain) ** 2
+    volume = 12 * H**3
+    assert abs(viscosity.energy(rest @ turn.T + spin)) < 1e-12 * shear * volume
+    stretched = rest @ turn.T + rest @ strain @ turn.T
+    assert viscosity.energy(stretched) == pytest.approx(3 * volume * density, rel=1e-12)
+    viscosity.begin(rest, rest + 2 * H * RNG.normal(size=rest.shape))
+    assert all(viscosity.energy(rest + RNG.normal(size=rest.shape)) > 0 for _ in range(20))

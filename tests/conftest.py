@@ -2,10 +2,10 @@
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import pytest
 import trimesh
 from forked import run_forked, run_ranks
@@ -32,9 +32,10 @@ SMOKE = {
 
 # the files that take longest, which are begun first: what is left for the end is short
 LONGEST = [
-    "test_readme", "test_scenes", "test_agreement", "test_kills", "test_tunnelling", "test_touching", "test_sizing",
-    "test_cycle_options", "test_extras", "test_recovery", "test_cli", "test_bodies", "test_adaptive", "test_run",
-    "test_cycle", "test_bodies_contact", "test_anchor", "test_cages", "test_going_on", "test_grids",
+    "test_readme", "test_scenes", "test_agreement", "test_kills", "test_recovery", "test_resume", "test_tunnelling",
+    "test_sizing", "test_adaptive", "test_cycle_options", "test_extras", "test_new", "test_cli", "test_bodies",
+    "test_bodies_contact", "test_run", "test_cycle", "test_check", "test_grids", "test_going_on", "test_on_gpu",
+    "test_anchor", "test_cages",
 ]  # fmt: skip
 
 Run = Callable[..., subprocess.CompletedProcess]
@@ -56,24 +57,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.smoke)
 
 
-def run(ranks: int, *arguments: object, timeout: float = 120) -> subprocess.CompletedProcess:
+def run(ranks: int, *arguments: object, timeout: float = 120, status: int | None = None) -> subprocess.CompletedProcess:
     """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out.
 
-    Several ranks, and the program itself on one, are forked.
+    All are forked from a process that has imported the package. ``status``: that it must end with.
     """
     words = [*map(str, arguments)]
-    if ranks > 1:
-        return run_ranks(ranks, words, ENVIRONMENT, timeout)
-    if words[:2] == ["-m", "msmpetsc.cli.main"]:
-        return run_forked(words[2:], ENVIRONMENT, timeout)
-    command = ["mpiexec", "-n", "1", sys.executable, *words]
-    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
+    if ranks == 1 and words[:2] in (["-m", "msmpetsc.cli.main"], ["-m", "msmpetsc"]):
+        done = run_forked(words[2:], ENVIRONMENT, timeout)
+    else:
+        done = run_ranks(ranks, words, ENVIRONMENT, timeout)
+    assert status in (None, done.returncode), done.stdout + done.stderr
+    return done
 
 
-@pytest.fixture
-def on_ranks() -> Run:
-    """on_ranks(2, "worker.py", "argument") -> the finished process, whatever its status."""
-    return run
+def result_on(ranks: int, scene: Path, *words: object, timeout: float = 120) -> h5py.File:
+    """The result of a scene on so many ranks, which lies beside it."""
+    path = scene.with_name(f"{scene.stem}_{ranks}.h5")
+    run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", path, *words, timeout=timeout, status=0)
+    return h5py.File(path)
 
 
 @pytest.fixture
@@ -88,6 +90,22 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("meshes") / "ball.ply"
     trimesh.creation.icosphere(subdivisions=2, radius=1).export(path)
     return path
+
+
+@pytest.fixture(scope="session")
+def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of a ball that falls and leaps, its surface stored; for reading only."""
+    from ball_result import write_ball  # which wakes MPI
+
+    return write_ball(tmp_path_factory.mktemp("falling") / "ball.h5", surface=True)
+
+
+@pytest.fixture(scope="session")
+def bar_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of a bar of two cells; for reading only."""
+    import small_result
+
+    return small_result.write(tmp_path_factory.mktemp("bar") / "bar.h5")
 
 
 @pytest.fixture

@@ -1,13 +1,13 @@
 """Rows travel, keys are numbered and errors are shared the same on any number of ranks."""
 
 import pytest
-from conftest import WORKERS
+from conftest import WORKERS, run
 
 WORKER = WORKERS / "comm_worker.py"
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
-def test_against_plain_arrays(on_ranks, ranks):
-    done = on_ranks(ranks, "-m", "mpi4py", WORKER, timeout=60)  # -m mpi4py: a failure on one rank ends all
+def test_against_plain_arrays(ranks):
+    done = run(ranks, "-m", "mpi4py", WORKER, timeout=60)  # -m mpi4py: a failure on one rank ends all
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("passed") == ranks

@@ -6,6 +6,7 @@ from unittest.mock import patch
 import pytest
 from block_scene import block_scene, play
 from mpi4py import MPI
+from one_process import errors
 from petsc4py import PETSc
 
 from msmpetsc.backend import cuda
@@ -37,9 +38,9 @@ def no_gpu():
 def test_without_a_gpu_one_line_says_what_is_missing(tmp_path: Path, msmpetsc, words: list[str], ranks: int, no_gpu):
     path, out = block_scene(tmp_path, **FALL), tmp_path / "out.h5"
     done = msmpetsc(ranks, "run", path, "-o", out, *words)
-    said = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc:")]
-    assert done.returncode == 2 and len(said) == 1 and not out.exists()
-    assert device.what_is_missing() in said[0] and words[-1] in said[0]
+    (line,) = errors(done.stderr)
+    assert done.returncode == 2 and not out.exists()
+    assert device.what_is_missing() in line and words[-1] in line
     assert "Traceback" not in done.stderr and "CAUGHT SIGNAL" not in done.stderr.upper()
 
 
@@ -50,7 +51,7 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
 
 def test_a_package_that_is_not_there_is_named():
     with patch.dict("sys.modules", cupy=None):
-        assert cuda.missing() == "cupy cannot be imported; pip install 'msmpetsc[cuda]' brings it"
+        assert "msmpetsc[cuda]" in cuda.missing()
 
 
 @pytest.mark.cuda

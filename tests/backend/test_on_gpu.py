@@ -21,7 +21,7 @@ import numpy as np
 import pretend_gpu
 import pytest
 from block_scene import CELL, block_scene
-from conftest import ENVIRONMENT, WORKERS
+from conftest import ENVIRONMENT, WORKERS, run
 from mpi4py import MPI
 from petsc4py import PETSc
 from pretend_gpu import pretended
@@ -263,15 +263,14 @@ def test_kernels_compile_for_a_gpu(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_ranks_agree_on_gpus_too(tmp_path: Path, on_ranks):
+def test_ranks_agree_on_gpus_too(tmp_path: Path):
     """And a run of the command line: three ranks with ghosts, against one on the CPU."""
     path = block_scene(tmp_path, **CASES["pressed, rubbed and stiffening"])
     files, devices = [], []
     for ranks, worker in ((1, ["-m", "msmpetsc"]), (3, [WORKERS / "gpu_worker.py"])):
         files.append(tmp_path / f"{ranks}.h5")
         cost = files[-1].with_suffix(".json")
-        done = on_ranks(ranks, *worker, "run", path, "-o", files[-1], "--measure", cost)
-        assert done.returncode == 0, done.stderr
+        run(ranks, *worker, "run", path, "-o", files[-1], "--measure", cost, status=0)
         devices.append(json.loads(cost.read_text())["device"])
     assert devices == ["cpu", "cuda"]
     frames = [h5py.File(file)["frames/position"][:] for file in files]

@@ -1,5 +1,7 @@
-"""Paths on the command line that lead nowhere, or to what is no file: one line, and status 2."""
+"""Paths on the command line that lead nowhere, or to what is no file, or bear the name of another format: one line, and
+status 2. Commands for one process say so under mpiexec."""
 
+import json
 import os
 from pathlib import Path
 
@@ -7,6 +9,8 @@ import pytest
 import small_result
 from bad_input import limits
 from block_scene import block_scene
+from conftest import run
+from one_process import IN_ONE_PROCESS, command_error, errors
 
 from msmpetsc.cli.main import main
 
@@ -87,3 +91,41 @@ def test_what_no_machine_holds_is_refused_before_it_is_made(folder, monkeypatch,
         assert main(command) == 2
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1 and words in told[0]
+
+
+RESULT, PICTURE, JSON = "is named *.h5 or *.hdf5", "is named *.png", "is named *.json"
+WRONG = [
+    *[(["run", "scene.toml", "-o", name], RESULT)
+      for name in ("x.vtk", "x.h5.gz", "x", "scene.toml")],
+    (["run", "scene.toml", "-o", "scene.toml", "--overwrite"], RESULT),
+    (["run", "scene.toml", "--resume", "x.vtk"], RESULT),
+    (["run", "scene.toml", "--measure", "scene.toml"], JSON),
+    *[(["render", "good.h5", "-o", name], PICTURE) for name in ("x.vtk", "x", "good.h5")],
+    (["compare", "good.h5", "good.h5", "-o", "x.vtk"], "compare: unknown argument -o"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, arguments, words):
+    monkeypatch.chdir(folder)
+    before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    assert words in command_error(*arguments)
+    assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
+
+
+ALONE = {
+    "compare": (["good.h5", "good.h5"], "compare is started without mpiexec: it reads two files"),
+    "plan": (["scene.toml", "--surface-error", "0.1"], "plan is started without mpiexec: it starts its runs"),
+}
+
+
+def test_what_is_for_one_process_says_why_under_mpiexec(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    before = sorted(folder.iterdir())
+    done = run(2, "-c", IN_ONE_PROCESS, json.dumps([[name, *rest] for name, (rest, _) in ALONE.items()]), status=0)
+    for (_, words), line in zip(ALONE.values(), done.stdout.splitlines(), strict=True):
+        answers = json.loads(line)
+        assert [status for status, _ in answers] == [2, 2] and answers[1][1] == ""
+        (error,) = errors(answers[0][1])
+        assert words in error
+    assert sorted(folder.iterdir()) == before

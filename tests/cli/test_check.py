@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from block_scene import block_scene
+from one_process import command_error
 
 from msmpetsc.cli.main import main
 from msmpetsc.study.baseline import Numbers, Recipe, allowed, judged, read
@@ -80,7 +81,7 @@ def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(scene: Path, 
     assert after["run"] == before["run"] and after["numbers"] != before["numbers"]
 
 
-def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Path, tmp_path: Path, capsys):
+def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Path, tmp_path: Path):
     other = block_scene(tmp_path, time={"step": 0.01, "duration": 1.0, "error": 1e-2})
     few = ("--set", "time={step=1e-2, duration=1}")
     refused = {
@@ -92,13 +93,10 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
         "the run failed": ["check", "--update", str(other), *few, "--set", "cages={cell_size=0.125, max_cells=1}"],
     }
     for words, command in refused.items():
-        assert main(command) == 2, words
-        told = capsys.readouterr().err.splitlines()
-        assert len(told) == 1 and words in told[0], told
+        assert words in command_error(*command)
     for text in ("{}", "[1]", "nonsense", '{"run": 1, "counts": {}, "numbers": {}}'):
         numbers.write_text(text)
-        assert main(["check", str(scene)]) == 2
-        assert f"{numbers} is damaged, or has no numbers of a scene" in capsys.readouterr().err
+        assert f"{numbers} is damaged" in command_error("check", scene)
 
 
 DAMAGE = {
@@ -112,14 +110,13 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("place", DAMAGE)
-def test_damaged_numbers_are_refused_before_anything_is_run(scene: Path, numbers: Path, capsys, place: str):
+def test_damaged_numbers_are_refused_before_anything_is_run(scene: Path, numbers: Path, place: str):
     table, key, value = DAMAGE[place]
     stored = json.loads(numbers.read_text())
     stored[table][key] = value
     numbers.write_text(json.dumps(stored))
-    assert main(["check", str(scene)]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.count("\n") == 1 and "damaged" in told.err and place in told.err
+    text = command_error("check", scene)
+    assert "damaged" in text and place in text
 
 
 def test_too_great_a_scale_hides_no_difference(numbers: Path):
@@ -129,11 +126,10 @@ def test_too_great_a_scale_hides_no_difference(numbers: Path):
     assert judged(read(numbers), Numbers.model_validate(stored))["elastic"]
 
 
-def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, numbers: Path, ball: Path, capsys):
+def test_changes_that_come_with_the_numbers_name_nothing_elsewhere(scene: Path, numbers: Path, ball: Path):
     stored = json.loads(numbers.read_text())
     stored["run"]["changes"] = [f"mesh.source={ball}"]
     numbers.write_text(json.dumps(stored))
     for command in (["check", str(scene)], ["check", "--update", str(scene), "--set", f"mesh.source={ball}"]):
-        assert main(command) == 2
-        assert "is not in the scene's folder" in capsys.readouterr().err
+        assert "is not in the scene's folder" in command_error(*command)
     assert json.loads(numbers.read_text()) == stored

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT
+from one_process import command_error
 
 import msmpetsc
 from msmpetsc.cli.main import main
@@ -79,9 +80,8 @@ def test_parts_are_measured_by_their_area_and_thickness_by_volume_and_area():
         [trimesh.creation.box([1, 1, 1]), trimesh.creation.box([2, 2, 2]).apply_translation([5, 0, 0])]
     )
     assert measured(surface(two)).parts == pytest.approx([0.8, 0.2])  # 24 and 6 m^2
-    assert measured(surface(trimesh.creation.box([6, 6, 6]))).thickness == pytest.approx(
-        2
-    )  # 2 V / A of a cube: a third
+    cube = surface(trimesh.creation.box([6, 6, 6]))
+    assert measured(cube).thickness == pytest.approx(2)  # 2 V / A: a third
 
 
 BODIES = {
@@ -109,7 +109,7 @@ def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, caps
     assert [kind for kind in ("obstacle", "pin") if getattr(scene, kind)] == tables
     size = scene.mesh.size
     assert size is not None and 0.01 < size < 1
-    assert main(["run", "my.toml", "-o", "my.h5", "--set", "cages.count=300", "--quiet"]) == 0
+    assert main(["run", "my.toml", "-o", "my.h5", "--set", "cages.count=150", "--quiet"]) == 0
     with msmpetsc.open("my.h5") as run:
         moved = np.linalg.norm(run.frames.position[-1] - run.lattice.nodes[:], axis=1).max()
         fallen = 0.2 * size if tables == ["obstacle"] else 0.05 * size
@@ -123,8 +123,7 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     trimesh.util.concatenate([box, box.copy().apply_translation([0.3, 0, 0])]).export("two.ply")
     assert main(["new", "two.toml", "--mesh", "two.ply"]) == 0
     told = capsys.readouterr().err
-    assert "two.ply: 24 triangles, closed, 2 parts, the largest of 50% of the area" in told
-    assert "warning: two.ply: the faces are wound inwards" in told
+    assert "24 triangles, closed, 2 parts, the largest of 50% of the area" in told and "wound inwards" in told
     hole = trimesh.Trimesh(box.vertices, box.faces[2:], process=False)
     hole.export("open.ply")
     assert main(["new", "open.toml", "--mesh", "open.ply"]) == 0
@@ -137,13 +136,13 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     assert "warning: edge.ply: 1 edges have more than two triangles" in capsys.readouterr().err
 
 
-def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Path, monkeypatch, capsys):
+def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Path, monkeypatch):
     (tmp_path / "there").mkdir()
     monkeypatch.chdir(tmp_path / "there")
     shutil.copy(ball, "ball.ply")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export("flat.ply")
     refused = {
-        "which": ["new", "my.toml"],
+        "takes the scene's name": ["new", "my.toml"],
         "takes": ["new", "--mesh", "ball.ply"],
         "is named *.toml": ["new", "my.txt", "--mesh", "ball.ply"],
         "no file": ["new", "my.toml", "--mesh", "gone.ply"],
@@ -151,11 +150,8 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Pat
         "nor below it": ["new", "my.toml", "--mesh", str(ball)],
         "did you mean 'bunny_fall'": ["new", "my.toml", "--from", "bunny_fal"],
     }
-    refused["takes the scene's name"] = refused.pop("which")
     for words, command in refused.items():
-        assert main(command) == 2, command
-        told = capsys.readouterr().err.splitlines()
-        assert len(told) == 1 and words in told[0], told
+        assert words in command_error(*command)
     assert sorted(os.listdir()) == ["ball.ply", "flat.ply"]
     Path("my.toml").write_text("mine")
     assert main(["new", "my.toml", "--mesh", "ball.ply"]) == 2 and Path("my.toml").read_text() == "mine"

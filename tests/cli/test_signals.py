@@ -83,7 +83,7 @@ def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
     raise AssertionError("it never began")
 
 
-def test_a_second_interrupt_stops_at_once(tmp_path, msmpetsc):
+def test_a_second_interrupt_stops_at_once(tmp_path):
     """Both come within one step, which these settings would not end for minutes."""
     path = tmp_path / "x.h5"
     stiff = {"young_modulus": 1e9, "density": 1000.0}

@@ -41,11 +41,9 @@ def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
     for frame in frames:
         np.testing.assert_array_equal(frame.position[prescribed], rest[prescribed] + place(UP, frame.time))
     others = (frames[-1].position - rest)[~prescribed]
-    assert (
-        0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
-    )  # it swings about the end of the path
-    moved = np.linalg.norm(others, axis=1)
-    assert moved.min() > 0
+    # it swings about the end of the path
+    assert 0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
+    assert np.linalg.norm(others, axis=1).min() > 0
 
 
 def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_both(tmp_path: Path):
@@ -91,27 +89,19 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     play(led_scene(tmp_path, 1, anchors[1:]))
 
 
-def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path: Path, capsys):
+def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(tmp_path: Path, petsc_options):
     """And one of the user's that the first solver used is not called unused, nor taken out with our defaults."""
-    from petsc4py import PETSc
-
     scene = load_scene(led_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
-    database = PETSc.Options()
-    database.setValue("ksp_rtol", "1e-8")
-    try:
-        with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-            first = simulation.integrator.stepper
-            assert len(list(simulation.frames())) == 4
-            second = simulation.integrator.stepper
-            assert second is not first and second.ksp.getTolerances()[0] == 1e-8
+    petsc_options(ksp_rtol="1e-8")
+    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+        first = simulation.integrator.stepper
+        assert len(list(simulation.frames())) == 4
+        second = simulation.integrator.stepper
+        assert second is not first and second.ksp.getTolerances()[0] == 1e-8
+        simulation.refuse_unused_options(at_end=True)
+        petsc_options(ksp_tpye="cg")
+        with pytest.raises(InputError, match="-ksp_tpye"):
             simulation.refuse_unused_options(at_end=True)
-            database.setValue("ksp_tpye", "cg")
-            with capsys.disabled(), pytest.raises(InputError, match=r"-ksp_tpye: .*'ksp_type'"):  # PETSc's own stdout
-                simulation.refuse_unused_options(at_end=True)
-        assert database.getString("ksp_rtol") == "1e-8"
-    finally:
-        database.delValue("ksp_rtol")
-        database.delValue("ksp_tpye")
 
 
 # ---- painted regions
@@ -127,7 +117,6 @@ def balls(tmp_path_factory) -> Path:
     ball.export(folder / "ball.ply")
     (folder / "numbers.txt").write_text("3 17\n3\n\n  101\n")
     (folder / "words.txt").write_text("3 17 left\n")
-    (folder / "empty.txt").write_text("\n")
     (folder / "negative.txt").write_text("3 -1\n")
     (folder / "binary.txt").write_bytes(bytes(range(256)))
     (folder / "scene.toml").write_text(
@@ -179,7 +168,6 @@ WRONG = {
     "[3, 162]": ["pin.0.region.painted", "there is no point 162", "162"],
     "gone.txt": ["gone.txt cannot be read"],
     "words.txt": ["words.txt is no list of whole numbers"],
-    "empty.txt": ["empty.txt must list point numbers"],
     "negative.txt": ["negative.txt must list point numbers"],
     "binary.txt": ["binary.txt is no list of whole numbers"],
     "[3, -1]": ["pin.0.region.painted", "point numbers, from 0"],
@@ -207,8 +195,7 @@ def runs(balls: Path) -> dict[int, tuple[Path, list]]:
         for value in WRONG:
             commands += [[balls / "scene.toml", "-o", out / "wrong.h5", "--set", f"pin.0.region.painted={value}"]]
         commands = [["run", *map(str, command), "-ksp_rtol", "1e-8"] for command in commands]
-        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=300)
-        assert done.returncode == 0, done.stderr
+        done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(commands), timeout=300, status=0)
         found[ranks] = out, [json.loads(line) for line in done.stdout.splitlines()]
     return found
 

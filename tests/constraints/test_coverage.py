@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,11 @@ def build(folder: Path, **tables) -> Model:
     return build_model(MPI.COMM_SELF, scene)
 
 
+def assert_warns(lines: list[tuple[str, str]], words: str) -> None:
+    """One warning, which begins so."""
+    assert [(level, line[: len(words)]) for level, line in lines] == [("WARNING", words)]
+
+
 @pytest.fixture
 def heard(caplog):
     """heard() -> the lines since the last call, by level."""
@@ -47,9 +53,6 @@ def force(region: dict, **more) -> dict:
     return {"region": region, "total": [0, 0, -1.0]} | more
 
 
-NOT_FREE = "force.0 moves nothing: of the 15 nodes in its region none is free while it acts, pins and anchors hold all"
-
-
 @pytest.mark.parametrize(
     "tables",
     [
@@ -60,7 +63,7 @@ NOT_FREE = "force.0 moves nothing: of the 15 nodes in its region none is free wh
     ids=["pinned", "led", "led for as long as it acts"],
 )
 def test_a_force_on_no_free_node_is_refused(tmp_path, tables):
-    with pytest.raises(InputError, match=NOT_FREE):
+    with pytest.raises(InputError, match="moves nothing"):
         build(tmp_path, **tables)
 
 
@@ -80,12 +83,9 @@ def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
 
 def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path, heard):
     twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
-    with pytest.raises(
-        InputError, match=r"anchor.1: of the 15 nodes in its region 15 are led by an anchor before it: it leads none"
-    ):
-        build(tmp_path, anchor=twice)
-    with pytest.raises(InputError, match=r"anchor.0: of the 15 nodes in its region 15 are pinned: it leads none"):
-        build(tmp_path, anchor=twice[:1], pin=[{"region": LEFT_HALF}])
+    for number, more in ((1, {"anchor": twice}), (0, {"anchor": twice[:1], "pin": [{"region": LEFT_HALF}]})):
+        with pytest.raises(InputError, match=rf"anchor.{number}: .* it leads none"):
+            build(tmp_path, **more)
     build(tmp_path, anchor=[twice[0], twice[0]])
     assert heard() == []  # both say the same of every node
 
@@ -93,11 +93,8 @@ def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path, heard)
 def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):
     low, low_edge = {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}, {"box": [[0, 0, 0], [0.5, 0.01, 0.01]]}  # 25 and 5 nodes
     build(tmp_path, anchor=[{"region": LEFT, "path": UP}, {"region": low, "path": ASIDE}], pin=[{"region": low_edge}])
-    assert heard() == [
-        ("WARNING", "anchor.0: of the 15 nodes in its region 1 is pinned, which it does not lead"),
-        ("WARNING", "anchor.1: of the 25 nodes in its region 5 are pinned and 4 are led by an anchor before it, "
-                    "which it does not lead"),
-    ]  # fmt: skip
+    first, second = (line for level, line in heard() if level == "WARNING")
+    assert re.findall(r"\d+", first) == ["0", "15", "1"] and re.findall(r"\d+", second) == ["1", "25", "5", "4"]
 
 
 def test_pins_may_overlap(tmp_path, heard):
@@ -110,60 +107,48 @@ def test_a_part_that_changes_nothing_is_warned_of(tmp_path, heard):
     build(tmp_path, part=[part], pin=[{"region": LEFT}])
     assert heard() == []
     build(tmp_path, part=[part], pin=[{"region": TWO_LAYERS}])
-    assert heard() == [("WARNING", "part.0 has no effect: pins and anchors hold all nodes of its 8 cells")]
+    assert_warns(heard(), "part.0 has no effect: pins and anchors")
     stiffer = part | {"young_modulus": 1e6}
     build(tmp_path, part=[part, {"region": LEFT_HALF, "density": 700.0}])
-    assert heard() == [("WARNING", "part.0 has no effect: later parts give all that it gives, on all its 8 cells")]
+    assert_warns(heard(), "part.0 has no effect: later parts")
     build(tmp_path, part=[stiffer, {"region": LEFT_HALF, "density": 700.0}])
     assert heard() == []  # its stiffness counts
-    with pytest.raises(InputError, match=r"part.0.region holds the centre of no cell"):
-        build(tmp_path, part=[part | {"region": {"box": [[5, 5, 5], [6, 6, 6]]}}])
 
 
 @pytest.mark.parametrize(
-    ("start", "stop", "integrator", "line"),
+    ("start", "stop", "integrator", "level"),
     [
-        (0.0, 0.005, "implicit-euler", ("WARNING", "from 0 s to 0.005 s, between the ends of steps of 0.01 s")),
-        (0.012, 0.018, "bdf2", ("WARNING", "from 0.012 s to 0.018 s, between the ends of steps of 0.01 s")),
-        (0.2, None, "implicit-euler", ("INFO", "from 0.2 s on, and the run ends at 0.1 s")),
+        (0.0, 0.005, "implicit-euler", "WARNING"),  # between the ends of steps
+        (0.012, 0.018, "bdf2", "WARNING"),
+        (0.2, None, "implicit-euler", "INFO"),  # after the end
         (0.0, 0.005, "verlet", None),
         (0.1, None, "implicit-euler", None),
         (0.03, 0.035, "implicit-euler", None),
     ],
 )
-def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator, line):
+def test_what_acts_in_no_step_is_noted(tmp_path, heard, start, stop, integrator, level):
     times = {"start": start} | ({"stop": stop} if stop else {})
     ground = {"shape": "plane", "point": [0, 0, -1], "normal": [0, 0, 1]}
     build(tmp_path, force=[force(RIGHT, **times)], obstacle=[ground | times], time=TIME | {"integrator": integrator})
-    wanted = (
-        [(line[0], f"{key} acts in no step: it is there {line[1]}") for key in ("force.0", "obstacle.0")]
-        if line
-        else []
-    )
-    assert heard() == wanted
+    wanted = [(level, f"{key} acts in no step") for key in ("force.0", "obstacle.0") if level]
+    assert [(found, line.partition(":")[0]) for found, line in heard()] == wanted
 
 
 @pytest.mark.parametrize(
     ("side", "mesh", "words"),
     [
-        (300.0, {}, "the body is 300 m long, and the scene gives no mesh.size: is the mesh in millimetres?"),
-        (
-            0.0005,
-            {},
-            "the body is 0.0005 m long, and the scene gives no mesh.size: is the mesh in another unit than metres?",
-        ),
-        (20.0, {}, None),
-        (0.001, {}, None),
-        (300.0, {"size": 30.0}, None),
+        (300.0, {}, ["300 m long", "millimetres"]),
+        (0.0005, {}, ["0.0005 m long", "another unit"]),
+        (20.0, {}, []),
+        (0.001, {}, []),
+        (300.0, {"size": 30.0}, []),
     ],
 )
 def test_a_body_of_an_odd_size_is_warned_of_before_it_is_filled(tmp_path, heard, side, mesh, words):
     path = block_scene(tmp_path, [side, side / 2, side / 2], mesh={"source": "scene.ply"} | mesh, time=TIME)
     read_bodies(MPI.COMM_SELF, load_scene(path))
-    assert heard() == ([("WARNING", f"scene.ply: {words}")] if words else [])
-
-
-# The first and the last lines
+    lines = heard()
+    assert len(lines) == (len(words) > 0) and all(word in lines[0][1] for word in words)
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
@@ -173,15 +158,12 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
         anchor=[{"region": RIGHT, "path": UP, "stop": 0.01}], force=[force(LEFT_HALF)],
     )  # fmt: skip
     out = tmp_path / "out" / "x.h5"
-    done = run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", out, "--measure", tmp_path / "cost.json")
-    assert done.returncode == 0, done.stderr
+    done = run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", out, "--measure", tmp_path / "cost.json", status=0)
     lines = [line for line in done.stderr.splitlines() if "compiling" not in line]
     said = [line.removeprefix("msmpetsc: note: ") for line in lines if line.startswith("msmpetsc:")]
-    assert said[:3] == [
-        "body of 0.5 x 0.5 x 0.25 m; closed mesh of 0.0625 m^3, 62.5 kg; lattice of 0.0625 m^3, 62.5 kg",
-        f"32 cells of 0.125 m, 75 nodes (15 pinned), 554 springs on {ranks} rank{'s' * (ranks > 1)}",
-        "anchor.0 leads 15 nodes, force.0 pulls 45 nodes (15 of them held)",
-    ]
+    assert said[0].startswith("body of 0.5 x 0.5 x 0.25 m;")
+    assert said[1].startswith(f"32 cells of 0.125 m, 75 nodes (15 pinned), 554 springs on {ranks} rank")
+    assert said[2] == "anchor.0 leads 15 nodes, force.0 pulls 45 nodes (15 of them held)"
     assert lines[:3] == [f"msmpetsc: note: {line}" for line in said[:3]] and lines[3].startswith("frame 0/2")
     assert len(said) == 5 and said[3].startswith("took ") and said[3].endswith(" s of it before the first step")
     assert said[4].startswith(f"left 3 frames in {out} (") and f"{out.with_suffix('.xdmf')} (" in said[4]
@@ -214,8 +196,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
         + [word for key, value in given.items() for word in ("--set", f"{key}={toml_value(value)}")]
         for number, given in enumerate(tables.values())
     ]
-    done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands))
-    assert done.returncode == 0, done.stderr
+    done = run(2, "-c", IN_ONE_PROCESS, json.dumps(commands), status=0)
     for words, status, line in zip(tables, (2, 2, 0), done.stdout.splitlines(), strict=True):
         answers = json.loads(line)
         assert [given for given, _ in answers] == [status] * 2 and answers[1][1] == "", answers

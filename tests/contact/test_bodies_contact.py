@@ -8,10 +8,9 @@ import pytest
 import tomli_w
 import trimesh
 from block_scene import play
-from conftest import run
+from conftest import result_on
 from crossings import count_crossings
 
-import msmpetsc as package
 from msmpetsc.build import Model
 from msmpetsc.fields import Frame
 
@@ -91,10 +90,7 @@ def test_on_three_ranks_they_end_as_on_one(folder: Path):
     tight = {"preset": "newton", "error": 1e-9}
     path = fall(folder, "ranks", 0.002, time={"step": 0.01, "duration": 0.04}, solver=tight)
     _, frames = play(path)
-    done = run(3, "-m", "msmpetsc", "run", path, "-o", folder / "three.h5", timeout=150)
-    assert done.returncode == 0, done.stderr
-    with package.open(folder / "three.h5") as result:
-        positions, rest = result.frames.position[:], result.lattice.nodes[:]
-        assert result.frames.self_contacts[:][-1] > 0
-    expected = np.array([frame.position for frame in frames])
-    assert np.abs(positions - expected).max() < 1e-6 * np.abs(expected - rest).max()
+    three = result_on(3, path, timeout=150)
+    assert three["frames/self_contacts"][-1] > 0
+    expected, rest = np.array([frame.position for frame in frames]), three["lattice/nodes"][:]
+    assert np.abs(three["frames/position"] - expected).max() < 1e-6 * np.abs(expected - rest).max()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
+from block_scene import CELL, DENSITY, SIDES, STIFFEST, YOUNG, G, block_scene, play
 from mpi4py import MPI
 from obstacles import box, plane, sphere
 
@@ -259,6 +259,27 @@ def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_pat
     assert np.log2(errors[0] / errors[1]) > 1.6 and np.log2(errors[1] / errors[2]) > 1.6
 
 
+PRESSING_PLANE = {
+    "shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty", "friction": 0.8,
+    "path": [{"time": 1.0, "by": [0, 0, 0.3]}],
+}  # fmt: skip
+SLIDES = {  # it falls on the ground, slides a little and is pressed
+    "sides": np.array([6, 3, 3]) * CELL,
+    "mesh": {"source": "scene.ply", "base": [0, 0, 0.01]},
+    "start": {"velocity": [0.3, 0.0, -1.5]},
+    "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+    "material": {"young_modulus": 1e5, "density": 1000.0},
+    "time": {"step": 0.02, "duration": 0.2},
+    "obstacle": [PRESSING_PLANE],
+    "solver": {"preset": "newton-multigrid", "error": 1e-6},
+}
+
+
+def test_secants_of_friction_save_iterations(tmp_path: Path):
+    """Newton takes 73 in all; with true curvatures alone it is 83, with secants alone 256."""
+    assert sum(frame.iterations for frame in play(block_scene(tmp_path, **SLIDES))[1]) < 78
+
+
 # ---- a press
 
 TALL = np.array([0.25, 0.25, 0.5])
@@ -322,9 +343,6 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
     norm = lambda v: np.sqrt((v**2).sum(axis=1) @ lattice.mass)  # noqa: E731
     assert norm(result.position - exact) <= 1.5 * result.cost.step_error * norm(exact - (2 * q - before))
     assert result.cost.step_error <= 1e-3 and contact.energy(result.position) > 0
-
-
-# ---- obstacles that move, and that act for a while
 
 
 def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its_own_reversed():

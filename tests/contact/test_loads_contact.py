@@ -1,16 +1,10 @@
-"""Regions, forces shared out over them, and nodes that bounce off a plane."""
+"""Regions, and forces shared out over them."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from mpi4py import MPI
 
-from msmpetsc.constraints.loads import Load, Motion, spread_by_mass
-from msmpetsc.contact.obstacles.moving_solid import Obstacle
-from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
-from msmpetsc.contact.obstacles.solids import Faces
+from msmpetsc.constraints.loads import Load, spread_by_mass
 from msmpetsc.geometry.inside import inside
 from msmpetsc.scene.body import Region
 
@@ -55,28 +49,3 @@ def test_force_is_shared_out_by_mass():
 def test_a_time_that_is_rounded_beside_start_or_stop_counts_as_it():
     late = np.nextafter(1.8, 0)
     assert not Load(np.zeros((1, 3)), 0.0, 1.8).acts_at(late) and Load(np.zeros((1, 3)), 1.8, 2.0).acts_at(late)
-
-
-STILL = Motion.through(())
-
-
-def exchanged(q, q_previous, point, normal, e):
-    """At a plane at rest."""
-    return Exchange(Obstacle(Faces(point[None], normal[None]), STILL), e).exchanged(q, q_previous, StepTaken(1.0, 0.1))
-
-
-coordinates = arrays(float, (6, 3), elements=st.integers(-64, 64).map(lambda x: x / 16))
-
-
-@settings(deadline=None)  # the first example compiles
-@given(coordinates, coordinates, st.sampled_from([0.0, 0.25, 1.0]), st.sampled_from([0, 1, 2]), st.integers(-2, 2))
-def test_normal_velocity_becomes_minus_e_times_itself(q, q_previous, e, axis, height):
-    normal = np.eye(3)[axis] * (-1 if height < 0 else 1)
-    after, before = exchanged(q, q_previous, height * normal, normal, e)
-    v, v_after = q - q_previous, after - before
-    hit = ((q @ normal) <= height) & (v @ normal < 0)
-    assert np.array_equal(v_after @ normal, np.where(hit, -e * (v @ normal), v @ normal))
-    along = np.eye(3)[np.arange(3) != axis]
-    assert np.array_equal(after @ along.T, q @ along.T) and np.array_equal(before @ along.T, q_previous @ along.T)
-    assert np.array_equal(after[~hit], q[~hit]) and np.array_equal(before[~hit], q_previous[~hit])
-    assert np.array_equal(after[hit] @ normal, q_previous[hit] @ normal)  # back where it came from

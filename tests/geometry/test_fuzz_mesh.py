@@ -58,14 +58,15 @@ def mz3() -> bytes:
     return header + BOX.faces.astype("<i4").tobytes() + BOX.vertices.astype("<f4").tobytes()
 
 
-def gltf() -> bytes:
-    """With its buffers as text in it."""
-    binary = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
-    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+IN_GLTF = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes()
+
+
+def gltf(uri: str = "data:application/octet-stream;base64," + base64.b64encode(IN_GLTF).decode()) -> bytes:
+    """With its buffers as text in it, or in another file."""
     tree = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}],
         "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
-        "buffers": [{"uri": uri, "byteLength": len(binary)}],
+        "buffers": [{"uri": uri, "byteLength": len(IN_GLTF)}],
         "bufferViews": [
             {"buffer": 0, "byteLength": 96}, {"buffer": 0, "byteOffset": 96, "byteLength": 144, "byteStride": 4},
         ],
@@ -189,7 +190,6 @@ TRIANGLE = "0 0 0\n1 0 0\n0 1 0\n"
 REFUSED = {
     "10^12 points": ("ply", ply(10**12, 1), "claims more than the file holds"),
     "10^12 triangles": ("stl", bytes(80) + b"\xff\xff\xff\xff" + bytes(50), "holds no triangles"),
-    "10^12 of OFF": ("off", b"OFF\n1000000000000 1000000000000 0\n", "not a readable OFF"),
     "a single coordinate each": ("obj", b"v 1\nv 2\nv 3\nf 1 2 3\n", "not of three numbers each"),
     "control characters": ("ply", b"ply\nformat ascii 1.0\n\x1b[31m 3\nend_header\n", "x.ply"),
     "one point": ("obj", b"v 0 0 0\nf 1 1 1\n", "fewer than four points"),
@@ -200,12 +200,9 @@ REFUSED = {
     ),
     "nothing": ("ply", b"", "is empty"),
     "a page": ("vtu", b"<html><body>404</body></html>", "not a readable VTU"),
-    "another version": ("vtk", b"# vtk DataFile Version 9.9\nhello\n", "not a readable VTK"),
-    "half a header": ("mz3", b"MZ", "not a readable MZ3"),
     "words": ("obj", b"hello\nworld\n", "no triangles"),
     "not a number": ("ply", ply(3, 1, "0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"), "NaN or infinite"),
     "no such point": ("ply", ply(3, 1, TRIANGLE + "3 0 1 7\n"), "outside 0..2: 7"),
-    "a point below 0": ("ply", ply(3, 1, TRIANGLE + "3 0 1 -1\n"), "outside 0..2: -1"),
     "too few rows": ("ply", ply(3, 2, TRIANGLE + "3 0 1 2\n"), "1 of 2 face rows"),
     "a document": ("docx", b"PK", "not a mesh format"),
 }  # fmt: skip
@@ -258,26 +255,17 @@ def test_a_mesh_opens_no_other_file(tmp_path, opened, kind):
     assert [name for name in opened if str(tmp_path) in name] == [str(tmp_path / f"x.{kind}")]
 
 
-GLTF = (
-    '{"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "buffers": [{"uri": "%s",'
-    ' "byteLength": 36}], "bufferViews": [{"buffer": 0, "byteLength": 36}], "accessors": [{"bufferView": 0,'
-    ' "componentType": 5126, "type": "VEC3", "count": 3}], "meshes": [{"primitives":'
-    ' [{"attributes": {"POSITION": 0}}]}]}'
-)
-
-
 @pytest.mark.parametrize("name", ["../secret.bin", "link.bin", "pipe.bin", "/etc/passwd", "", "."])
 def test_a_gltf_names_files_of_its_folder_only(tmp_path, opened, name):
     folder = tmp_path / "folder"
     folder.mkdir()
-    points = np.eye(3, dtype="<f4").tobytes()
-    (tmp_path / "secret.bin").write_bytes(points)
+    (tmp_path / "secret.bin").write_bytes(IN_GLTF)
     (folder / "link.bin").symlink_to("../secret.bin")
     os.mkfifo(folder / "pipe.bin")
-    (folder / "own.bin").write_bytes(points)
-    (folder / "x.gltf").write_text(GLTF % "own.bin")
-    assert len(read_surface(folder / "x.gltf").points) == 3
-    (folder / "x.gltf").write_text(GLTF % name)
+    (folder / "own.bin").write_bytes(IN_GLTF)
+    (folder / "x.gltf").write_bytes(gltf("own.bin"))
+    assert len(read_surface(folder / "x.gltf").points) == 8
+    (folder / "x.gltf").write_bytes(gltf(name))
     opened.clear()
     assert "no file in its folder" in refusal(lambda: read_surface(folder / "x.gltf"))
     assert not [one for one in opened if one.endswith((".bin", "passwd"))]
@@ -344,12 +332,7 @@ VTK = b"# vtk DataFile Version 3.0\nx\n"
 HOLLOW = re.sub(rb'"bufferView": 0, (.*?)"count": 8', rb'\1"count": 1000000000', gltf())
 CLAIMS = {
     "a grid of 36 million points": ("vtk", vtk("STRUCTURED_POINTS"), "a grid of points"),
-    "cells of a grid": ("vtk", vtk("structured_grid"), "a grid of points"),
-    "10^9 points of VTK": (
-        "vtk",
-        VTK + b"BINARY\nDATASET UNSTRUCTURED_GRID\nPOINTS 1000000000 double\n",
-        "claims more",
-    ),
+    "10^9 points of VTK": ("vtk", VTK + b"BINARY\nDATASET UNSTRUCTURED_GRID\nPOINTS 1000000000 double\n", "claims"),
     "10^9 zeros of glTF": ("gltf", HOLLOW, "claims more"),
     "packed a thousandfold": ("vtu", vtu(10**7), "times as long"),
     "in many blocks": ("vtu", vtu(10**5, blocks=1000), "times as long"),

@@ -1,8 +1,6 @@
 """Named models: where they are looked for, fetching (from this machine only), the command."""
 
 import hashlib
-import os
-import subprocess
 import sys
 import threading
 from dataclasses import replace
@@ -13,14 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from one_process import input_error
 
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.commands import fetch as command
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import registry
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.registry import MODELS, Download, NamedMesh, Packaged, fetch, load, locate
-from msmpetsc.geometry.surface import examine
 
 
 def sha256(content: bytes) -> str:
@@ -142,9 +139,7 @@ def test_a_model_of_several_files_is_here_only_with_all_of_them(toy, site, monke
 
 def test_a_fetched_file_is_checked(toy, site):
     (site[0] / "box.stl").write_bytes(COPY)
-    with pytest.raises(InputError, match="SHA-256 differs") as caught:
-        fetch("toybox")
-    assert "\n" not in str(caught.value)
+    assert "SHA-256 differs" in input_error(lambda: fetch("toybox"))
     with pytest.raises(InputError, match="is not here"):
         locate("toybox", toy)
 
@@ -156,44 +151,8 @@ def test_a_failed_connection_is_one_line(toy, site, monkeypatch, capfd):
         fetch("toybox")
     closed = Download("http://127.0.0.1:9/box.stl", sha256(ORIGINAL))  # nothing answers there
     monkeypatch.setitem(MODELS, "toybox", replace(MODELS["toybox"], downloads=(closed,)))
-    with pytest.raises(InputError, match=r"cannot fetch .*ConnectionError") as caught:
-        fetch("toybox")
-    assert "\n" not in str(caught.value)
+    assert "ConnectionError" in input_error(lambda: fetch("toybox"))
     assert capfd.readouterr() == ("", "")
-
-
-def test_paths_are_relative_to_the_scene(tmp_path):
-    (tmp_path / "mine.ply").write_bytes(COPY)
-    assert locate("mine.ply", tmp_path) == tmp_path / "mine.ply"
-    assert locate(str(tmp_path / "mine.ply"), "elsewhere") == tmp_path / "mine.ply"
-    assert examine(load("mine.ply", tmp_path)).volume == pytest.approx(1)
-    with pytest.raises(InputError, match="did you mean 'dragon'"):
-        locate("dargon", tmp_path)
-    with pytest.raises(InputError, match=r"no file: .*none.ply"):
-        locate("none.ply", tmp_path)
-
-
-def test_the_bunny_scan_needs_only_its_package():
-    pytest.importorskip("pymeshfix")
-    script = (
-        "import sys; from msmpetsc.geometry.registry import load; s = load('bunny_scan', '.');"
-        "print(len(s.points), len(s.triangles), 'pymeshfix' in sys.modules)"
-    )
-    environment = {k: v for k, v in os.environ.items() if k != "MSMPETSC_MESH_DIR"}
-    environment["PYTHONPATH"] = str(Path(registry.__file__).parents[2])
-    output = subprocess.run(
-        [sys.executable, "-c", script],
-        env=environment, capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
-    assert output.stdout.split() == ["50000", "99785", "False"] and output.stderr == ""
-
-
-def test_local_copies_are_what_the_table_says():
-    folder = os.environ.get("MSMPETSC_MESH_DIR")
-    if not folder:
-        pytest.skip("MSMPETSC_MESH_DIR is not set")
-    for name, model in MODELS.items():
-        assert locate(name, "nowhere") == Path(folder) / model.copy
 
 
 def test_the_command_fetches_and_lists(toy, capsys):

@@ -96,20 +96,3 @@ def test_what_encloses_nothing_is_refused():
     fold = Surface(corner, np.array([[0, 1, 2], [0, 2, 1], [0, 2, 3], [0, 3, 2]]))
     with pytest.raises(InputError, match="folded"):
         check_encloses(fold, examine(fold))
-
-
-def test_doubts_are_named():
-    surface = box()
-
-    def doubts(triangles):
-        changed = Surface(surface.points, triangles)
-        return " / ".join(check_encloses(changed, examine(changed)))
-
-    holed = doubts(surface.triangles[1:])
-    assert "3 boundary edges" in holed and "winding number" in holed and "inwards" not in holed
-    assert "inwards (volume -6" in doubts(surface.triangles[:, ::-1])
-    flipped = surface.triangles.copy()
-    flipped[0] = flipped[0, ::-1]
-    assert "3 edges have triangles wound against" in doubts(flipped)
-    doubled = np.vstack([surface.triangles, surface.triangles[:1]])
-    assert "more than two triangles" in doubts(doubled)

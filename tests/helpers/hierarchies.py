@@ -183,11 +183,11 @@ class Case:
     def size(self) -> int:
         return 3 * self.unknowns.total
 
-    def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None]) -> np.ndarray:
-        """Matrix of what writes into its second vector, column by column (collective)."""
+    def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None], every: int = 1) -> np.ndarray:
+        """Matrix of what writes into its second vector, column by column, or some of its columns (collective)."""
         first = self.multigrid.operator.getOwnershipRange()[0] // 3
-        own = np.empty((3 * self.unknowns.size, self.size))
-        for column in range(self.size):
+        own = np.zeros((3 * self.unknowns.size, self.size))
+        for column in range(0, self.size, every):
             node, c = column // 3 - first, column % 3
             chosen = self.unknowns.columns_to_write(self.x)
             chosen[:] = 0

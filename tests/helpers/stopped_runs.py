@@ -3,7 +3,7 @@
 import os
 import signal
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -13,6 +13,7 @@ from block_scene import block_scene
 
 from msmpetsc.results.reader import finished
 from msmpetsc.solve import simulate
+from msmpetsc.solve.simulate import TimeLoop
 
 EVERY, STEPS = 3, 40
 
@@ -51,19 +52,31 @@ def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
                 assert np.array_equal(found, expected, equal_nan=True), name
 
 
-def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
-    """This process gets the signal when the run has taken that step."""
-    from msmpetsc.solve.simulate import TimeLoop
-
+def at_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object], is_stored: bool = True) -> None:
+    """Have ``action`` happen when the run has taken that step, its frame stored or not yet."""
     advance = TimeLoop.advance
 
     def watched(simulation):
         for frame in advance(simulation):
-            if simulation.step == step:
-                os.kill(os.getpid(), number)
+            if simulation.step == step and not is_stored:
+                action()
             yield frame
+            if simulation.step == step and is_stored:
+                action()
 
     monkeypatch.setattr(TimeLoop, "advance", watched)
+
+
+def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
+    """This process gets the signal when the run has taken that step."""
+    at_step(monkeypatch, step, lambda: os.kill(os.getpid(), number), is_stored=False)
+
+
+def assert_equal(found: dict, expected: dict) -> None:
+    """Frames or checkpoints, bit by bit, but for how long they took."""
+    assert found.keys() == expected.keys()
+    for name in expected.keys() - {"wall_time", "Effort.work.wall_time"}:
+        assert expected[name] is None or np.array_equal(found[name], expected[name], equal_nan=True), name
 
 
 def ranks_of(mpiexec: subprocess.Popen) -> list[int]:

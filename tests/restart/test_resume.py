@@ -14,9 +14,18 @@ import numpy as np
 import pytest
 import tomli_w
 from block_scene import block_scene
-from conftest import WORKERS
+from conftest import WORKERS, run
 from mpi4py import MPI
-from stopped_runs import STEPS, assert_same, every_step_forgets, hanging, signal_after  # noqa: F401  # a fixture
+from one_process import command_error
+from stopped_runs import (  # noqa: F401  # a fixture
+    STEPS,
+    assert_equal,
+    assert_same,
+    at_step,
+    every_step_forgets,
+    hanging,
+    signal_after,
+)  # fmt: skip
 
 from msmpetsc.app.resume import Resumed
 from msmpetsc.build import build_model
@@ -103,12 +112,6 @@ CASES = {
 }
 
 
-def assert_equal(found: dict, expected: dict) -> None:
-    assert found.keys() == expected.keys()
-    for name in expected.keys() - {"wall_time", "Effort.work.wall_time"}:
-        assert np.array_equal(found[name], expected[name], equal_nan=True) if expected[name] is not None else True, name
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path, case, monkeypatch):
     """Every number of the frame and of the next checkpoint, bit by bit, from several steps of the run."""
@@ -178,16 +181,12 @@ def test_what_was_asked_for_beside_the_frames_is_there_after_going_on(whole: Pat
 def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path, monkeypatch):
     """A checkpoint at the start alone, and a failure later: not one frame is written again."""
     path = tmp_path / "x.h5"
+
+    def killed() -> None:
+        raise InterruptedError
+
     with monkeypatch.context() as patch:
-        advance = TimeLoop.advance
-
-        def killed(simulation):
-            for frame in advance(simulation):
-                yield frame
-                if simulation.step == 21:
-                    raise InterruptedError
-
-        patch.setattr(TimeLoop, "advance", killed)
+        at_step(patch, 21, killed)
         arguments = ["-o", str(path), "--true-error", "3", "--checkpoint-every", "1h"]
         assert main(["run", str(whole.parent / "scene.toml"), *arguments]) == 1
     with h5py.File(path) as file:
@@ -220,10 +219,8 @@ def test_another_scene_is_refused_with_its_keys(stopped: Path, capsys):
     given = ["--set", "time.duration=0.8", "--set", "material.density=900", "--preset", "anderson"]
     assert main(["run", str(scene), "--resume", str(stopped), *given]) == 2
     told = capsys.readouterr().err
-    assert f"time.duration: 0.4 in {stopped}, 0.8 now" in told
-    assert f"material.density: 1000.0 in {stopped}, 900.0 now" in told
-    assert f"solver.preset: newton in {stopped}, anderson now" in told
-    assert "--force goes on all the same" in told
+    for key, earlier in (("time.duration", 0.4), ("material.density", 1000.0), ("solver.preset", "newton")):
+        assert f"{key}: {earlier} in {stopped}" in told
     assert main(["run", "--resume", str(stopped), "--set", "time.step=0.005", "--force"]) == 2
     assert "time.step: 0.01 in" in capsys.readouterr().err
     assert stopped.read_bytes() == before
@@ -256,17 +253,9 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
 
 def left_by_a_kill(monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]) -> None:
     """The run's file as a kill after that step would leave it."""
-    advance = TimeLoop.advance
-
-    def watched(simulation):
-        for frame in advance(simulation):
-            yield frame
-            if simulation.step == step:
-                left.append(path.read_bytes())
-
     left: list[bytes] = []
     with monkeypatch.context() as patch:
-        patch.setattr(TimeLoop, "advance", watched)
+        at_step(patch, step, lambda: left.append(path.read_bytes()))
         assert main(arguments) == 0
     path.write_bytes(left[0])
 
@@ -306,22 +295,20 @@ def test_another_start_takes_no_frame_of_before_the_first_checkpoint(whole: Path
     assert_same(path, tmp_path / "other.h5")
 
 
-def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path, capsys):
+def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path):
     block_scene(tmp_path, sides=np.array([0.5, 0.5, 0.375]), name="other")
     with h5py.File(stopped, "r+") as file:
         scene = tomllib.loads(file.attrs["scene"])
         other = scene["mesh"]["source"] = str(tmp_path / "other.ply")
         file.attrs["scene"] = tomli_w.dumps(scene)
-    assert main(["run", "--resume", str(stopped), "--set", f"mesh.source={other}"]) == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert len(told) == 1 and "the mesh has changed: lattice/nodes" in told[0]
+    assert "the mesh has changed" in command_error("run", "--resume", stopped, "--set", f"mesh.source={other}")
     with h5py.File(stopped) as file:
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
 @pytest.mark.parametrize(("step", "value"), [(9, 1e160), (10, 1e8)])
 @pytest.mark.parametrize("name", ["q", "q_previous"])
-def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkeypatch, capsys, name, step, value):
+def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkeypatch, name, step, value):
     """After step 9, of which there is a frame, and step 10, of which there is none."""
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
@@ -331,14 +318,11 @@ def test_positions_that_no_frame_knows_are_refused(whole: Path, tmp_path, monkey
         assert max(file["checkpoint/step"]) == step
         file[f"checkpoint/{name}"][...] = value
     before = path.read_bytes()
-    capsys.readouterr()
-    assert main(["run", "--resume", str(path)]) == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-    assert len(told) == 1 and "damaged" in told[0] and path.read_bytes() == before
+    assert "damaged" in command_error("run", "--resume", path) and path.read_bytes() == before
 
 
 @pytest.mark.parametrize("lies_there", ["mesh", "mesh and another scene"])
-def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path, tmp_path, capsys, lies_there: str):
+def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path, tmp_path, lies_there: str):
     """What it says of its scene's folder is not believed: that scene must lie there, and name the mesh."""
     other = tmp_path / "other"
     other.mkdir()
@@ -350,27 +334,23 @@ def test_a_file_cannot_name_meshes_of_another_folder(whole: Path, stopped: Path,
     with h5py.File(stopped, "r+") as file:
         file.attrs["scene_file"] = str(other / "scene.toml")
     for force in ([], ["--force"]):
-        assert main(["run", "--resume", str(stopped), *force]) == 2
-        told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
-        assert len(told) == 1 and "name the SCENE too" in told[0]
+        assert "name the SCENE too" in command_error("run", "--resume", stopped, *force)
     assert main(["run", str(whole.parent / "scene.toml"), "--resume", str(stopped)]) == 0
 
 
 @pytest.mark.parametrize("option", ["-pc_type python -pc_python_type os.system", "-options_file x", "-log_view :x.py"])
-def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, capsys, tmp_path, monkeypatch, option: str):
+def test_a_file_cannot_make_a_run_do_more_than_solve(stopped: Path, tmp_path, monkeypatch, option: str):
     """Options without effect on results are forgotten, all others that choose no solver are refused."""
     monkeypatch.chdir(tmp_path)
     with h5py.File(stopped, "r+") as file:
         file.attrs["petsc_options"] = option
-    status = main(["run", "--resume", str(stopped)])
-    told = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     if option.startswith("-log_view"):
-        assert status == 0 and not list(tmp_path.glob("x*"))
+        assert main(["run", "--resume", str(stopped)]) == 0 and not list(tmp_path.glob("x*"))
     else:
-        assert status == 2 and len(told) == 1 and "is not taken from a file" in told[0]
+        assert "is not taken from a file" in command_error("run", "--resume", stopped)
 
 
-def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
+def test_a_file_that_is_being_written_is_left_alone(stopped: Path):
     from msmpetsc.results.disk import Lock
 
     held, done = multiprocessing.Event(), multiprocessing.Event()
@@ -385,8 +365,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path, capsys):
     other = multiprocessing.get_context("fork").Process(target=hold)
     other.start()
     held.wait(60)
-    assert main(["run", "--resume", str(stopped)]) == 2
-    assert "is being written by another run" in capsys.readouterr().err
+    assert "is being written by another run" in command_error("run", "--resume", stopped)
     done.set()
     other.join()
     assert main(["run", "--resume", str(stopped)]) == 0
@@ -423,28 +402,22 @@ def test_no_two_hold_a_lock(tmp_path):
 
 @pytest.mark.parametrize("with_its_folder", [False, True])
 @pytest.mark.parametrize("another", [False, True])
-def test_a_file_that_is_removed_while_it_is_written(
-    whole: Path, tmp_path, monkeypatch, capsys, with_its_folder, another
-):
+def test_a_file_that_is_removed_while_it_is_written(whole: Path, tmp_path, monkeypatch, with_its_folder, another):
     """The run stops at its next checkpoint, and what it had is there to go on from."""
     folder, scene = tmp_path / "out", str(whole.parent / "scene.toml")
-    path, advance = folder / "x.h5", TimeLoop.advance
+    path = folder / "x.h5"
 
-    def watched(simulation):
-        for frame in advance(simulation):
-            yield frame
-            if simulation.step == 17:
-                shutil.rmtree(folder) if with_its_folder else path.unlink()
-                folder.mkdir(exist_ok=True)
-                if another:
-                    path.write_text("another")
+    def removed() -> None:
+        shutil.rmtree(folder) if with_its_folder else path.unlink()
+        folder.mkdir(exist_ok=True)
+        if another:
+            path.write_text("another")
 
     with monkeypatch.context() as patch:
-        patch.setattr(TimeLoop, "advance", watched)
-        assert main(["run", scene, "-o", str(path), "--true-error", "3", "--checkpoint-every", "3"]) == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
+        at_step(patch, 17, removed)
+        text = command_error("run", scene, "-o", path, "--true-error", "3", "--checkpoint-every", "3")
     kept = folder / f"x.{os.getpid()}.h5" if another else path
-    assert len(told) == 1 and "was removed while it was written" in told[0] and told[0].endswith(f"--resume {kept}")
+    assert "was removed while it was written" in text and text.endswith(f"--resume {kept}")
     assert os.listdir(folder) == [kept.name] or (another and sorted(os.listdir(folder)) == sorted([kept.name, "x.h5"]))
     with h5py.File(kept) as file:
         assert max(file["checkpoint/step"]) == 18 and finished(file) == 7
@@ -454,21 +427,17 @@ def test_a_file_that_is_removed_while_it_is_written(
 
 
 @pytest.mark.parametrize("given", [[], ["--resume", "none.h5"], ["--resume", "none.h5", "-o", "other.h5"]])
-def test_what_cannot_be_resumed_is_told(given, capsys, monkeypatch, tmp_path):
+def test_what_cannot_be_resumed_is_told(given, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert main(["run", *given]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert command_error("run", *given)
 
 
-def test_on_two_ranks_exactly_and_on_another_number_closely(msmpetsc, tmp_path):
+def test_on_two_ranks_exactly_and_on_another_number_closely(tmp_path):
     """Stopped on two ranks after its fifth step; gone on with on two, and on one."""
     worker = WORKERS / "stop_worker.py"
-    from conftest import run
-
     scene = hanging(tmp_path, 12, solver={"preset": "newton", "error": 1e-10})
     for step, name in ((5, "x.h5"), (-1, "whole.h5")):
-        done = run(2, worker, step, "run", scene, "-o", tmp_path / name)
-        assert done.returncode == 0, done.stderr
+        run(2, worker, step, "run", scene, "-o", tmp_path / name, status=0)
     (tmp_path / "y.h5").write_bytes((tmp_path / "x.h5").read_bytes())
     assert run(2, worker, -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
     assert_same(tmp_path / "x.h5", tmp_path / "whole.h5")

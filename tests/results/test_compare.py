@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_result
+from one_process import command_error
 from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
 
 from msmpetsc.cli.main import main
@@ -19,8 +20,8 @@ DISPLACED = 0.1 * (FRAMES - 1) * 0.5  # [m]: the top of the sheared bar at the l
 
 
 @pytest.fixture
-def a(tmp_path: Path) -> Path:
-    return small_result.write(tmp_path / "a.h5")
+def a(bar_result: Path) -> Path:
+    return bar_result
 
 
 def changed(tmp_path: Path, index: int, **values) -> Path:
@@ -49,7 +50,7 @@ def error_of(a: Path, b: Path, name: str) -> np.ndarray:
 
 def test_a_file_agrees_with_itself(a: Path, capsys):
     status, out, _ = told(capsys, a, a, "--rtol", 0)
-    assert status == 0 and "they agree to 0 at these 5 frames" in out
+    assert status == 0 and "they agree" in out
     assert [line.split()[0] for line in out.splitlines()[1:-1]] == list(COMPARED)
 
 
@@ -57,9 +58,8 @@ def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path,
     node = number(np.array([0.5, 0.5, 0]))
     b = changed(tmp_path, 2, position=moved(2, node, 1e-3 * DISPLACED))
     status, out, _ = told(capsys, a, b)
-    assert status == 1 and "they differ from frame 2 on, t = 0.02 s: position\n" in out
+    assert status == 1 and "from frame 2 on, t = 0.02 s: position\n" in out
     assert f"node {node}, at rest at (0.5, 0.5, 0) m, is 0.0002 m off at frame 2" in out
-    assert "position                  0.001        2           2       0.2 m" in out
     assert told(capsys, a, b, "--rtol", 1.001e-3)[0] == 0
 
 
@@ -70,11 +70,7 @@ def test_the_first_frame_and_node_that_differ_are_named(a: Path, tmp_path: Path,
         ("elastic", 6.0 + 8e-4, 1e-4),
         ("potential", -1.8, 0.1),
         ("momentum", np.array([1, 0.03, 3]), 0.03 / np.sqrt(2 * 12 * 0.25 * 4)),  # m = 12 * 0.25 kg, K = 4 J
-        (
-            "surface",
-            POINTS + np.array([0.03, 0.004, 0]),
-            0.004 / 0.04,
-        ),  # moved by 0.01 m a frame; frame 4 is the farthest
+        ("surface", POINTS + np.array([0.03, 0.004, 0]), 0.1),  # moved by 0.01 m a frame; frame 4 is the farthest
     ],
 )
 def test_errors_are_relative_to_what_is_stated(a: Path, tmp_path: Path, name: str, value, error: float):
@@ -91,7 +87,7 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
     nan = changed(tmp_path, 1, elastic=np.nan)
     assert told(capsys, nan, nan)[0] == 0
     status, out, _ = told(capsys, a, nan)
-    assert status == 1 and "from frame 1 on, t = 0.01 s: elastic" in out and " inf " in out
+    assert status == 1 and "from frame 1 on" in out and " inf " in out
     a, b = np.array([np.nan, np.nan, np.inf, np.inf, 1]), np.array([np.nan, 1, np.inf, -np.inf, np.inf])
     assert difference(a, b, 0.0).tolist() == [0, np.inf, 0, np.inf, np.inf]
 
@@ -111,8 +107,7 @@ def test_rounding_is_no_difference(tmp_path: Path):
 def test_other_times_are_compared_where_shared_and_count(a: Path, tmp_path: Path, capsys):
     b = small_result.write(tmp_path / "b.h5", [frame(index) for index in (0, 2, 4)])
     status, out, _ = told(capsys, a, b)
-    assert status == 1 and "5 and 3 frames, of which 3 have the same time, from 0 s to 0.04 s" in out
-    assert "they agree" in out and "not the same times" in out
+    assert status == 1 and "5 and 3 frames, of which 3 have the same time" in out and "they agree" in out
     late = small_result.write(tmp_path / "c.h5", [frame(0, time=0.5)])
     status, _, said = told(capsys, a, late)
     assert status == 2 and "no finished frame of the same time" in said
@@ -120,8 +115,8 @@ def test_other_times_are_compared_where_shared_and_count(a: Path, tmp_path: Path
 
 def test_frames_are_numbered_as_in_the_first_file(a: Path, tmp_path: Path, capsys):
     b = small_result.write(tmp_path / "b.h5", [frame(2), frame(3, kinetic=5.0), frame(4)])
-    assert f"they differ from frame 3 on, t = {3 * DT:g} s: kinetic" in told(capsys, a, b)[1]
-    assert f"they differ from frame 1 on, t = {3 * DT:g} s: kinetic" in told(capsys, b, a)[1]
+    for pair, index in (((a, b), 3), ((b, a), 1)):
+        assert f"from frame {index} on, t = {3 * DT:g} s: kinetic" in told(capsys, *pair)[1]
 
 
 def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
@@ -135,19 +130,15 @@ def test_fields_that_one_alone_has_are_told(a: Path, tmp_path: Path, capsys):
     [
         (dict(nodes=np.vstack([NODES, [[9, 9, 9]]]), mass=np.ones(13)), "12 and 13 nodes"),
         (dict(nodes=2 * NODES), "cells of 0.5 m and 1 m"),
-        (
-            dict(nodes=NODES + np.array([1e-3, 0, 0])),
-            r"node 0 rests at \(0, 0, 0\) m in one, at \(0.001, 0, 0\) m in the other",
-        ),
+        (dict(nodes=NODES + np.array([1e-3, 0, 0])), r"node 0 rests at \(0, 0, 0\) m in one"),
         (dict(cells=np.full((2, 8), 99)), "lattice/cells names what is not among its 12 nodes"),
     ],
 )
-def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, capsys, lattice: dict, reason: str):
+def test_other_lattices_are_refused_with_the_reason(a: Path, tmp_path: Path, lattice: dict, reason: str):
     n = len(lattice.get("nodes", NODES))
     frames = [frame(i, position=np.zeros((n, 3)), surface=None) for i in range(2)]
     b = small_result.write(tmp_path / "b.h5", frames, surface=False, **lattice)
-    status, _, said = told(capsys, a, b)
-    assert status == 2 and re.search(reason, said) and said.count("\n") == 1, said
+    assert re.search(reason, command_error("compare", a, b))
 
 
 def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> Path:
@@ -162,8 +153,8 @@ def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(a: Pa
     b = other_lattice(tmp_path / "b.h5", by=0.02)
     status, out, _ = told(capsys, a, b)
     largest = np.hypot(0.04, 0.02)  # of a displacement in b
-    assert status == 1 and "different lattices: cells of 0.5 m and 1 m: their surfaces alone are compared" in out
-    assert "they differ from frame 2 on, t = 0.02 s: surface, surface, rms" in out and "surface point 3, at rest" in out
+    assert status == 1 and "their surfaces alone are compared" in out
+    assert "from frame 2 on, t = 0.02 s: surface, surface, rms" in out and "surface point 3, at rest" in out
     with Result(a) as one, Result(b) as other:
         _, mean = compare_surfaces(one, other).fields
         assert mean.scale == pytest.approx(largest, rel=1e-6)
@@ -184,16 +175,14 @@ def test_points_count_by_the_area_around_them(a: Path):
     assert areas == pytest.approx([first, first + second, first + second, second])
 
 
-def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path, capsys):
+def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path):
     b = other_lattice(tmp_path / "b.h5", points=POINTS + np.outer([0, 0, 1, 0], [0, 0.01, 0]))
-    status, _, said = told(capsys, a, b)
-    assert status == 2 and said.count("\n") == 1 and "different meshes: point 2 rests at (0.9, 0.4, 0.4) m" in said
+    assert "different meshes: point 2" in command_error("compare", a, b)
     with pytest.raises(InputError, match="nothing moves"):
         still = small_result.write(tmp_path / "still.h5", [frame(0)])
         surface_error(a, still)
 
 
 @pytest.mark.parametrize("options", [["--rtol", "nan"], ["--rtol", "-1"], ["--rtol", "x"], ["--field"]])
-def test_odd_options_are_refused(a: Path, capsys, options: list[str]):
-    status, _, said = told(capsys, a, a, *options)
-    assert status == 2 and said.startswith("msmpetsc: error: ") and said.count("\n") == 1
+def test_odd_options_are_refused(a: Path, options: list[str]):
+    assert command_error("compare", a, a, *options)

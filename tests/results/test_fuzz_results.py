@@ -6,7 +6,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import small_result
 from bad_input import TRIALS, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,11 +17,6 @@ from msmpetsc.results.reader import refuse_deadly
 from msmpetsc.results.restart import Earlier
 
 SECRET = 7.25
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_result.write(tmp_path_factory.mktemp("fuzz") / "good.h5")
 
 
 def read_all(path: Path) -> None:
@@ -38,15 +32,15 @@ def compared(one: Path, other: Path) -> None:
 
 
 NAMES = ["lattice/nodes", "lattice/cells", "lattice/springs", "lattice/mass", "surface/points", "surface/triangles"]
+NAMES += ["embedding/indptr", "embedding/indices", "embedding/weights", "frames/time", "frames/position"]
 NAMES += [
-    "embedding/indptr",
-    "embedding/indices",
-    "embedding/weights",
-    "frames/time",
-    "frames/position",
     "frames/kinetic",
+    "frames/iterations",
+    "checkpoint/step",
+    "checkpoint/q",
+    "checkpoint/q_previous",
+    "frames/new\nline",
 ]
-NAMES += ["frames/iterations", "checkpoint/step", "checkpoint/q", "checkpoint/q_previous", "frames/new\nline"]
 SHAPES = st.lists(st.sampled_from([0, 1, 2, 3, 5, 12, 10**12]), max_size=4).map(tuple)
 TYPES = st.sampled_from(
     ["f8", "f4", ">f8", "i8", "u1", "S3", "c16", h5py.string_dtype(), h5py.vlen_dtype("f8"), h5py.ref_dtype]
@@ -60,9 +54,9 @@ VALUES = st.sampled_from([np.nan, np.inf, -1, 0, 12, 1e308, 2**62])
         st.tuples(st.sampled_from(NAMES), SHAPES, TYPES, VALUES, st.booleans(), st.booleans()), min_size=1, max_size=2
     )
 )
-def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
+def test_other_contents_are_read_or_refused(bar_result, tmp_path, capfd, edits):
     path = tmp_path / "x.h5"
-    path.write_bytes(whole.read_bytes())
+    path.write_bytes(bar_result.read_bytes())
     with h5py.File(path, "r+") as file:
         for name, shape, kind, value, one_value, packed in edits:
             if one_value and name in file and file[name].size and file[name].dtype.kind in "iuf":
@@ -76,7 +70,7 @@ def test_other_contents_are_read_or_refused(whole, tmp_path, capfd, edits):
             file.create_dataset(
                 name, shape, kind, chunks=(1,) * len(shape) if packed else None, compression="gzip" if packed else None
             )
-    for call in (lambda: read_all(path), lambda: compared(whole, path), lambda: Earlier.read(path)):
+    for call in (lambda: read_all(path), lambda: compared(bar_result, path), lambda: Earlier.read(path)):
         refusal(call)
 
 
@@ -116,9 +110,9 @@ ELSEWHERE = {
 
 @pytest.mark.parametrize("name", ["frames/position", "lattice/nodes", "checkpoint/q"])
 @pytest.mark.parametrize("how", ELSEWHERE)
-def test_no_other_file_is_followed(whole, tmp_path, name, how):
+def test_no_other_file_is_followed(bar_result, tmp_path, name, how):
     path = tmp_path / "x.h5"
-    path.write_bytes(whole.read_bytes())
+    path.write_bytes(bar_result.read_bytes())
     with h5py.File(path, "r+") as file:
         shape = file[name].shape
         ELSEWHERE[how](file, name, tmp_path)
@@ -127,16 +121,16 @@ def test_no_other_file_is_followed(whole, tmp_path, name, how):
     (tmp_path / "secret.bin").write_bytes(np.full(shape, SECRET).tobytes())
     for call in (
         msmpetsc.open,
-        lambda path: compared(whole, path),
+        lambda path: compared(bar_result, path),
         *([Earlier.read] if name == "checkpoint/q" else []),
     ):
         said = refusal(lambda call=call: call(path))
         assert "not followed" in said or "not opened" in said
 
 
-def test_names_and_versions_act_on_no_terminal(whole, tmp_path):
+def test_names_and_versions_act_on_no_terminal(bar_result, tmp_path):
     path = tmp_path / "x.h5"
-    path.write_bytes(whole.read_bytes())
+    path.write_bytes(bar_result.read_bytes())
     with h5py.File(path, "r+") as file:
         file["frames/\x1b[31m"] = np.ones(2)  # too short, and left alone
     assert not refusal(lambda: read_all(path))
@@ -146,12 +140,12 @@ def test_names_and_versions_act_on_no_terminal(whole, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["crashes", "hangs"])
-def test_where_hdf5_itself_fails_a_child_fails(whole, monkeypatch, ending):
+def test_where_hdf5_itself_fails_a_child_fails(bar_result, monkeypatch, ending):
     """The child is made to do what HDF5 does on damaged tables, where no exception comes."""
     from msmpetsc.results import reader
 
     code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]
     monkeypatch.setattr(reader, "PATIENCE", 1)
     monkeypatch.setattr(reader, "_read_tables", lambda path: exec(code, {"os": __import__("os")}))
-    with pytest.raises(InputError, match=f"good.h5 is damaged: the HDF5 library {ending} on it"):
-        refuse_deadly(whole)
+    with pytest.raises(InputError, match=f"bar.h5 is damaged: the HDF5 library {ending} on it"):
+        refuse_deadly(bar_result)

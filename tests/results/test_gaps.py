@@ -1,12 +1,9 @@
 """Gaps of a surface to obstacles and to its own parts: where they are known, and where nothing is to be touched."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import trimesh
 
-from msmpetsc.contact.obstacles.distance import FunctionSolid
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.gaps import SurfaceGaps, gaps_to_obstacles
 from msmpetsc.scene.obstacles import ObstacleTable
@@ -47,34 +44,15 @@ def test_the_nearest_obstacle_counts_where_it_is_by_then():
     assert gaps_to_obstacles([moves, PLANE], {}, points, 0.0) == pytest.approx(-0.2)
 
 
-def ball_as_mesh() -> Surface:
+def test_the_gap_to_a_surface_is_that_to_what_it_encloses():
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
-
-
-def ball_as_function() -> Surface:
-    """As it is drawn: by marching cubes."""
-
-    def distance(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        far = np.linalg.norm(x, axis=1)
-        return far - 0.5, x / np.maximum(far, 1e-12)[:, None]
-
-    return FunctionSolid(distance, "obstacle.0").surface(np.full(3, -0.5), np.full(3, 0.5))
-
-
-SHAPES = [
-    (obstacle(shape="mesh", mesh={"source": "ball.ply"}), ball_as_mesh),
-    (obstacle(shape="function", function="ball"), ball_as_function),
-]
-
-
-@pytest.mark.parametrize(("table", "solid"), SHAPES, ids=["mesh", "function"])
-def test_the_gap_to_a_surface_is_that_to_what_it_encloses(table: ObstacleTable, solid: Callable[[], Surface]):
+    solid = Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    table = obstacle(shape="mesh", mesh={"source": "ball.ply"})
     points = np.random.default_rng(3).normal(size=(200, 3))
     points *= np.linspace(0.3, 0.7, 200)[:, None] / np.linalg.norm(points, axis=1)[:, None]
-    gaps = gaps_to_obstacles([PLANE, table], {1: solid()}, points, 0.0)
+    gaps = gaps_to_obstacles([PLANE, table], {1: solid}, points, 0.0)
     assert gaps == pytest.approx(np.minimum(np.linalg.norm(points, axis=1) - 0.5, points[:, 2] - 1), abs=2e-3)
-    gaps = gaps_to_obstacles([table], {0: solid()}, points, 0.0)
+    gaps = gaps_to_obstacles([table], {0: solid}, points, 0.0)
     assert gaps == pytest.approx(np.linalg.norm(points, axis=1) - 0.5, abs=2e-3)
     assert np.isinf(gaps_to_obstacles([table], {}, points, 0.0)).all()  # a result without its surface
 

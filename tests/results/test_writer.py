@@ -24,8 +24,7 @@ pytestmark = pytest.mark.timeout(60)
 
 
 def run_on_ranks(ranks: int, action: str, path: Path) -> str:
-    done = run(ranks, WORKER, action, path, timeout=40)
-    assert done.returncode == 0, done.stderr
+    done = run(ranks, WORKER, action, path, timeout=40, status=0)
     return done.stdout
 
 

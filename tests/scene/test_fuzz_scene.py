@@ -113,17 +113,6 @@ def test_the_own_scenes_and_studies_name_what_they_may():
             load_study(path)
 
 
-@pytest.mark.parametrize("name", ["huge.ply", "../out.ply"])
-def test_all_ranks_say_the_same_once(folder, msmpetsc, name):
-    (folder / "huge.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"
-    )
-    done = msmpetsc(2, "run", naming(folder, name), "-o", folder / "x.h5", timeout=60)
-    told = [line for line in done.stderr.splitlines() if line.startswith("msmpetsc: error")]
-    assert done.returncode == 2 and len(told) == 1 and "Traceback" not in done.stderr
-    assert not (folder / "x.h5").exists()
-
-
 DEEP = {
     "a key of many parts": b"a" + b".a" * 20_000 + b" = 1\n",
     "in a table that is a value": b"x = [{ y = 1, a" + b".a" * 20_000 + b" = 1 }]\n",

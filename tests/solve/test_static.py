@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from block_scene import DENSITY, YOUNG, G, block_scene, play
 from lattices import COMM, one_spring
+from one_process import input_error
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError, StepFailed
@@ -62,16 +63,6 @@ def test_a_hanging_bar(tmp_path: Path):
     assert longer == pytest.approx(DENSITY * 0.1 * COLUMN[2] ** 2 / (2 * YOUNG), rel=0.02)
 
 
-def test_ends_where_a_motion_comes_to_rest(tmp_path: Path):
-    """Long implicit Euler steps, each of which leaves 1 / (1 + (w t)^2) of a mode."""
-    model, frames = play(column(tmp_path, **BEAM))
-    _, motion = play(column(tmp_path, {"step": 1e3, "duration": 4e3}, **BEAM))
-    bent = np.abs(frames[-1].position - model.lattice.nodes).max()
-    assert bent > 0.5
-    assert np.abs(frames[-1].position - motion[-1].position).max() < 1e-7 * bent
-    assert frames[-1].kinetic == 0 and frames[-1].energy_gained == 0
-
-
 def test_states_under_forces_that_come_and_go(tmp_path: Path):
     """A state for each time; those under the same loads are the same, and cost nothing."""
     states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
@@ -110,9 +101,8 @@ POINT = {"pin": [{"region": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]]}
 
 @pytest.mark.parametrize("tables, words", [({}, "held by nothing"), (POINT, "held at a point or two")])
 def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, words: str):
-    with pytest.raises(InputError, match=words) as refused:
-        play(column(tmp_path, gravity={"acceleration": [0.0, 0.0, -0.1]}, **tables))
-    assert "\n" not in str(refused.value)
+    scene = column(tmp_path, gravity={"acceleration": [0.0, 0.0, -0.1]}, **tables)
+    assert words in input_error(lambda: play(scene))
 
 
 PLANE = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}

@@ -8,7 +8,7 @@ from lattices import COMM, GRAVITY, T, beam, block, cages_of, one_spring, swing,
 from mpi4py import MPI
 
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.errors import StepFailed
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -212,8 +212,3 @@ def test_a_body_pressed_to_half_still_gives_a_descent():
     assert np.sqrt((F**2).sum(axis=1) @ (1 / lattice.mass)) <= 20 * 1e-6 * away
     energy = Elasticity(MPI.COMM_SELF, lattice).energy
     assert energy(x) < energy(pressed)
-
-
-def test_unknown_preset_names_the_nearest():
-    with pytest.raises(InputError, match="did you mean 'newton'"):
-        find_preset("neuton")

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from block_scene import CELL, G, block_scene, play
+from conftest import result_on
 from lattices import block, cages_of, one_spring
 from mpi4py import MPI
 
@@ -16,7 +16,6 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.initial_state import at_rest
 from msmpetsc.lattice.lattice import Lattice, LatticeMaterial, build_lattice
-from msmpetsc.results.reader import Result
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
@@ -259,7 +258,7 @@ def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_two_ranks_give_the_same(tmp_path: Path, msmpetsc):
+def test_two_ranks_give_the_same(tmp_path: Path):
     """With pins, anchors that let go, both kinds of obstacle, friction, and a law that stiffens."""
     floor = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0.1, 1], "response": "penalty", "friction": 0.4}
     wall = {"shape": "plane", "point": [0.55, 0, 0], "normal": [-1, 0, 0], "path": [{"time": 0.1, "by": [-0.06, 0, 0]}]}
@@ -272,16 +271,9 @@ def test_two_ranks_give_the_same(tmp_path: Path, msmpetsc):
         anchor=[hold],
         material={"young_modulus": 1e5, "density": 1000.0, "law": "stiffening"},
     )
-    files, states = [], []
-    for ranks in (1, 2):
-        done = msmpetsc(ranks, "run", scene, "-o", tmp_path / f"{ranks}.h5", "-log_view")  # no option of a solver
-        assert done.returncode == 0, done.stderr
-        with Result(tmp_path / f"{ranks}.h5") as run:
-            states.append([run[f"checkpoint/{name}"][:] for name in ("step", "q", "q_previous")])
-        files.append(h5py.File(tmp_path / f"{ranks}.h5"))
-    one, two = files
+    one, two = (result_on(ranks, scene, "-log_view") for ranks in (1, 2))  # no option of a solver
     assert one["frames/contact"][:].max() > 0
     np.testing.assert_array_equal(two["frames/iterations"], one["frames/iterations"])
     np.testing.assert_allclose(two["frames/position"], one["frames/position"], atol=1e-9)
-    for mine, other in zip(*states, strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-9)
+    for name in ("step", "q", "q_previous"):
+        np.testing.assert_allclose(two[f"checkpoint/{name}"], one[f"checkpoint/{name}"], atol=1e-9)

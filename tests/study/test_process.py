@@ -1,11 +1,60 @@
-"""The processes of a study, under mpiexec and with more ranks than cores."""
+"""The processes of a study: runs that need not start the program, under mpiexec, and with more ranks than cores."""
 
 import os
 import subprocess
+from pathlib import Path
 
-from conftest import ENVIRONMENT
+import h5py
+import numpy as np
+import pytest
+from block_scene import block_scene
+from conftest import ENVIRONMENT, run
+from study_files import alive
 
-from msmpetsc.study.process import environment
+from msmpetsc.study import process
+from msmpetsc.study.forkserver import COLD
+from msmpetsc.study.process import Ended, Processes, environment
+
+TIME = {"step": 0.01, "duration": 0.1}
+
+
+@pytest.fixture
+def processes():
+    found = Processes()
+    yield found
+    found.stop()
+
+
+def carry_out(
+    processes: Processes, path: Path, *words: str, timeout: float = 60, warm: bool = True
+) -> tuple[Ended, str]:
+    """How it ended, and what it said."""
+    log = path.with_suffix(".log")
+    ended = processes.run([*COLD, "run", str(path), "-o", str(path.with_suffix(".h5")), *words], log, timeout, warm)
+    return ended, log.read_text()
+
+
+def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
+    """Each begins anew: what one was given does not stay for the next."""
+    path, frames = block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}), []
+    for words, warm in (([], False), (["-snes_type", "ngmres"], True), ([], True)):
+        ended, told = carry_out(processes, path, "--overwrite", *words, warm=warm)
+        assert ended.status == 0, told
+        with h5py.File(path.with_suffix(".h5")) as file:
+            frames.append(file["frames/position"][:])
+            assert file.attrs["petsc_options"] == " ".join(words) and str(path) in file.attrs["command"]
+    np.testing.assert_array_equal(frames[2], frames[0])
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
+def test_it_is_ended_when_it_takes_too_long(tmp_path: Path, processes: Processes, monkeypatch):
+    began, end = [], process.end
+    monkeypatch.setattr(process, "end", lambda one: (began.append(one.pid), end(one)))
+    path = block_scene(tmp_path, time={"step": 0.01, "duration": 1000.0})
+    ended, _ = carry_out(processes, path, timeout=3)
+    assert ended.status is None and "longer than 3 s" in ended.reason
+    assert began and not any(map(alive, began))
+
 
 RUNS_WITHIN_A_RUN = """
 import subprocess, sys
@@ -17,8 +66,8 @@ for alone, launcher in ((True, []), (False, ["mpiexec", "-n", "2"])):
 """
 
 
-def test_a_study_may_be_one_rank_of_mpiexec(on_ranks):
-    done = on_ranks(1, "-c", RUNS_WITHIN_A_RUN, timeout=60)
+def test_a_study_may_be_one_rank_of_mpiexec():
+    done = run(1, "-c", RUNS_WITHIN_A_RUN, timeout=60)
     assert done.returncode == 0 and "".join(done.stdout.split()) == "122", done.stderr
 
 

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import ENVIRONMENT
+from one_process import command_error
 from study_files import ONE_SCENE, STAND_IN, alive, calls, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
 
 from msmpetsc.cli.main import main
@@ -72,10 +73,9 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
 
 
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])
-def test_a_part_that_is_none_is_refused(tmp_path: Path, capsys, own_log, part: str):
+def test_a_part_that_is_none_is_refused(tmp_path: Path, own_log, part: str):
     path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")
-    assert main(["study", str(path), "-o", str(tmp_path / "out"), f"--part={part}"]) == 2
-    assert capsys.readouterr().err == f"msmpetsc: error: --part must read I/N, 1 <= I <= N, not {part}\n"
+    assert f"not {part}" in command_error("study", path, "-o", tmp_path / "out", f"--part={part}")
 
 
 def test_the_list_names_each_case_and_runs_none(tmp_path: Path, capsys, own_log):
@@ -142,12 +142,9 @@ def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path)
 
 def test_a_package_that_is_missing_is_told_before_anything_is_run(tmp_path: Path, stand_in, monkeypatch):
     monkeypatch.setattr(table, "find_spec", lambda name: None if name == "pandas" else name)
-    with pytest.raises(InputError, match=r"^pandas is not installed: pip install .msmpetsc\[study\]. brings it$"):
+    with pytest.raises(InputError, match="pandas is not installed"):
         carry_out(tmp_path, ONE_SCENE + "[[sweep]]")
     assert not (tmp_path / "out").exists()
-
-
-# The table
 
 
 def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):

@@ -3,7 +3,6 @@
 # ruff: noqa: F811 (fixtures are imported)
 import json
 import math
-import shlex
 import shutil
 import subprocess
 import sys
@@ -215,14 +214,6 @@ def test_the_plan_meets_the_error_and_wastes_little(tmp_path: Path, monkeypatch,
     assert plan.choice.budget.total <= target and len(plan.tried) >= 6
 
 
-def test_a_choice_is_measured_from_a_lattice_that_steps_alike(tmp_path: Path, monkeypatch):
-    """The lattices are run by BDF2, whose steps have an error of their own; the choice is verlet."""
-    plan, _, _ = sized(tmp_path, monkeypatch, 0.1)
-    tried = {(each.method, each.cells) for each in plan.tried}
-    assert {("bdf2", 100), ("bdf2", 800), ("bdf2", 6400)} <= tried and ("verlet", 100) not in tried
-    assert plan.choice.method.integrator == "verlet" and ("verlet", 6400) in tried
-
-
 @pytest.mark.parametrize("cell_error", [1.5, 3.7, 5.2])
 def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell_error: float):
     """Of fewer cells than the finest lattice, of nearly as many and of many more."""
@@ -276,8 +267,7 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
     plan, *_ = sized(tmp_path, monkeypatch, 0.1)
     assert plan.met and 300 < plan.choice.cells < 330
     assert plan.choice.budget.total == pytest.approx(plan.choice.cells**-0.5, rel=0.2)
-    (said,) = plan.bounds
-    assert said.startswith("the fewest cells: 5.") and "nothing was found between" in said
+    assert len(plan.bounds) == 1
 
 
 def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path, monkeypatch):
@@ -293,8 +283,7 @@ def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
     runs_away = lambda integrator, cells: integrator == "verlet" and cells == first.choice.cells  # noqa: E731
     plan, _, said = sized(tmp_path, monkeypatch, 0.1, fails=runs_away)
     assert first.choice.method.integrator == "verlet" and plan.met and plan.choice.method.integrator != "verlet"
-    assert any("planted" in text for text in said if isinstance(text, str))
-    assert any("verlet" in bound and "fails" in bound for bound in plan.bounds)
+    assert any("planted" in text for text in said if isinstance(text, str)) and "verlet" in plan.bounds[0]
 
 
 def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, monkeypatch):
@@ -310,20 +299,21 @@ def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: P
     assert plan.met and {each.method for each in plan.tried} == {"bdf2", "implicit-euler"}
 
 
-def test_lattices_out_of_step_tell_no_order(tmp_path: Path, monkeypatch):
-    """Nothing is farther apart than 0.4, however coarse: the two distances are alike, and the usual order is taken."""
-    plan, bench, _ = sized(tmp_path, monkeypatch, 0.2, cell_error=5.0, most=0.45)
-    (said,) = plan.bounds
-    assert "apart, too far to tell); order 1.5 is taken" in said
-    assert 0.14 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.2
+BOUNDS = {  # what bounds the error: error asked for, and the bodies
+    "the mesh's cells": (1e-2, {"cell_error": 4.0}),  # there may be 8 times the cells at most: 1.8e-2 is left
+    "the step": (0.1, {"impacts": True}),  # shorter steps do not come nearer to each other
+    "the cells: no order": (0.2, {"cell_error": 5.0, "most": 0.45}),  # however coarse, 0.4 apart: the usual order
+}
 
 
-def test_a_plan_says_when_the_mesh_bounds_the_error(tmp_path: Path, monkeypatch):
-    """There may be 8 times the cells at most: an error of 1.8e-2 is left."""
-    plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, cell_error=4.0)
-    assert not plan.met and plan.choice.cells == 8 * 6400
-    (said,) = (bound for bound in plan.bounds if bound.startswith("the mesh's cells"))
-    assert f"{4 * (8 * 6400) ** -0.5:.1e} is left with 51200 cells" in said
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: str):
+    target, bodies = BOUNDS[bound]
+    plan, bench, _ = sized(tmp_path, monkeypatch, target, **bodies)
+    assert any(said.startswith(bound) for said in plan.bounds) and plan.met == ("order" in bound)
+    if plan.met:
+        assert 0.14 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.2
+    assert bound != "the mesh's cells" or plan.choice.cells == 8 * 6400
 
 
 def test_a_plan_says_until_when_the_error_would_be_within_reach(tmp_path: Path, monkeypatch):
@@ -331,9 +321,7 @@ def test_a_plan_says_until_when_the_error_would_be_within_reach(tmp_path: Path, 
     parts = {"cell_error": 4.0, "share_until": lambda time: 0.25 if time < 0.065 else 1.0}
     plan, _, _ = sized(tmp_path, monkeypatch, 1e-2, **parts)
     (said,) = (bound for bound in plan.bounds if bound.startswith("the motion"))
-    assert "if it ended at 0.06 s: fewer --frames" in said
-    left = plan.choice.budget.total - 0.75 * plan.choice.budget.cells
-    assert f"{left:.1e} would be left" in said and left <= 1e-2
+    assert "if it ended at 0.06 s" in said and plan.choice.budget.total - 0.75 * plan.choice.budget.cells <= 1e-2
     assert sized(tmp_path, monkeypatch, 0.1, **parts)[0].bounds == []
 
 
@@ -341,8 +329,7 @@ def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
     """On the finest lattice that was tried: then order 1 is taken. Coarser ones do not matter."""
     plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0)
     order, motion = plan.bounds
-    assert order == "the cells: no order was seen (cells end inside out); order 1 is taken"
-    assert motion.startswith("the motion: of 6400 cells 7 end inside out") and motion.endswith('"neo-hookean" may help')
+    assert "order 1 is taken" in order and motion.endswith('"neo-hookean" may help')
     without, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0)
     assert without.bounds == [] and plan.choice.cells >= without.choice.cells
 
@@ -353,12 +340,6 @@ def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch
     assert plan.bounds[-1].endswith("fewer --frames may help")
 
 
-def test_a_plan_says_when_impacts_bound_the_error(tmp_path: Path, monkeypatch):
-    """Shorter steps do not come nearer to each other."""
-    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, impacts=True)
-    assert not plan.met and any(bound.startswith("the step") for bound in plan.bounds)
-
-
 def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
     said: list = []
     bench = Bodies()
@@ -367,7 +348,7 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
     )
     (tmp_path / "scene.toml").write_text(SCENE)
     sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), ["newton"], said.append)
-    with pytest.raises(InputError, match="the trials failed on 1 cells, see above"):
+    with pytest.raises(InputError, match="the trials failed"):
         sizer.plan()
     assert all("planted" in text for text in said) and len(said) == 2
     (tmp_path / "scene.toml").write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
@@ -424,38 +405,22 @@ PLAN = SizePlan(
 
 
 def test_the_command_tells_the_answer_writes_it_and_draws_it(tmp_path: Path, monkeypatch, capsys, own_log):
-    monkeypatch.setattr(plan_command, "size_all", lambda *_: PLAN)
+    monkeypatch.setattr(plan_command, "size_all", lambda *_: print("what was tried") or PLAN)
     path, chart = tmp_path / "scene.toml", tmp_path / "chart.png"
     path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
     before = load_scene(path)
     assert main(["plan", str(path), "--surface-error", "0.1", "--write", "--chart", str(chart)]) == 0
     out, written = capsys.readouterr().out, load_scene(path)
-    assert "7.5 computing seconds a simulated second, surface error 8.1e-02\n" in out
-    assert "cells              5.0e-02         60%" in out and "what bounds it: the step: planted" in out
+    assert "7.5 computing seconds a simulated second" in out and "the step: planted" in out
     assert written.cages.count == 4321 and written.cages.cell_size is None and before.budget is None
     assert (written.time.integrator, written.time.step, written.solver.error) == ("bdf2", 0.005, 0.01)
     assert written.budget.model_dump() == {
         "target": 0.1, "cells": 0.05, "time": 0.03, "step": 0.001, "count": 4321, "time_step": 0.005
     }  # fmt: skip
-    command = next(line for line in out.splitlines() if line.startswith("msmpetsc run "))
-    changes = [word for flag, word in pairwise(shlex.split(command)) if flag == "--set"]
-    path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
-    changed = load_scene(path, changes)
-    assert (changed.cages, changed.time, changed.solver, changed.budget) == (
-        written.cages, written.time, written.solver, written.budget
-    )  # fmt: skip
     assert chart.read_bytes()[:4] == b"\x89PNG"
-
-
-def test_the_answer_is_one_json_object(tmp_path: Path, monkeypatch, capsys, own_log):
-    monkeypatch.setattr(plan_command, "size_all", lambda *_: print("what was tried") or PLAN)
-    path = tmp_path / "scene.toml"
-    path.write_text(SCENE)
     assert main(["plan", str(path), "--surface-error", "0.1", "--json"]) == 0
-    out, err = capsys.readouterr()
-    told = json.loads(out)
-    assert told["met"] and told["choice"]["cells"] == 4321 and told["error"] == pytest.approx(0.081)
-    assert told["command"].startswith("msmpetsc run") and "what was tried" in err
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["met"] and answer["choice"]["cells"] == 4321 and answer["error"] == pytest.approx(0.081)
 
 
 COMMENTED = """# A scene of mine
@@ -528,4 +493,4 @@ def test_what_cannot_be_met_is_told_with_status_3_and_not_written(tmp_path: Path
 def test_what_makes_no_sense_is_refused_in_one_line(tmp_path: Path, capsys, own_log, options: list[str], words: str):
     assert main(["plan", str(tmp_path / "gone.toml"), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("msmpetsc: error: ") and words in line
+    assert words in line

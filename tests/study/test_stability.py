@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
+from one_process import input_error
 from study_files import (
     Balance,
     all_cases,
@@ -24,7 +25,6 @@ from study_files import (
 
 from msmpetsc.cli.commands.study import log_failures
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError
 from msmpetsc.study.cases import shown_command, study_cases
 from msmpetsc.study.charts.convergence import closed_form, order
 from msmpetsc.study.charts.stability import COLORS, LIMIT, SYMBOLS, stability_charts
@@ -48,9 +48,6 @@ CHANGES = '["material.density={value}", "gravity.acceleration=[0, 0, -{value}]"]
 Y = f'y = {{ name = "density", template = {CHANGES}, values = [10, 20] }}\n'
 GRID = '[[map]]\nname = "g"\nfile = "scene.toml"\nsteps = 4\n'
 NAMED = '[[map]]\nname = "n"\n[[map.case]]\nname = "a"\nfile = "scene.toml"\nsteps = 4\n'
-
-
-# The cases
 
 
 def test_a_map_is_each_method_at_each_place(tmp_path: Path):
@@ -85,9 +82,8 @@ def test_named_cases_have_their_own_options_for_what_solves(tmp_path: Path):
     ],
 )
 def test_a_mistake_in_a_map_is_told(tmp_path: Path, text: str, words: list[str]):
-    with pytest.raises(InputError) as told:
-        load_study(study_file(tmp_path, text))
-    assert all(word in str(told.value) for word in words), str(told.value)
+    path = study_file(tmp_path, text)
+    assert all(word in input_error(lambda: load_study(path)) for word in words)
 
 
 def test_the_atlas_shipped_is_sound():
@@ -130,9 +126,6 @@ def test_every_outcome_has_a_meaning_a_colour_and_a_mark():
     assert set(OUTCOMES) == set(MEANING) == set(COLORS) == {*SYMBOLS, "slow", "ok"}
 
 
-# What is run and told
-
-
 def method(label: str, options: str = "") -> str:
     return f'[[method]]\nlabel = "{label}"\noptions = "{options}"\n'
 
@@ -141,12 +134,8 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):
     methods = {"good": "", "bad": "-ksp_exit 3 -ksp_kind energy", "worse": "-ksp_exit 2", "worst": "-ksp_fail"}
     text = "".join(method(*one) for one in methods.items()) + NAMED
     rows = carry_out(tmp_path, text, jobs=2)
-    assert [(row["x"], row["outcome"], row["status"]) for row in rows] == [
-        ("good", "ok", "ok"),
-        ("bad", "energy", "failed"),
-        ("worse", "refused", "failed"),
-        ("worst", "crashed", "failed"),
-    ]
+    assert [row["outcome"] for row in rows] == ["ok", "energy", "refused", "crashed"]
+    assert [row["status"] for row in rows] == ["ok"] + 3 * ["failed"]
     assert rows[0]["shape_error"] < 1e-12 and rows[1]["frames"] == 5 and rows[0]["map"] == "n"
     assert counted(row["outcome"] for row in rows) == "1 ok, 1 energy, 1 refused, 1 crashed"
     with caplog.at_level(INFO, log.name):
@@ -155,9 +144,6 @@ def test_a_map_that_fails_is_an_answer(tmp_path: Path, stand_in, caplog):
     assert not any("without figures" in record.message for record in caplog.records)
     page = write_report(tmp_path / "out").read_text()
     assert "Failed cases" not in page and "4: 1 ok, 1 energy, 1 refused, 1 crashed" in page
-
-
-# The charts
 
 
 def place(label: str, x: float, y: float, outcome: str, **given) -> dict:
@@ -204,13 +190,10 @@ def test_each_cell_has_its_mark_and_tells_its_numbers(folder: Path):
     assert Balance(text).open == [] and len(svgs(text)) == 1
     tips = tooltips(text)
     assert len(tips) == 12
-    assert any(tip.startswith("verlet\ntime step 1 s\nmodulus 100 kPa\noutcome diverged\n") for tip in tips)
+    assert any("time step 1 s\nmodulus 100 kPa\noutcome diverged\n" in tip for tip in tips)
     marks = re.findall(r"<text[^>]*>([^<]*)</text>", text)
     assert marks.count("D") == 4 and marks.count("4") == 12, "each with what keeps the line of the limit off it"
     assert "Failed cases" not in text and "12: 8 ok, 2 slow, 2 diverged" in text
-
-
-# The order in time
 
 
 def timed(step: float, error: float, **given) -> dict:

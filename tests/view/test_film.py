@@ -1,10 +1,12 @@
 """Films: their playback, their pictures as they come out of the file, and what cannot be filmed."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
+from one_process import input_error
 from PIL import Image, ImageSequence
 
 from msmpetsc.cli.arguments import parsed
@@ -15,11 +17,6 @@ from msmpetsc.view.playback import playback_of, usual_speed
 
 pytestmark = pytest.mark.timeout(60)
 TIMES = np.arange(11) / 10  # of the ball's frames [s]
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory) -> Path:
-    return write_ball(tmp_path_factory.mktemp("ball") / "ball.h5", surface=True)
 
 
 def render(*words: object) -> None:
@@ -43,12 +40,6 @@ def middle_of_body(picture: np.ndarray) -> float:
     return (rows[0] + rows[-1]) / 2
 
 
-def test_pace_in_real_time_shows_each_frame_at_its_time():
-    playback = playback_of(4 * TIMES)  # ten frames in four seconds are fewer than a film has at the most
-    assert playback.numbers.tolist() == list(range(11)) and playback.fps == pytest.approx(2.5) and playback.speed == 1
-    assert playback.words == ""
-
-
 def test_pace_leaves_frames_out_where_they_come_faster_than_pictures():
     playback = playback_of(np.arange(4001) / 1000)  # four seconds of four thousand frames
     assert playback.fps == 30 and len(playback.numbers) == 121
@@ -68,10 +59,10 @@ def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
     assert playback_of(np.arange(61.0)).words == "10 times faster than real"
 
 
-def test_a_film_fills_its_frame_and_says_its_speed(result, tmp_path, caplog):
+def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplog):
     """The ball's way is four times as high as wide, and so is the film, as far as its caption lets it."""
     with caplog.at_level("INFO", logger="msmpetsc"):
-        render(result, "-o", tmp_path / "x.gif")
+        render(falling_ball, "-o", tmp_path / "x.gif")
     with Image.open(tmp_path / "x.gif") as film:
         seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
     assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
@@ -89,11 +80,6 @@ def test_slow_motion_shows_all_frames_for_longer():
     assert len(both.numbers) == 201 and (abs(np.bincount(both.numbers)[1:-1] - 20) <= 1).all()
 
 
-def test_pictures_a_second_alone_are_of_a_frame_each():
-    playback = playback_of(TIMES, fps=25)
-    assert playback.numbers.tolist() == list(range(11)) and playback.speed == pytest.approx(2.5)
-
-
 def test_frames_out_of_order_have_no_speed():
     assert playback_of(TIMES[[5, 2, 0]], fps=4).numbers.tolist() == [0, 1, 2]
     with pytest.raises(InputError, match="--speed needs frames in order of time"):
@@ -101,11 +87,11 @@ def test_frames_out_of_order_have_no_speed():
 
 
 @pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
-def test_the_ball_falls_and_leaps_in_the_film(result, tmp_path, ending, capsys):
+def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, capsys):
     if ending == "mp4":
         pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "new" / f"x.{ending}"
-    render(result, "-o", path, "--size", "320x480", "--eye", "0,-1,0", "--fps", 5, "--frames", "0:11")
+    render(falling_ball, "-o", path, "--size", "320x480", "--eye", "0,-1,0", "--fps", 5, "--frames", "0:11")
     assert capsys.readouterr().out.strip() == str(path)
     pictures = pictures_of(path)
     assert len(pictures) == len(HEIGHTS) and pictures[0].shape == (480, 320, 3)
@@ -138,16 +124,14 @@ def test_on_the_turntable_every_side_is_seen_once(tmp_path):
     assert dark[6] < dark[3] < dark[0]
 
 
-def test_the_legend_names_what_is_drawn(result, tmp_path):
+def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
     """The bar of colours goes from the palest to the darkest, and without colours there is none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
-        render(result, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
+        render(falling_ball, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
     plain, coloured = (np.array(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("plain", "coloured"))
     assert len(coloured) == len(plain) + 34
-    row = coloured[-17]
-    assert (abs(row - [0xED, 0xF8, 0xB1]).max(axis=1) < 12).any() and (
-        abs(row - [8, 0x1D, 0x58]).max(axis=1) < 12
-    ).any()
+    for end in ([0xED, 0xF8, 0xB1], [8, 0x1D, 0x58]):
+        assert (abs(coloured[-17] - end).max(axis=1) < 12).any()
 
 
 @pytest.mark.parametrize(
@@ -157,15 +141,12 @@ def test_the_legend_names_what_is_drawn(result, tmp_path):
         (["--count", "0"], "--count must be at least 1"),
         (["--eye", "0,0,0"], "--eye takes three numbers"),
         (["--eye", "north"], "--eye takes numbers"),
-        (["-o", "/proc/x.png"], "/proc/x.png cannot be written"),
         (["--frames", "0:x"], "--frames takes numbers like 0,10,20 or slices"),
         (["--frames", "20:"], "of which --frames names none"),
-        (["--frames", "0:5:0"], "--frames takes numbers"),
         (["--colour", "sped"], "did you mean 'speed'"),
         (["--colour", "error"], "--colour error goes with --reference"),
         (["--colour", "part"], "has no part"),
         (["--show", "cell"], "did you mean 'cells'"),
-        (["--size", "100x"], "--size takes two even numbers"),
         (["--size", "101x100"], "--size takes two even numbers"),
         (["--fps", "10"], r"--fps is for \*.mp4"),
         (["--turntable"], r"--turntable is for \*.mp4"),
@@ -175,11 +156,7 @@ def test_the_legend_names_what_is_drawn(result, tmp_path):
         (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
         (["-o", "x.gif", "--turntable", "--speed", "2"], "--speed needs --frames"),
         (["-o", "x.gif", "--size", "64x64", "--colour", "speed"], "too small for caption and legend"),
-        (["-o", "/proc/x.gif"], "/proc/x.gif cannot be written"),
-        (["-o", "/proc/x.html"], "/proc/x.html cannot be written"),
     ],
 )
-def test_what_cannot_be_drawn_ends_in_one_line(result, words, line):
-    with pytest.raises(InputError, match=line) as caught:
-        render(result, *words)
-    assert "\n" not in str(caught.value)
+def test_what_cannot_be_drawn_ends_in_one_line(falling_ball, words, line):
+    assert re.search(line, input_error(lambda: render(falling_ball, *words)))

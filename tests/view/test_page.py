@@ -108,9 +108,6 @@ def test_anchored_points_are_free_after_their_stop(tmp_path):
     assert set(first) == {0, 255} and not second.any()
 
 
-# In a browser
-
-
 def seen(path: Path, address: str) -> np.ndarray:
     """What a browser shows of a page at an address, (h, w, 3)."""
     picture = path.with_suffix(".seen.png")

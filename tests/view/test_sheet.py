@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -26,14 +25,8 @@ from msmpetsc.view.drawable import BodiesAtRest, drawable_of_result
 pytestmark = pytest.mark.timeout(60)
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory) -> Path:
-    """The ball with its surface stored."""
-    return write_ball(tmp_path_factory.mktemp("ball") / "ball.h5", surface=True)
-
-
-def test_moments_tell_the_story(result):
-    with Result(result) as run:
+def test_moments_tell_the_story(falling_ball):
+    with Result(falling_ball) as run:
         five = sheet.choose_moments(run, 5)
         assert five == {0: "start", 3: "fastest", 5: "most elastic energy", 8: "highest", 10: "end"}
         assert list(sheet.choose_moments(run, 3)) == [0, 5, 10]
@@ -144,13 +137,6 @@ def test_an_arrow_for_each_force_while_it_acts(stills):
         assert tip - tail == pytest.approx([0, 0, -0.2 * 0.2])  # a fifth of the ball
 
 
-def test_an_arrow_is_seen_in_front_of_the_body(tmp_path):
-    path = write_ball(tmp_path / "x.h5", surface=True, scene=BARE + FORCE)
-    picture = np.array(Image.open(sheet.contact_sheet(path, tmp_path / "x.png", frames=[2, 8]))).astype(int)
-    red = [(panel[..., 0] - panel[..., 2] > 90).sum() for panel in np.split(picture, 2, axis=1)]
-    assert red[0] > 500 and red[1] == 0
-
-
 PLATE = """
 [[obstacle]]
 shape = "box"
@@ -176,9 +162,6 @@ def test_what_would_hide_the_body_is_glass(stills):
     above = stills(plane(0.7, "[0, 0, -1]"), frames=[0])[0].overlays
     assert above.grounds == [] and above.glass[0][:4, 2] == pytest.approx(np.full(4, 0.7))  # its face
     assert (above.glass[0][4:, 2] > 0.7).all()  # a plate lies behind the plane
-    assert (
-        stills(plane(0.7, "[0, 0, -1]"), frames=[0], eye=(0, 1, -0.1))[0].overlays.grounds == []
-    )  # nothing lies on it
     ground = plane(0.4, "[0, 0, 1]")
     below = stills(ground, frames=[0])[0].overlays
     assert below.glass == [] and below.grounds[0].corners[:, 2] == pytest.approx(np.full(4, 0.4))
@@ -236,8 +219,8 @@ def body_rows(picture: np.ndarray) -> tuple[int, int]:
     return rows[0], rows[-1]
 
 
-def test_heights_sizes_and_captions_are_seen(result, tmp_path, capfd):
-    sheet.contact_sheet(result, tmp_path / "new" / "x.png")
+def test_heights_sizes_and_captions_are_seen(falling_ball, tmp_path, capfd):
+    sheet.contact_sheet(falling_ball, tmp_path / "new" / "x.png")
     assert capfd.readouterr().err == ""
     picture = np.array(Image.open(tmp_path / "new" / "x.png"))
     panels = np.split(picture, 5, axis=1)
@@ -261,21 +244,21 @@ def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
             sheet.contact_sheet(path, tmp_path / "x.png")
 
 
-def test_without_opengl_one_line_names_the_package(result, tmp_path):
+def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
     """EGL is made to find no driver; VTK would crash."""
     draw = "import sys; from msmpetsc.view.sheet import contact_sheet; contact_sheet(*sys.argv[1:])"
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
-    order = [sys.executable, "-c", draw, str(result), str(tmp_path / "x.png")]
+    order = [sys.executable, "-c", draw, str(falling_ball), str(tmp_path / "x.png")]
     done = subprocess.run(order, env=environment, capture_output=True, text=True, timeout=40)
     assert done.returncode == 1
     assert done.stderr.strip().endswith("no OpenGL to draw with: apt install libegl1 libgl1-mesa-dri")
     assert "WARN" not in done.stderr
 
 
-def test_many_panels_stand_in_rows_and_each_is_shown(result, tmp_path):
+def test_many_panels_stand_in_rows_and_each_is_shown(falling_ball, tmp_path):
     """Eleven of them in three rows of four, in a sheet that a screen shows."""
-    sheet.contact_sheet(result, tmp_path / "x.png", frames=range(11))
+    sheet.contact_sheet(falling_ball, tmp_path / "x.png", frames=range(11))
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert 1000 < drawn.shape[1] <= 2000
     each = [part for row in np.split(drawn, 3) for part in np.split(row, 4, axis=1)]
@@ -283,7 +266,7 @@ def test_many_panels_stand_in_rows_and_each_is_shown(result, tmp_path):
     assert body_rows(each[3])[0] > body_rows(each[2])[0] > body_rows(each[0])[0] > 0
 
 
-def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
+def test_all_that_is_written_is_in_one_typeface(falling_ball, tmp_path, monkeypatch):
     """Captions and the lengths of axes too, which VTK wrote in its own."""
     written, draw = {}, ImageDraw.ImageDraw.text
 
@@ -292,20 +275,20 @@ def test_all_that_is_written_is_in_one_typeface(result, tmp_path, monkeypatch):
         draw(self, at, text, fill, font, **options)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
-    sheet.contact_sheet(result, tmp_path / "x.png", frames=[0], style=Style(axes=True, colour="displacement"))
+    sheet.contact_sheet(falling_ball, tmp_path / "x.png", frames=[0], style=Style(axes=True, colour="displacement"))
     assert set(written.values()) == {"DejaVu Sans"}
     assert {"x:", "y:", "z:", "t"} <= {text.partition(" ")[0] for text in written}
 
 
-def test_a_picture_too_high_is_refused(result, tmp_path, monkeypatch):
+def test_a_picture_too_high_is_refused(falling_ball, tmp_path, monkeypatch):
     monkeypatch.setattr(sheet, "HIGHEST", 1000)
-    with pytest.raises(InputError, match="11 moments are too many for one picture: of panels of"):
-        sheet.contact_sheet(result, tmp_path / "y.png", frames=range(11))
+    with pytest.raises(InputError, match="11 moments are too many"):
+        sheet.contact_sheet(falling_ball, tmp_path / "y.png", frames=range(11))
     assert not (tmp_path / "y.png").exists()
 
 
-def test_a_black_picture_is_no_picture(result, tmp_path, monkeypatch):
+def test_a_black_picture_is_no_picture(falling_ball, tmp_path, monkeypatch):
     monkeypatch.setattr(renderer.pv.Plotter, "screenshot", lambda self, **_: np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(InputError, match=r"the graphics library gives a black picture"):
-        sheet.contact_sheet(result, tmp_path / "y.png", frames=[0])
+    with pytest.raises(InputError, match="black picture"):
+        sheet.contact_sheet(falling_ball, tmp_path / "y.png", frames=[0])
     assert not (tmp_path / "y.png").exists()

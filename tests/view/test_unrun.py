@@ -55,26 +55,17 @@ def test_a_mesh_alone_shows_its_box_and_a_length(tmp_path, ball):
 
 
 @pytest.mark.parametrize(
-    ("words", "line"),
+    ("kind", "words", "line"),
     [
-        (["-o", "x.mp4"], "has no motion to film: --turntable"),
-        (["--frames", "1"], "--frames is for results"),
-        (["--colour", "part"], "has no part"),
+        ("scene", ["-o", "x.mp4"], "no motion to film"),
+        ("scene", ["--frames", "1"], "--frames is for results"),
+        ("scene", ["--colour", "part"], "has no part"),
+        ("mesh", ["--show", "cells"], "is a mesh without cells"),
+        ("mesh", ["--colour", "speed"], "is a mesh alone"),
+        ("mesh", ["--set", "cages.count=3"], "--set changes a scene"),
     ],
 )
-def test_what_a_scene_has_not_got(tmp_path, words, line):
+def test_what_a_scene_or_a_mesh_has_not_got(tmp_path, ball, kind, words, line):
+    path = ball if kind == "mesh" else sized(tmp_path, (0.5, 0.5, 0.25))
     with pytest.raises(InputError, match=line):
-        command.run(parsed(["render", str(sized(tmp_path, (0.5, 0.5, 0.25))), *words]))
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--show", "cells"], "is a mesh without cells"),
-        (["--colour", "speed"], "is a mesh alone"),
-        (["--set", "cages.count=3"], "--set changes a scene"),
-    ],
-)
-def test_what_a_mesh_has_not_got(ball, words, line):
-    with pytest.raises(InputError, match=line):
-        command.run(parsed(["render", str(ball), *words]))
+        command.run(parsed(["render", str(path), *words]))

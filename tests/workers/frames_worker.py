@@ -1,4 +1,4 @@
-"""Writes result files for test_frames.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
+"""Writes result files for test_writer.py, on as many ranks as mpiexec gives: frames_worker.py ACTION PATH."""
 
 import os
 import sys

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from block_scene import CELL, block_scene
 
-ERROR, STEPS, STEP = 1e-6, 8, 0.01
+ERROR, STEPS, STEP = 1e-6, 6, 0.01
 HELD = [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}]
 FAR = {"box": [[0.95, 0, 0], [1, 1, 1]], "relative": True}
 LED = [{"region": FAR, "path": [{"time": 4 * STEP, "by": [0.05, 0, 0.05]}], "stop": 5 * STEP}]
@@ -41,8 +41,7 @@ def test_frames_are_those_by_jacobi(msmpetsc, tmp_path: Path, case: str):
         *((n, "newton-multigrid", "-pc_mg_levels", 3) for n in (1, 2)),
     ):
         file = tmp_path / f"{preset}{ranks}.h5"
-        done = msmpetsc(ranks, "run", path, "-o", file, "--preset", preset, *options)
-        assert done.returncode == 0, done.stderr
+        msmpetsc(ranks, "run", path, "-o", file, "--preset", preset, *options, status=0)
         with h5py.File(file) as result:
             found.append(result["frames/position"][:])
             assert np.nanmax(result["frames/step_error"][:]) <= ERROR

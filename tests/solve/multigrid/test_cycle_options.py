@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, block_scene
+from one_process import errors
 
 SCENE = {
     "sides": np.array([8, 3, 3]) * CELL,
@@ -29,17 +30,12 @@ REFUSED = {
 }
 
 
-def error_lines(text: str) -> list[str]:
-    return [line for line in text.splitlines() if line.startswith("msmpetsc: error:")]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
     path = block_scene(tmp_path, **SCENE)
     for options, shown in OBEYED.items():
-        done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split())
-        assert done.returncode == 0, options + done.stderr
+        done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", "--overwrite", *options.split(), status=0)
         assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV")), options
         assert shown in done.stdout, options
 
@@ -49,6 +45,6 @@ def test_options_of_the_cycle(msmpetsc, tmp_path: Path, ranks: int):
 def test_options_that_cannot_be_are_one_line(msmpetsc, tmp_path: Path, options: str, ranks: int):
     path = block_scene(tmp_path, **SCENE)
     done = msmpetsc(ranks, "run", path, "-o", tmp_path / "o.h5", *options.split())
-    errors = error_lines(done.stderr)
-    assert done.returncode == 2 and len(errors) == 1 and REFUSED[options] in errors[0], done.stderr
+    (line,) = errors(done.stderr)
+    assert done.returncode == 2 and REFUSED[options] in line, done.stderr
     assert not any(noise in done.stdout + done.stderr for noise in ("Traceback", "PETSC ERROR", "SEGV"))

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_scene import CELL, block_scene
-from conftest import WORKERS
+from conftest import WORKERS, run
 from mpi4py import MPI
-from stopped_runs import assert_same
+from stopped_runs import assert_equal, assert_same
 
 from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
@@ -65,12 +65,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
 
 
-def assert_equal(found: dict, expected: dict) -> None:
-    assert found.keys() == expected.keys()
-    for name in expected.keys() - {"wall_time", "Effort.work.wall_time"}:
-        assert np.array_equal(found[name], expected[name], equal_nan=True) if expected[name] is not None else True, name
-
-
 QUICK = {"stiffening, pressed", "switched, pressed", "fallback"}  # each takes some five seconds
 
 
@@ -105,12 +99,11 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path: Path, c
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_run_that_was_stopped_goes_on_exactly(on_ranks, tmp_path: Path, ranks: int):
+def test_a_run_that_was_stopped_goes_on_exactly(tmp_path: Path, ranks: int):
     """By the command line, on several coarse levels."""
     stiff = {"young_modulus": 1e9, "density": 1000.0}
     path = block_scene(tmp_path, **scene("newton", pin=HELD, anchor=LED, material=stiff))
     for step, file in ((6, "x.h5"), (-1, "whole.h5")):
-        done = on_ranks(ranks, WORKERS / "stop_worker.py", step, "run", path, "-o", tmp_path / file, "-pc_mg_levels", 3)
-        assert done.returncode == 0, done.stderr
-    assert on_ranks(ranks, WORKERS / "stop_worker.py", -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
+        run(ranks, WORKERS / "stop_worker.py", step, "run", path, "-o", tmp_path / file, "-pc_mg_levels", 3, status=0)
+    assert run(ranks, WORKERS / "stop_worker.py", -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
     assert_same(tmp_path / "x.h5", tmp_path / "whole.h5")

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import WORKERS
+from conftest import WORKERS, run
 from hierarchies import CELL, COMM, LATTICES, ORIGIN, build, hierarchy
 
 from msmpetsc.geometry.grid import decode_morton
-from msmpetsc.solve.multigrid.grids import grid_indices, grids
+from msmpetsc.solve.multigrid.grids import grids
 
 
 @pytest.mark.parametrize("pins", [False, True])
@@ -53,13 +53,7 @@ def test_a_grid_that_is_not_much_smaller_is_none():
     assert len(grids(COMM, ijk, 27, coarsest=800)) == 1  # a coarse level there always is
 
 
-@pytest.mark.parametrize("name", LATTICES)
-def test_grid_indices_are_those_of_the_keys(name: str):
-    with hierarchy(COMM, build(COMM, LATTICES[name])) as case:
-        np.testing.assert_array_equal(grid_indices(case.unknowns), decode_morton(case.lattice.table.keys))
-
-
-def test_hierarchies_of_several_ranks_are_those_of_one(on_ranks):
+def test_hierarchies_of_several_ranks_are_those_of_one():
     """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
-    done = on_ranks(3, WORKERS / "multigrid_worker.py")
+    done = run(3, WORKERS / "multigrid_worker.py")
     assert done.returncode == 0 and done.stdout.count("same") == 3, done.stdout + done.stderr

@@ -22,17 +22,6 @@ def kept(petsc_options):
     unknowns.destroy()
 
 
-def test_it_is_kept_while_solves_are_as_quick_as_the_first(kept):
-    preconditioner, q = kept
-    preconditioner.is_stale = True
-    assert preconditioner.prepare(q, None)
-    for its, rtol in [(4, 1e-1), *[(8, 1e-2)] * 50, (0, 0.1)]:
-        preconditioner.learn(its, rtol)
-    assert (
-        preconditioner.pace == 4 and preconditioner.wasted == pytest.approx(0) and not preconditioner.prepare(q, None)
-    )
-
-
 def test_it_is_given_up_when_it_has_cost_as_much_as_a_new_one(kept):
     preconditioner, q = kept
     preconditioner.is_stale = True

@@ -1,4 +1,4 @@
-"""What the studies of this folder share: runs of scenes in processes of their own, repeats, and tables in Markdown."""
+"""What the studies of this folder share: runs of scenes in processes of their own, and tables in Markdown."""
 
 import datetime
 import io
@@ -11,8 +11,7 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from statistics import median
-from typing import Any, TextIO, TypeVar
+from typing import Any, TextIO
 
 from clone import ROOT
 
@@ -25,7 +24,6 @@ from msmpetsc.study.process import Ended, Processes
 
 SCENES, OUT = ROOT / "scenes", ROOT / "out"
 DAY = 86_400.0  # [s]
-T = TypeVar("T")
 Row = Mapping[str, object]  # of a table: cells by column
 Rows = Iterator[Row]
 
@@ -39,13 +37,11 @@ class Run:
 
     failure : why it did not come to its end; empty if it did
     status  : its exit status; None where time ran out
-    seconds : that the process took
     """
 
     path: Path
     failure: str = ""
     status: int | None = 0
-    seconds: float = 0.0
 
     @cached_property
     def cost(self) -> dict[str, Any]:
@@ -80,7 +76,7 @@ def run(
     ended = python(command, path.with_suffix(".log"), ranks, timeout, warm)
     if ended.reason:
         print("  failed:", ended.reason, file=sys.stderr)
-    return Run(path, ended.reason, ended.status, ended.seconds)
+    return Run(path, ended.reason, ended.status)
 
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
@@ -89,34 +85,12 @@ def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = 
     return Processes().run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
 
 
-# ---- repeats
-
-
-def alternated(kinds: Mapping[str, Callable[[], T | None]], repeats: int) -> dict[str, list[T]]:
-    """Do each kind so often, no one twice in a row while there are others; one that gives None is not done again."""
-    found: dict[str, list[T]] = {name: [] for name in kinds}
-    failed = set()
-    for name in [*kinds] * repeats:
-        value = None if name in failed else kinds[name]()
-        if value is None:
-            failed.add(name)
-        else:
-            found[name].append(value)
-    return {name: [] if name in failed else values for name, values in found.items()}
-
-
-def spread(values: Sequence[float]) -> str:
-    """Return the median, and the least and the greatest where there are several."""
-    ends = f" ({shown(min(values))} to {shown(max(values))})" if len(values) > 1 else ""
-    return shown(median(values)) + ends
+# ---- what is printed
 
 
 def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
     """Return the slope of a line fitted to log |error| over log size."""
     return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
-
-
-# ---- what is printed
 
 
 def shown(value: object) -> str:

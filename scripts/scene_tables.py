@@ -1,17 +1,14 @@
 #!/usr/bin/env python3
 """Tables of the shipped scenes. Needs the meshes.
 
-    scripts/scene_tables.py paper|tissue|energy|touching [SCENE...] [--frames N] [--set KEY=VALUE ...] [-o PAGE]
+    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--set KEY=VALUE ...] [-o PAGE]
 
-paper    : the paper's Table 1 beside ours, the paper's figures in brackets: with its own springs, and as its twin, a
+table1   : the paper's Table 1 beside ours, the paper's figures in brackets: with its own springs, and as its twin, a
            neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a second are those of the
            steps alone, as each frame's wall_time has them: the mean, and the slowest tenth of the frames. Products
            with the Hessian are a frame's. The error is the largest relative error of a step that the runs report.
 tissue   : neo-Hookean solids of Poisson's ratio 0.47. The volume is what the drawn surface encloses, against rest:
            the most that is lost and gained in any frame, and at the end. "Inside out" is the most cells in any frame.
-energy   : what the body gains from nowhere, over the most kinetic and elastic energy that it had: the greatest rise of
-           kinetic, elastic, contact's and potential energy together, and what the run's own energy budget counts.
-           Anchors and obstacles that move do work, so that there the first is no gain.
 touching : surfaces that meet themselves. Crossed: pairs of an edge and a triangle that cross, over all frames, by a
            test that shares nothing with the contact's own, of the surface that meets itself; drawn: of the one that is
            drawn, over 20 frames. --shorter 16 takes steps, and frames, of a sixteenth.
@@ -71,18 +68,13 @@ ARRAYS = {
 }  # fmt: skip
 
 
-def slowest_tenth(seconds: np.ndarray) -> float:
-    """Return the mean of the slowest tenth of the frames, of one at least [s]."""
-    return float(np.sort(seconds)[-max(1, len(seconds) // 10) :].mean())
-
-
-def paper(scene: str, args: Namespace) -> lab.Row:
+def table1(scene: str, args: Namespace) -> lab.Row:
     """Return a row of Table 1, of both laws."""
     *counts, cpu, _ = PAPER[scene.split("_")[0]]
     found: dict[str, object] = {"scene": scene}
     worst = 0.0
     for law, changes in LAWS.items():
-        with Result(run(f"paper_{law}", scene, args, *changes)) as result:
+        with Result(run(f"table1_{law}", scene, args, *changes)) as result:
             ours = [len(result[name]) for name in ARRAYS.values()]
             seconds, products = result.frames.wall_time[1:], result.frames.products[1:]
             worst = max(worst, float(result.frames.step_error[1:].max()))
@@ -91,7 +83,7 @@ def paper(scene: str, args: Namespace) -> lab.Row:
             found |= {name: f"{own:,} ({paper:,})" for name, own, paper in beside}
         paper = f" ({cpu})" if law == "springs" else ""
         found[f"{law}: frames a second"] = f"{1 / seconds.mean():.3g}{paper}"
-        found[f"{law}: slowest tenth"] = float(1 / slowest_tenth(seconds))
+        found[f"{law}: slowest tenth"] = float(1 / np.sort(seconds)[-max(1, len(seconds) // 10) :].mean())
         found[f"{law}: products"] = float(products.mean())
     return found | {"step error": worst}
 
@@ -121,28 +113,6 @@ def tissue(scene: str, args: Namespace) -> lab.Row:
             "inside out": int(result.frames.inverted[:].max()),
             "volume": ", ".join(lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])),
         }
-
-
-# ---- energy
-
-PARTS = "kinetic", "elastic", "contact", "potential"
-WORK = "[[anchor]]", "path = ", "[[force]]", "anchor = ", "[[body.anchor]]"  # what does work on the body, in a scene
-
-
-def energy(scene: str, args: Namespace) -> lab.Row:
-    """Return the row of a scene's energy."""
-    with Result(run("energy", scene, args, "output.surface=false")) as result:
-        parts = {name: result.frames[name][:] for name in PARTS}
-        gained = max(float(np.nansum(result.frames.energy_gained[:])), 0.0)
-    total, had = sum(parts.values()), float((parts["kinetic"] + parts["elastic"]).max())
-    rise = float((total - np.minimum.accumulate(total)).max())
-    works = any(word in (lab.SCENES / f"{scene}.toml").read_text() for word in WORK)
-    return {
-        "scene": scene,
-        "most kinetic and elastic [J]": had,
-        "rise of all energy": "work is done" if works else f"{rise / had:.2%}",
-        "from nowhere": f"{gained / had:.2%}",
-    }
 
 
 # ---- surfaces that meet themselves
@@ -176,9 +146,8 @@ def touching(scene: str, args: Namespace) -> lab.Row:
 # ---- by name: the row of a scene, and the scenes if none is named
 
 TABLES = {
-    "paper": (paper, SCENES),
+    "table1": (table1, SCENES),
     "tissue": (tissue, ("bunny_fall", "heart_pull", "brain_fall")),
-    "energy": (energy, tuple(sorted(path.stem for path in lab.SCENES.glob("*.toml")))),
     "touching": (touching, ("two_bunnies", "pile", "armadillo_fold", "lung_press_contact")),
 }
 

@@ -172,8 +172,9 @@ def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str]
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
-            wanted = (not sweep.scenes or scene.name in sweep.scenes) and (full or not (sweep.full or scene.full))
-            for own in of_laws(scene, sweep) if wanted else ():
+            if (sweep.scenes and scene.name not in sweep.scenes) or (not full and (sweep.full or scene.full)):
+                continue
+            for own in of_laws(scene, sweep):
                 for case in sweep_cases(study, *own, folder=folder, presets=presets):
                     by_id.setdefault(case.id, case)
     for map in study.map:
@@ -191,13 +192,12 @@ def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]
 
 
 def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
-    """Yield a scene with each law of a sweep, which its reference has, too; and the sweep, labelled by the law."""
+    """Yield a scene with each law of a sweep, and the sweep labelled by it; references have the law, too."""
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
-        name = f"{sweep.label}, {law}" if sweep.label else law
         changed = scene.model_copy(update={"set": (*scene.set, f"material.law={law}")})
-        yield changed, sweep.model_copy(update={"label": name})
+        yield changed, sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))})
 
 
 def sweep_cases(
@@ -267,8 +267,8 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     """Return the run with tiny steps that a case is measured against, stored where they are compared.
 
-    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in it,
-    but for the law, if it names none.
+    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in
+    it, but for the law, if it names none.
     """
     reference = scene.reference
     if reference is None:
@@ -314,8 +314,8 @@ def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | N
                 preset = method.preset
             case = Case(
                 scene=map.name, file=file, content=digest(file, scene), set=(*run.set, *method.set),
-                integrator=method.integrator, time_step=step, preset=preset, options=options, error=method.error,
-                max_iterations=method.max_iterations, label=method.label, timeout=study.timeout,
+                integrator=method.integrator, time_step=step, preset=preset, options=options,
+                error=method.error, max_iterations=method.max_iterations, label=method.label, timeout=study.timeout,
                 point=MapPoint(map.name, method.label if x is None else x, y, run.recovers),
             )  # fmt: skip
             yield with_time(with_solver(case, scene), max(duration, step), 1, scene)

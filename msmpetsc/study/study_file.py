@@ -99,7 +99,7 @@ class Sweep(Table):
     integrators: ListOf[IntegratorName] = ("implicit-euler",)
     presets: ListOf[PresetName] = ()
     options: ListOf[Options] = ("",)  # of PETSc, each one string: "-pc_type icc"
-    laws: ListOf[Name] = ()  # of the material, which curves are called by; those of their references, too
+    laws: ListOf[Name] = ()  # of the material and of references; curves are called by them
     cells: ListOf[Count] = ()
     time_steps: ListOf[Positive] = ()  # [s]; of verlet, what is between two frames
     substeps: ListOf[Positive] = ()  # [s] of verlet, the longest; the stability limit's if absent

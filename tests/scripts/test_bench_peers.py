@@ -1,7 +1,6 @@
 """What the programs of others are given, and the error that they are measured by."""
 
 import bench_peers
-import peers
 import pytest
 
 
@@ -14,7 +13,7 @@ def small(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_the_beam_that_peers_get_is_that_of_the_run(small: bench_peers.Setup):
-    given = peers.read_beam(small.reference)
+    given = bench_peers.read_beam(small.reference)
     assert len(given.nodes) == 5 * 3 * 3 and given.pinned.sum() == 9
     assert given.corner.max(axis=0).tolist() == [4, 2, 2]
     assert given.mass.sum() == pytest.approx(1000 * 16 * bench_peers.CELL**3)

@@ -47,7 +47,6 @@ def planted(folder: Path, **files: str) -> Path:
         path = package / f"{name.replace('__', '/')}.py"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    (folder / "README.md").write_text("# A title\n\nthree more words\n")
     return folder
 
 
@@ -68,4 +67,3 @@ def test_planted_faults_are_measured(tmp_path: Path):
     assert rows["lines/files by room"] == "model 47/2, solve 7/2"
     assert rows["conditional expressions: all, in 1,000 lines"].startswith("1, ")
     assert rows["tuple assignments: all, in 1,000 lines"].startswith("1, ")
-    assert rows["README files: lines, words"] == "3, 6"

@@ -230,14 +230,15 @@ SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart of all scenes with surface errors: a curve a way to step, over its cost and over its cells."""
+    """Return a chart of all scenes with surface errors: a curve a way to step, over cost and over cells."""
     scenes = grouped(measured(succeeded(table), *SIZE), "scene")
     if not scenes:
         return []
     own = {label: styles[label] for label in dict.fromkeys(concat(scenes.values())["label"])}
-    names = list(scenes) if len(scenes) == 1 else []
-    title = ": ".join([SIZES, *names])
-    chart = Chart("_".join(["size", *names]), SIZES, title, SIZES_CAPTION, own, columns=2, height=200)
+    chart = Chart("size", SIZES, SIZES, SIZES_CAPTION, own, columns=2, height=200)
+    if len(scenes) == 1:
+        chart.name += f"_{next(iter(scenes))}"
+        chart.title += f": {next(iter(scenes))}"
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
         lines = [what_takes(rows, level) for level in (0.1, 0.03, 0.01)]
@@ -265,12 +266,13 @@ def reached(rows: DataFrame, level: float) -> str:
     """Return the cells and the cost from which on a curve, by rising cells, is below a level."""
     above = np.flatnonzero(rows["surface_error"] > level)
     if len(above) == 0:
-        first = rows.iloc[0]
-        return f"{formatting.count(first['cells'])} cells or fewer ({formatting.seconds(first['time_second'])})"
+        cells, seconds = rows.iloc[0][["cells", "time_second"]]
+        return f"{formatting.count(cells)} cells or fewer ({formatting.seconds(seconds)})"
     if above[-1] + 1 == len(rows):
         return f"more than {formatting.count(rows['cells'].iloc[-1])} cells"
-    logs = np.log(rows.iloc[[above[-1] + 1, above[-1]]][["surface_error", "cells", "time_second"]].to_numpy(float))
-    cells, seconds = (np.exp(np.interp(np.log(level), logs[:, 0], column)) for column in logs.T[1:])
+    between = rows.iloc[[above[-1] + 1, above[-1]]][["surface_error", "cells", "time_second"]]
+    logs = np.log(between.to_numpy(float)).T
+    cells, seconds = (float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:])
     return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
 
 

@@ -311,7 +311,7 @@ STARTS: dict[str, Tables] = {
     "pressed to 30%": {"scale": [0.3, 1, 1]},
     "mirrored": {"scale": [-1, 1, 1]},
     "scattered": {"scatter": 1.0},
-    "collapsed": {"scale": [0, 0, 0]},
+    "collapsed": {"scale": [0.01, 0.01, 0.01]},
 }
 FALL = {"time": {"step": 1 / 20, "duration": 60, "until": "rest"}, "solver": {"error": 1e-3}}
 

@@ -27,7 +27,7 @@ import lab
 import numpy as np
 import trimesh
 from petsc4py import PETSc
-from table1 import PAPER, SCENES, slowest_tenth
+from scene_tables import PAPER, SCENES, slowest_tenth
 
 from msmpetsc.backend import cuda
 from msmpetsc.solve.petsc import device

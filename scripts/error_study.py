@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
 """Holds the error that steps say they have against their true one, on random hard scenes.
 
-    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--write FOLDER] [--json OUT] [--at-once 2] [-o PAGE]
-                           [--set KEY=VALUE ...]
+    scripts/error_study.py [--scenes 500] [--seed 1] [--only K] [--set KEY=VALUE ...] [--json OUT] [-o PAGE]
 
 Each scene is drawn from its seed and number: a body (beam, cube, plate, ball, tilted or not) of 40 to 150 cells, soft
 or stiff, of either law, squashed, stretched, twisted, scattered, spinning, thrown, pressed between plates with
@@ -10,15 +9,11 @@ friction, in parts of up to 1e6 to 1, pinned, led or free, in short and long ste
 a second time to rounding from where it ended: what it says of its error over that distance is the ratio.
 
 Exit status: 1 if a step that a run of status 0 took says less than a third of its true error, or a scene ends in a
-fault.
-
-    --only K        run scene K alone, and print each step
-    --write FOLDER  leave scene K there, with its mesh, for `msmpetsc run`
+fault. --only K runs scene K alone, leaves it in out/error_study/SEED for `msmpetsc run`, and prints each step.
 """
 
 import json
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -36,11 +31,13 @@ SECONDS = 300  # a scene may take so long
 NOTHING = 1e-9  # true errors below it cannot be told from 0
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
 ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}  # exit status; any other is a fault
+FOLDER = lab.OUT / "error_study"
 Draw = np.random.Generator
 
 
 def draw_scene(seed: int, number: int, folder: Path) -> Path:
     """Write scene ``number`` of a seed and its mesh; the path of the scene."""
+    folder.mkdir(parents=True, exist_ok=True)
     draw = np.random.default_rng([seed, number])
     sides = np.array(SIDES[draw.integers(len(SIDES))])
     scene: dict = {
@@ -153,14 +150,14 @@ def add_anchor(draw: Draw, scene: dict, sides: np.ndarray) -> None:
 
 def measured(seed: int, changes: list[str], number: int) -> dict:
     """What became of one scene, some keys changed: ``status``, its words, each step's error as said and in truth."""
-    with tempfile.TemporaryDirectory() as folder:
-        set_words = [word for change in changes for word in ("--set", change)]
-        scene, result = draw_scene(seed, number, Path(folder)), Path(folder) / "run.h5"
-        run = lab.run(scene, result, ["--true-error", 1, "--quiet", *set_words], timeout=SECONDS, warm=True)
-        solver, steps = load_scene(scene).solver, []
-        if result.exists():  # of a run that failed, the steps before
-            frames = run.frames("step_error", "true_error")
-            steps = np.transpose([frames["step_error"], frames["true_error"]]).tolist()
+    scene = draw_scene(seed, number, FOLDER / str(seed))
+    result = scene.with_suffix(".h5")
+    result.unlink(missing_ok=True)
+    run = lab.run(scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True)
+    solver, steps = load_scene(scene).solver, []
+    if result.exists():  # of a run that failed, the steps before
+        frames = run.frames("step_error", "true_error")
+        steps = np.transpose([frames["step_error"], frames["true_error"]]).tolist()
     row = {"number": number, "preset": solver.preset, "goal": solver.error, "status": run.status}
     return row | {"said": run.failure, "steps": steps}
 
@@ -192,20 +189,14 @@ def main() -> int:
     options.add_argument("--scenes", type=int, default=500)
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--only", type=int)
-    options.add_argument("--write", type=Path)
     options.add_argument("--json", type=Path)
     options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    options.add_argument("--at-once", type=int, default=2)
     args = options.parse_args()
-    if args.write:
-        args.write.mkdir(parents=True, exist_ok=True)
-        print(draw_scene(args.seed, args.only or 0, args.write))
-        return 0
     if args.only is not None:
         row = measured(args.seed, args.set, args.only)
         print(json.dumps(row, indent=1))
         return int(bad(row))
-    with ThreadPoolExecutor(args.at_once) as pool:
+    with ThreadPoolExecutor(2) as pool:
         rows = list(pool.map(partial(measured, args.seed, args.set), range(args.scenes)))
     if args.json:
         args.json.write_text(json.dumps(rows))

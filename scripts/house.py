@@ -141,22 +141,12 @@ def density(tree: Tree) -> Facts:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
             tuples += any(isinstance(target, ast.Tuple) for target in node.targets)
     wide = sum(len(line) > WIDE for line in lines)
-    for name, count in (
-        (f"lines over {WIDE}", wide),
-        ("conditional expressions", choices),
-        ("tuple assignments", tuples),
-    ):
+    counts = {f"lines over {WIDE}": wide, "conditional expressions": choices, "tuple assignments": tuples}
+    for name, count in counts.items():
         yield f"{name}: all, in 1,000 lines", f"{count:,}, {1000 * count / len(lines):.1f}"
 
 
-# ---- documents, findings
-
-
-def documents(tree: Tree) -> Facts:
-    """Yield the size of the README files."""
-    paths = [path for path in tree.folder.rglob("README.md") if not {".venv", "out"} & set(path.parts)]
-    text = "".join(path.read_text() for path in paths)
-    yield "README files: lines, words", f"{len(text.splitlines()):,}, {len(text.split()):,}"
+# ---- findings
 
 
 def findings(tree: Tree) -> Facts:
@@ -170,7 +160,7 @@ def findings(tree: Tree) -> Facts:
 def measures(folder: Path, quick: bool) -> dict[str, object]:
     """Return all measures of a tree by their names."""
     tree = Tree(folder)
-    rows = dict(rooms(tree)) | dict(shape(tree)) | dict(density(tree)) | dict(documents(tree))
+    rows = dict(rooms(tree)) | dict(shape(tree)) | dict(density(tree))
     return rows if quick else rows | dict(findings(tree))
 
 

@@ -39,13 +39,11 @@ class Run:
 
     failure : why it did not come to its end; empty if it did
     status  : its exit status; None where time ran out
-    seconds : that the process took
     """
 
     path: Path
     failure: str = ""
     status: int | None = 0
-    seconds: float = 0.0
 
     @cached_property
     def cost(self) -> dict[str, Any]:
@@ -80,7 +78,7 @@ def run(
     ended = python(command, path.with_suffix(".log"), ranks, timeout, warm)
     if ended.reason:
         print("  failed:", ended.reason, file=sys.stderr)
-    return Run(path, ended.reason, ended.status, ended.seconds)
+    return Run(path, ended.reason, ended.status)
 
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False) -> Ended:
@@ -111,12 +109,12 @@ def spread(values: Sequence[float]) -> str:
     return shown(median(values)) + ends
 
 
+# ---- what is printed
+
+
 def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
     """Return the slope of a line fitted to log |error| over log size."""
     return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
-
-
-# ---- what is printed
 
 
 def shown(value: object) -> str:

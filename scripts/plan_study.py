@@ -1,21 +1,26 @@
 #!/usr/bin/env python3
 """Holds what `plan --surface-error` chooses against finer runs. Needs the meshes.
 
-    scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--cells N] [--frames N] [--limit SECONDS] [-o PAGE]
+    scripts/plan_study.py [SCENE...] [--errors 0.1 0.03 0.01] [--laws LAW...] [--cells N] [--frames N]
+                          [--limit SECONDS] [-o PAGE]
 
 The finer run has 32 times the cells of the choice, or 8 times where that takes longer than the limit, and a quarter
 more than the plan's finest trial at least. It takes explicit substeps or a quarter of the step; a static one is static.
-Where no choice meets the error, the best one is held against a finer run. Where the choice takes over 5 s for the whole
-scene, it is run in full, to tell the plan's own time beside it. SCENE is a name of the study or a scene file.
+Where no choice meets the error, the best one is held against a finer run. With --laws each scene is planned with each
+of these laws of its material. SCENE is a name of the study or a scene file.
 """
 
 import json
+import tomllib
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
+from shutil import copy
 from typing import NamedTuple
 
 import lab
+
+import tomli_w
 
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.statics import STATIC
@@ -25,9 +30,9 @@ from msmpetsc.study.metrics import surface_error
 ERRORS, LIMIT = (0.1, 0.03, 0.01), 900.0  # [s] a finer run
 FINER = 32, 8  # times the cells: 8 are half the edge, and err by half as much where the order is 1
 MORE = 1.25  # times the cells of the plan's finest trial, at least
-LONG = 5.0  # [s] a choice that takes as long for the whole scene is run so
 SHORTER = 4  # times, of implicit steps
 NOT_MET = 3  # exit status of a plan that is there all the same
+FOLDER = lab.OUT / "plan_study"
 Setting = tuple[tuple[int | None, ...], tuple[int, ...]]
 STUDIES: dict[str, Setting] = {  # for each of ERRORS: first frames, that are tried, and cells of the finest trial
     "armadillo_forehead": ((2, 2, 2), (1000, 4000, 8000)),
@@ -46,42 +51,37 @@ ANOTHER: Setting = ((None, None, None), (1000, 2000, 4000))  # of a scene file
 
 
 class Planned(NamedTuple):
-    """What the plan of a scene chose on its first frames.
+    """What the plan of a scene file chose on its first frames.
 
     frames  : None for all
     method  : integrator, time_step [s], preset, step_error (None of verlet)
     seconds : that the plan took
     """
 
-    scene: str
+    file: Path
     frames: int | None
     method: dict
     cells: int
     answer: dict
-    seconds: float = 0.0
+    seconds: float
 
-    @property
-    def file(self) -> Path:
-        """The scene's file."""
-        return Path(self.scene) if self.scene.endswith(".toml") else lab.SCENES / f"{self.scene}.toml"
-
-    def run(self, method: dict, cells: int, limit: float, frames: int | None) -> lab.Run:
+    def run(self, method: dict, cells: int, limit: float) -> lab.Run:
         """Run so many cells by a method, with the surface at the scene's own frames."""
         scene = load_scene(self.file)
         cages = scene.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         step = {"integrator": method["integrator"], "step": method["time_step"]}
         time = scene.time.model_dump(exclude_unset=True) | step
-        if frames:
-            time["duration"] = frames * scene.time.step
+        if self.frames:
+            time["duration"] = self.frames * scene.time.step
         changes = [f"cages={inline(cages)}", f"time={inline(time)}", "output.surface=true"]
         changes += [f"output.every={max(1, round(scene.time.step / method['time_step']))}"]
         if method["step_error"]:
             changes += [f"solver={inline({'preset': method['preset'], 'error': method['step_error']})}"]
-        path = lab.OUT / "plan_study" / f"{Path(self.scene).name}_{cells}_{method['integrator']}.h5"
+        path = FOLDER / f"{self.file.stem}_{cells}_{method['integrator']}.h5"
         return lab.run(self.file, path, ["--quiet"], changes, timeout=limit)
 
-    def finer(self, seconds: float, limit: float) -> Iterator[tuple[int, dict]]:
-        """Yield cells and methods of finer runs that the limit allows; ``seconds``: of the steps of the choice."""
+    def finer(self) -> Iterator[tuple[int, dict]]:
+        """Yield cells and methods of finer runs."""
         method, finest = self.method, max(each["cells"] for each in self.answer["tried"])
         if method["integrator"] == STATIC:
             method = method | {"step_error": 1e-3}
@@ -89,56 +89,56 @@ class Planned(NamedTuple):
             shorter = {"integrator": "bdf2", "time_step": method["time_step"] / SHORTER, "preset": "newton"}
             method = shorter | {"step_error": min(1e-3, method["step_error"])}
         for times in FINER:
-            cells = round(max(times * self.cells, MORE * finest))
-            growth = (cells / self.cells) ** (4 / 3 if method["integrator"] == "verlet" else 1)
-            if seconds * growth * (SHORTER if method["integrator"] == "bdf2" else 1) < limit:
-                yield cells, method
+            yield round(max(times * self.cells, MORE * finest)), method
 
 
-def planned(scene: str, target: float, frames: int | None, cells: int) -> Planned | str:
+def scene_file(name: str, law: str | None) -> Path:
+    """Return the file of a scene, of its twin by another law, which is written."""
+    file = Path(name) if name.endswith(".toml") else lab.SCENES / f"{name}.toml"
+    if law is None:
+        return file
+    tables = tomllib.loads(file.read_text())
+    tables["material"]["law"] = law
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    if (mesh := file.parent / tables["mesh"]["source"]).exists():  # a scene may name what lies beside it alone
+        copy(mesh, FOLDER)
+    twin = FOLDER / f"{file.stem}_{law}.toml"
+    twin.write_text(tomli_w.dumps(tables))
+    return twin
+
+
+def planned(file: Path, target: float, frames: int | None, cells: int) -> Planned | str:
     """Return what `msmpetsc plan` chooses; or why there is nothing."""
-    plan = Planned(scene, frames, {}, 0, {})
     words = ["--surface-error", target, *(("--frames", frames) if frames else ()), "--cells", cells, "--json"]
-    log = lab.OUT / "plan_study" / "plan.log"
+    log = FOLDER / f"{file.stem}_{target:g}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    ended = lab.python(["-m", "msmpetsc", "plan", plan.file, *words], log)
-    answer = log.read_text().rpartition("\n{\n")[2]  # behind what was tried
+    ended = lab.python(["-m", "msmpetsc", "plan", file, *words], log)
     if ended.status not in (0, NOT_MET):
         return ended.reason
-    found = json.loads("{" + answer)
-    choice = found["choice"]
-    return plan._replace(method=choice["method"], cells=choice["cells"], answer=found, seconds=ended.seconds)
+    answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])  # behind what was tried
+    choice = answer["choice"]
+    return Planned(file, frames, choice["method"], choice["cells"], answer, ended.seconds)
 
 
 def true_error(plan: Planned, limit: float) -> tuple[float | None, str]:
     """Return the error of a choice against the first finer run that ends in time, or why there is none."""
-    choice = plan.run(plan.method, plan.cells, limit, plan.frames)
+    choice = plan.run(plan.method, plan.cells, limit)
     if choice.failure:
         return None, f"the choice: {choice.failure}"
-    why = "a finer run would take too long"
-    for cells, method in plan.finer(choice.cost["time"]["stepping"], limit):
-        finer = plan.run(method, cells, limit, plan.frames)
+    why = ""
+    for cells, method in plan.finer():
+        finer = plan.run(method, cells, limit)
         if not finer.failure:
             return surface_error(choice.path, finer.path), f"from {cells:,} cells"
         why = f"the finer run: {finer.failure}"
     return None, why
 
 
-def full_seconds(plan: Planned, limit: float) -> float | None:
-    """Return the seconds of the choice for all of the scene; None where they are few, or more than the limit."""
-    time = load_scene(plan.file).time
-    if not LONG <= plan.answer["choice"]["cost"] * time.duration <= limit:
-        return None
-    ended = plan.run(plan.method, plan.cells, limit, None)
-    return None if ended.failure else ended.seconds
-
-
-def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row:
-    """Return the row of a plan."""
-    found = {"scene": scene, "asked": f"{100 * target:g}%"}
+def row(names: dict[str, object], target: float, plan: Planned | str, limit: float) -> lab.Row:
+    """Return the row of a plan; ``names``: its first columns."""
+    found = names | {"asked": f"{100 * target:g}%"}
     if isinstance(plan, str):
         return found | {"chosen, cells": plan}
-    full = full_seconds(plan, limit)
     error, why = true_error(plan, limit)
     method, choice = plan.method, plan.answer["choice"]
     step = "" if method["step_error"] is None else f", {1000 * method['time_step']:.3g} ms to {method['step_error']:g}"
@@ -150,8 +150,6 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
         "over asked": None if error is None else f"{error / target:.2g}",
         "s a simulated s": float(choice["cost"]),
         "plan, s": plan.seconds,
-        "choice in full, s": full,
-        "plan over that": full and plan.seconds / full,
         "what bounds it": "; ".join(bounds),
     }
 
@@ -162,14 +160,17 @@ def rows(args: Namespace) -> lab.Rows:
         number = next((number for number, error in enumerate(ERRORS) if target >= error), len(ERRORS) - 1)
         for scene in args.scenes or STUDIES:
             tried, finest = STUDIES.get(scene, ANOTHER)
-            plan = planned(scene, target, args.frames or tried[number], args.cells or finest[number])
-            yield row(scene, target, plan, args.limit)
+            for law in args.laws:
+                size = args.frames or tried[number], args.cells or finest[number]
+                names = {"scene": scene} | ({"law": law} if law else {})
+                yield row(names, target, planned(scene_file(scene, law), target, *size), args.limit)
 
 
 def main() -> None:
     options = lab.parser(__doc__)
     options.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(STUDIES))
     options.add_argument("--errors", nargs="+", type=float, default=ERRORS)
+    options.add_argument("--laws", nargs="+", default=[None], metavar="LAW", help="of the material; the scene's own")
     options.add_argument("--cells", type=int, help="of the finest trial")
     options.add_argument("--frames", type=int, help="the first ones, that are tried")
     options.add_argument("--limit", type=float, default=LIMIT, help="seconds of a finer run")

@@ -3,12 +3,12 @@
 
     scripts/solid_study.py [cantilever elastica rod ...] [-o PAGE]
 
-All but the uniform strains are runs of the product; errors are relative.
+All are runs of the product; errors are relative.
 """
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,10 +19,8 @@ import manifold3d
 import numpy as np
 import skfem
 import trimesh
-from material_study import COMM, SPRINGS, lattice_of
-from petsc4py import PETSc
-from scipy.optimize import brentq
-from scipy.sparse import csr_matrix
+from material_study import COMM, LAWS, SPRINGS
+from scipy.spatial.transform import Rotation
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import msmpetsc
@@ -76,10 +74,6 @@ def run(mesh: trimesh.Trimesh | Path, poisson: float | None, **tables: Any) -> R
     return Run(simulation.model.lattice, None if surface is None else surface.points, frames)
 
 
-def name_of(poisson: float | None) -> str:
-    return "springs" if poisson is SPRINGS else str(poisson)
-
-
 def box(*sides: float) -> trimesh.Trimesh:
     """Return a box with a corner at the origin."""
     return trimesh.creation.box(bounds=[[0, 0, 0], sides])
@@ -111,7 +105,7 @@ def sag_error(across: int, poisson: float | None, length: int = 10) -> float:
 def cantilever_rows() -> lab.Rows:
     for poisson in (SPRINGS, *POISSON):
         errors = {f"{across} cells": percent(sag_error(across, poisson), 2) for across in (2, 4)}
-        yield {"Poisson's ratio": name_of(poisson)} | errors
+        yield {"Poisson's ratio": str(poisson or "springs")} | errors
 
 
 LENGTH, DOWN, BACK = 20, 0.71379, 0.38763  # the tip's way in lengths, Bisshopp and Drucker (1945)
@@ -128,7 +122,7 @@ def elastica_rows() -> lab.Rows:
             of = elastica(across, poisson)
             back, _, down = -of.moved(LENGTH) / LENGTH
             yield {
-                "Poisson's ratio": name_of(poisson),
+                "Poisson's ratio": str(poisson or "springs"),
                 "cells across": across,
                 "tip down": percent(down / DOWN - 1, 2),
                 "tip back": percent(back / BACK - 1, 2),
@@ -156,23 +150,8 @@ def fem_surface(surface: trimesh.Trimesh, young: float, poisson: float, load: np
     K = linear_elasticity(*lame_parameters(young, poisson)).assemble(basis)
     f = skfem.LinearForm(lambda v, _: load[0] * v[0] + load[1] * v[1] + load[2] * v[2]).assemble(basis)
     fixed = basis.get_dofs(basis.mesh.facets_satisfying(lambda x: x[2] < 1e-9, boundaries_only=True))
-    u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=cholesky)
+    u = skfem.solve(*skfem.condense(K, f, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-10))
     return u[basis.nodal_dofs[:, : len(surface.vertices)]].T
-
-
-def cholesky(K: csr_matrix, f: np.ndarray) -> np.ndarray:
-    """Return K^(-1) f by MUMPS, K symmetric positive definite."""
-    matrix = PETSc.Mat().createAIJ(K.shape, csr=(K.indptr.astype("i4"), K.indices.astype("i4"), K.data))
-    matrix.setOption(PETSc.Mat.Option.SPD, True)
-    ksp = PETSc.KSP().create()
-    ksp.setOperators(matrix)
-    ksp.setType("preonly")
-    ksp.getPC().setType("cholesky")
-    ksp.getPC().setFactorSolverType("mumps")
-    x, b = matrix.createVecs()
-    b.array[:] = f
-    ksp.solve(b, x)
-    return x.array.copy()
 
 
 SCAN_E, PUSH = 1e9, [9.81, 0.0, 0.0]  # [Pa], [m/s^2]: small displacements
@@ -221,57 +200,54 @@ def bunny_rows() -> lab.Rows:
     yield from scan_rows(surface, fem_surface(surface, SCAN_E, 0.25, DENSITY * np.array(PUSH)))
 
 
-# ---- uniform strain
+def box_rows() -> lab.Rows:
+    """Rows of the beam of studies/beam_soft.toml, standing, which lies along the grid."""
+    surface = box(0.5, 0.5, 1.25)
+    for _ in range(4):
+        surface = surface.subdivide()
+    yield from scan_rows(surface, fem_surface(surface, SCAN_E, 0.25, DENSITY * np.array(PUSH)))
 
 
-def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
-    """Return P = mu (F - F^-T) + lambda (J - 1) J F^-T [Pa]."""
-    lame, mu = lame_parameters(E, poisson)
-    J, inverse = np.linalg.det(F), np.linalg.inv(F).T
-    return mu * (F - inverse) + lame * (J - 1) * J * inverse
+# ---- a clamp that lies askew in the grid
+
+RADIUS, FREE = 0.05, 0.3  # of a round bar, and its length beyond the clamp [m]
+TILT = Rotation.from_rotvec([0, 0, 0.35]) * Rotation.from_rotvec([0, 0.35, 0])
+CLAMPS = {"plane through cells": 1.0, "end face": 0.0}  # held over so many radii
 
 
-def stretched(poisson: float, s: float, sides: int) -> np.ndarray:
-    """Return the deformation gradient of stretches s along all axes but the last so many, whose faces are free."""
-
-    def shape(free: float) -> np.ndarray:
-        return np.diag([*(3 - sides) * [s], *sides * [free]])
-
-    return shape(brentq(lambda free: textbook(shape(free), poisson)[2, 2], 0.1, 10, xtol=1e-15))
-
-
-def strains(poisson: float) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield names and deformation gradients."""
-    for s in (0.5, 1.5):
-        yield f"uniaxial, {s}", stretched(poisson, s, 2)
-        yield f"equibiaxial, {s}", stretched(poisson, s, 1)
-        yield f"shear, {s}", np.array([[1, s, 0], [0, 1, 0], [0, 0, 1.0]])
-    yield "confined, 0.7", np.diag([0.7, 1, 1])
+def compliance(cells: int, tilt: Rotation, held: float, poisson: float | None = SPRINGS) -> float:
+    """Return the work [J] of the weight of a bar clamped over so many radii, of cells of RADIUS / ``cells``."""
+    length = FREE + held * RADIUS
+    mesh = trimesh.creation.cylinder(RADIUS, length, sections=256)
+    mesh.vertices = tilt.apply(mesh.vertices[:, [2, 0, 1]] + [length / 2 - held * RADIUS, 0, 0])
+    clamp = {"region": {"half_space": {"point": [0, 0, 0], "normal": [*tilt.apply([-1, 0, 0])]}}}
+    tables = {"material": {"young_modulus": SCAN_E}, "solver": {"error": 1e-5}, "pin": [clamp]}
+    gravity = {"acceleration": [*(G * tilt.apply([0, 0, -1]))]}
+    of = run(mesh, poisson, cages={"cell_size": RADIUS / cells}, gravity=gravity, **tables)
+    return of.frames[0].potential - of.frames[-1].potential
 
 
-def strain_error(poisson: float, F: np.ndarray) -> float:
-    """Return the greatest error of the forces on the faces and inside of a block, relative to E times a face."""
-    cells, h = np.array([4, 3, 2]), 0.125
-    lattice = lattice_of(box(*cells * h), h, poisson=poisson)
-    force, sides = np.zeros_like(lattice.nodes), cells * h
-    Elasticity(COMM, lattice).add_gradient(lattice.nodes @ F.T, force)
-    exact, P = np.zeros_like(force), textbook(F, poisson)
-    for axis in range(3):
-        across = np.delete(np.arange(3), axis)
-        ends = np.where(
-            np.isclose(lattice.nodes[:, across], 0) | np.isclose(lattice.nodes[:, across], sides[across]), 0.5, 1
-        )
-        for sign, at in ((-1, 0), (1, sides[axis])):
-            on = np.isclose(lattice.nodes[:, axis], at)
-            exact[on] += sign * h**2 * ends[on].prod(axis=1)[:, None] * P[:, axis]
-    return np.abs(force - exact).max() / np.abs(exact).max()
+def limit(coarse: int, fine: int, poisson: float | None = SPRINGS) -> float:
+    """Return the work [J] of a bar along the grid in the limit of small cells, by Richardson's extrapolation."""
+    a, b = (compliance(cells, Rotation.identity(), 0.0, poisson) for cells in (coarse, fine))
+    return b + (b - a) / ((fine / coarse) ** 2 - 1)
 
 
-def strain_rows() -> lab.Rows:
-    names = [name for name, _ in strains(0.25)]
-    for name in names:
-        yield {"uniform strain": name} | {
-            f"nu {poisson}": f"{strain_error(poisson, dict(strains(poisson))[name]):.0e}" for poisson in POISSON
+def clamp_errors(sizes: tuple[int, ...], exact: float, held: float, poisson: float | None = SPRINGS) -> np.ndarray:
+    """Return relative errors of the stiffness, one a size."""
+    return exact / np.array([compliance(cells, TILT, held, poisson) for cells in sizes]) - 1
+
+
+def clamp_rows() -> lab.Rows:
+    """A round bar tilted about two axes, under its weight; the exact work is that of a bar along the grid."""
+    sizes = (4, 8, 16)  # cells a radius
+    for law, poisson in LAWS.items():
+        exact = limit(*sizes[1:], poisson)
+        found = {name: clamp_errors(sizes, exact, held, poisson) for name, held in CLAMPS.items()}
+        for k, cells in enumerate(sizes):
+            yield {"law": law, "cells": f"R/{cells}"} | {name: percent(of[k], 2) for name, of in found.items()}
+        yield {"law": law, "cells": "order"} | {
+            name: f"{lab.slope([1 / cells for cells in sizes], of):.2f}" for name, of in found.items()
         }
 
 
@@ -301,7 +277,7 @@ def fem_force(poisson: float, half: float) -> float:
     u = basis.zeros()
     u[plate.all("u^3")] = -PRESSED
     fixed = np.unique(np.concatenate([bottom.all(), plate.all(), *middles]))
-    u = skfem.solve(*skfem.condense(K, basis.zeros(), x=u, D=fixed), solver=cholesky)
+    u = skfem.solve(*skfem.condense(K, basis.zeros(), x=u, D=fixed), solver=skfem.solver_iter_pcg(rtol=1e-10))
     return -4 * (K @ u)[plate.all("u^3")].sum()
 
 
@@ -396,20 +372,17 @@ def swing_rows() -> lab.Rows:
         for h in sizes:
             of = beam(poisson, h, time, error=1e-3)
             its = [frame.iterations for frame in of.frames[1:]]
+            tips = [of._replace(frames=[frame]).moved(1.25)[2] for frame in of.frames]
             yield {
-                "Poisson's ratio": name_of(poisson),
+                "Poisson's ratio": str(poisson or "springs"),
                 "cells": len(of.lattice.cells),
                 "Newton iterations a frame: mean": float(np.mean(its)),
                 "most": max(its),
                 "most cells inside out": max(frame.inverted for frame in of.frames),
-                "tip at the end [m]": f"{-of.moved(1.25)[2]:.4f}",
-                "lowest [m]": f"{-min(tip(of, frame) for frame in of.frames):.4f}",
+                "tip at the end [m]": f"{-tips[-1]:.4f}",
+                "lowest [m]": f"{-min(tips):.4f}",
                 "seconds a frame": float(np.mean([frame.wall_time for frame in of.frames[1:]])),
             }
-
-
-def tip(of: Run, frame: Frame) -> float:
-    return of._replace(frames=[frame]).moved(1.25)[2]
 
 
 TABLES: dict[str, Callable[[], lab.Rows]] = {
@@ -417,7 +390,8 @@ TABLES: dict[str, Callable[[], lab.Rows]] = {
     "elastica": elastica_rows,
     "rod": rod_rows,
     "bunny": bunny_rows,
-    "strain": strain_rows,
+    "box": box_rows,
+    "clamp": clamp_rows,
     "pad": lambda: pressed_rows(WIDE / 2),
     "punch": lambda: pressed_rows(WIDE / 4),
     "starts": lambda: start_rows(FALL),

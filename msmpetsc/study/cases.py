@@ -172,9 +172,11 @@ def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str]
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:
-            wanted = (not sweep.scenes or scene.name in sweep.scenes) and (full or not (sweep.full or scene.full))
-            for case in sweep_cases(study, scene, sweep, folder=folder, presets=presets) if wanted else ():
-                by_id.setdefault(case.id, case)
+            if (sweep.scenes and scene.name not in sweep.scenes) or (not full and (sweep.full or scene.full)):
+                continue
+            for own in of_laws(scene, sweep):
+                for case in sweep_cases(study, *own, folder=folder, presets=presets):
+                    by_id.setdefault(case.id, case)
     for map in study.map:
         for case in map_cases(study, map, folder, presets) if full or not map.full else ():
             by_id.setdefault(case.id, case)
@@ -187,6 +189,15 @@ def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]
 
 
 # Sweeps
+
+
+def of_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
+    """Yield a scene with each law of a sweep, and the sweep labelled by it; references have the law, too."""
+    if not sweep.laws:
+        yield scene, sweep
+    for law in sweep.laws:
+        changed = scene.model_copy(update={"set": (*scene.set, f"material.law={law}")})
+        yield changed, sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))})
 
 
 def sweep_cases(
@@ -256,13 +267,16 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     """Return the run with tiny steps that a case is measured against, stored where they are compared.
 
-    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in it.
+    It has the lattice of the case, unless it names cells of its own: then what a sweep changes is not changed in
+    it, but for the law, if it names none.
     """
     reference = scene.reference
     if reference is None:
         return None
     if reference.cells:
         base = replace(base, cells=reference.cells, set=(*scene.set, f"cages.count={reference.cells}"))
+    if reference.law:
+        base = base.changed(f"material.law={reference.law}")
     frame = scene.frame or as_given.time.step
     duration = scene.duration or (scene.steps * as_given.time.step if scene.steps else as_given.time.duration)
     case = replace(
@@ -299,9 +313,9 @@ def map_cases(study: Study, map: Map, folder: Path, presets: Collection[str] | N
                 options = f"{options} {run.options}".strip()
                 preset = method.preset
             case = Case(
-                scene=map.name, file=file, content=digest(file, scene), set=run.set, integrator=method.integrator,
-                time_step=step, preset=preset, options=options, error=method.error, label=method.label,
-                max_iterations=method.max_iterations, timeout=study.timeout,
+                scene=map.name, file=file, content=digest(file, scene), set=(*run.set, *method.set),
+                integrator=method.integrator, time_step=step, preset=preset, options=options,
+                error=method.error, max_iterations=method.max_iterations, label=method.label, timeout=study.timeout,
                 point=MapPoint(map.name, method.label if x is None else x, y, run.recovers),
             )  # fmt: skip
             yield with_time(with_solver(case, scene), max(duration, step), 1, scene)

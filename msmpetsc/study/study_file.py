@@ -53,6 +53,7 @@ class ReferenceRun(Table):
     step: Positive | None = None  # [s] of what is not verlet
     substep: Positive | None = None  # [s] of verlet, the longest; the stability limit's if absent
     cells: Count | None = None  # the case's own lattice if absent
+    law: Name | None = None  # of the material; the case's own if absent
     preset: PresetName = "newton"
     error: Error = 1e-6  # of a step, relative
     timeout: Positive = 600.0  # [s]
@@ -98,6 +99,7 @@ class Sweep(Table):
     integrators: ListOf[IntegratorName] = ("implicit-euler",)
     presets: ListOf[PresetName] = ()
     options: ListOf[Options] = ("",)  # of PETSc, each one string: "-pc_type icc"
+    laws: ListOf[Name] = ()  # of the material and of references; curves are called by them
     cells: ListOf[Count] = ()
     time_steps: ListOf[Positive] = ()  # [s]; of verlet, what is between two frames
     substeps: ListOf[Positive] = ()  # [s] of verlet, the longest; the stability limit's if absent
@@ -126,6 +128,7 @@ class Method(Table):
     error: Error | None = None  # of a step, aimed at; the preset's if absent
     max_iterations: Count | None = None
     options: Options = ""
+    set: ListOf[Override] = ()  # changes of every scene, as to another law of the material
 
 
 class Axis(Table):

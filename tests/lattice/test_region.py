@@ -1,12 +1,12 @@
 """Which nodes a region means: by the material that they carry, not by where they stick out to."""
 
 import logging
-import runpy
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import solid_study as study
 import trimesh
 from block_scene import CELL, block_scene
 from conftest import ROOT, result_on
@@ -21,8 +21,7 @@ from msmpetsc.solve.simulate import TimeLoop
 
 CASES = ROOT / "tests" / "cases"
 TIME = {"step": 0.01, "duration": 0.1}
-STUDY = runpy.run_path(str(ROOT / "scripts" / "clamp_study.py"))
-limit = cache(lambda: STUDY["limit"](6, 8))
+limit = cache(lambda: study.limit(6, 8))
 
 
 def build(path: Path, *changes: str) -> Model:
@@ -100,7 +99,7 @@ def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind
 def test_a_tilted_clamp_converges_in_second_order(held):
     """A round bar tilted about two axes. By nodes' positions it was +7% to +20% too soft at R/4, of first order."""
     sizes = (4, 8)
-    errors = STUDY["errors"](sizes, limit(), held)
+    errors = study.clamp_errors(sizes, limit(), held)
     assert np.abs(errors).max() < 0.03
     assert np.abs(errors[1]) < 0.01
 

@@ -8,7 +8,6 @@ import lab
 import bench
 import bench_peers
 import numpy as np
-import peers
 import pytest
 
 from msmpetsc.solve.petsc import device
@@ -59,7 +58,7 @@ def small(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_the_beam_that_peers_get_is_that_of_the_run(small: bench_peers.Setup):
-    given = peers.read_beam(small.reference)
+    given = bench_peers.read_beam(small.reference)
     assert len(given.nodes) == 5 * 3 * 3 and given.pinned.sum() == 9
     assert given.corner.max(axis=0).tolist() == [4, 2, 2]
     assert given.mass.sum() == pytest.approx(1000 * 16 * bench_peers.CELL**3)

@@ -122,6 +122,18 @@ def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
     assert own.reference.set[0] == "cages.count=10" and not own.stores_surface and not own.reference.stores_surface
 
 
+def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
+    """Each has a reference of its own, unless the scene names the law of one for all."""
+    reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
+    sweep = '[[sweep]]\nlaws = ["linear", "neo-hookean"]'
+    found = all_cases(tmp_path, ONE_SCENE + reference + sweep)
+    assert [case.label for case in found] == ["linear", "neo-hookean"]
+    for case in found:
+        assert f"material.law={case.label}" in case.set and f"material.law={case.label}" in case.reference.set
+    for case in all_cases(tmp_path, ONE_SCENE + reference.replace("cells", 'law = "linear", cells') + sweep):
+        assert [word for word in case.reference.set if word.startswith("material.law")][-1] == "material.law=linear"
+
+
 def test_the_studies_shipped_are_sound():
     for name in ("pareto", "figure6", "growth"):
         path = ROOT / "scenes" / "studies" / f"{name}.toml"

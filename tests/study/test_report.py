@@ -239,7 +239,8 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     rows.append(row_of("fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3))
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
-    assert len([title for title in tooltips(text) if "surface error " in title]) == 6
+    assert len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6  # over cost, over cells
+    assert "10%: whole 2,000" in text and "fill 418" in text and "1%: whole more than 2,000 cells" in text
     assert "a pin holds no node" in text
     table = read_table(tmp_path)
     (chart,) = size_charts(table, curve_styles(table["label"]))

@@ -14,6 +14,7 @@ from pandas import DataFrame, concat
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import (
+    COUNT,
     DASH,
     ERROR,
     FAINT,
@@ -222,23 +223,57 @@ SIZES = "Surface error over cost"
 SIZES_CAPTION = (
     "Lower is more exact, further left is cheaper. The surface error is how far the surface is from that of a run of "
     "many more cells and shorter steps, rms over the surface and time, of its largest displacement: cells, time step "
-    "and unfinished steps together. A line joins the cells of one way to step, few at its left end."
+    "and unfinished steps together. A line joins the cells of one way to step, few at its left end; ringed is the "
+    "Pareto front. What an error takes is read off these lines, between two points by their logarithms."
 )
 SIZE = ("time_second", "surface_error")
 
 
 def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart for each scene with surface errors: a curve a way to step, over its cells."""
-    charts = []
-    for scene, rows in grouped(measured(succeeded(table), *SIZE), "scene").items():
-        own = {label: styles[label] for label in dict.fromkeys(rows["label"])}
-        chart = Chart(f"size_{scene}", SIZES, f"{SIZES}: {scene}", SIZES_CAPTION, own)
-        x = log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS)
-        panel = chart.panel(scene, x, log_axis("surface error", rows["surface_error"], ERROR))
-        panel.curves(rows.sort_values("cells", kind="stable"), SIZE, (*SIZE[::-1], "cells", "time_step", "error"))
-        panel.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
-        charts.append(chart)
-    return charts
+    """Return a chart of all scenes with surface errors: a curve a way to step, over cost and over cells."""
+    scenes = grouped(measured(succeeded(table), *SIZE), "scene")
+    if not scenes:
+        return []
+    own = {label: styles[label] for label in dict.fromkeys(concat(scenes.values())["label"])}
+    chart = Chart("size", SIZES, SIZES, SIZES_CAPTION, own, columns=2, height=200)
+    if len(scenes) == 1:
+        chart.name += f"_{next(iter(scenes))}"
+        chart.title += f": {next(iter(scenes))}"
+    for scene, rows in scenes.items():
+        draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
+        lines = [what_takes(rows, level) for level in (0.1, 0.03, 0.01)]
+        chart.findings[f"What an error of the surface takes: {scene}"] = lines
+    return [chart]
+
+
+def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
+    """Draw a scene's two panels."""
+    y = log_axis("surface error", rows["surface_error"], ERROR)
+    over_cost = chart.panel(scene, log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS), y)
+    over_cost.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
+    over_cells = chart.panel("", log_axis("valid cells", rows["cells"], COUNT), y)
+    for panel, columns in ((over_cost, SIZE), (over_cells, ("cells", "surface_error"))):
+        panel.curves(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
+
+
+def what_takes(rows: DataFrame, level: float) -> str:
+    """Say how many cells and what time each way to step takes for an error."""
+    curves = ", ".join(f"{label} {reached(of, level)}" for label, of in grouped(rows, "label").items())
+    return f"{100 * level:g}%: {curves}."
+
+
+def reached(rows: DataFrame, level: float) -> str:
+    """Return the cells and the cost from which on a curve, by rising cells, is below a level."""
+    above = np.flatnonzero(rows["surface_error"] > level)
+    if len(above) == 0:
+        cells, seconds = rows.iloc[0][["cells", "time_second"]]
+        return f"{formatting.count(cells)} cells or fewer ({formatting.seconds(seconds)})"
+    if above[-1] + 1 == len(rows):
+        return f"more than {formatting.count(rows['cells'].iloc[-1])} cells"
+    between = rows.iloc[[above[-1] + 1, above[-1]]][["surface_error", "cells", "time_second"]]
+    logs = np.log(between.to_numpy(float)).T
+    cells, seconds = (float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:])
+    return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
 
 
 def plan_picture(plan: SizePlan, target: float, path: Path) -> None:

@@ -6,13 +6,6 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import lab
 
-import numpy as np
-import trimesh
-from mpi4py import MPI
-
-from msmpetsc.geometry.cages import BodySurface, fill
-from msmpetsc.geometry.surface import Surface, examine
-
 CELLS = "cages={count=2000}"
 FRAMES = {"armadillo_leg": 6, "heart_pull": 10, "lung_press": 20, "studies/beam_soft": 10}
 MEANS = "products", "iterations", "ksp_its", "wall_time"  # a frame, the first left out; times in seconds
@@ -39,17 +32,3 @@ class Scenes:
     def track_figure(self, found: dict[str, dict[str, float]], scene: str, figure: str) -> float:
         """Return a figure of a scene."""
         return found[scene][figure]
-
-
-class Cages:
-    """A ball of 20,000 triangles, filled with about 4,000 cells."""
-
-    def setup(self) -> None:
-        """Make the ball."""
-        ball = trimesh.creation.icosphere(5)
-        surface = Surface(np.array(ball.vertices), np.array(ball.faces))
-        self.body = BodySurface(MPI.COMM_SELF, surface, examine(surface), np.array(ball.bounds))
-
-    def time_fill(self) -> None:
-        """Fill it."""
-        fill([self.body], 0.1)

@@ -1,0 +1,174 @@
+#!/usr/bin/env python3
+"""Tables of the shipped scenes. Needs the meshes.
+
+    scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--set KEY=VALUE ...] [-o PAGE]
+
+table1   : the paper's Table 1 beside ours, the paper's figures in brackets: with its own springs, and as its twin, a
+           neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a second are those of the
+           steps alone, as each frame's wall_time has them: the mean, and the slowest tenth of the frames. Products
+           with the Hessian are a frame's. The error is the largest relative error of a step that the runs report.
+tissue   : neo-Hookean solids of Poisson's ratio 0.47. The volume is what the drawn surface encloses, against rest:
+           the most that is lost and gained in any frame, and at the end. "Inside out" is the most cells in any frame.
+touching : surfaces that meet themselves. Crossed: pairs of an edge and a triangle that cross, over all frames, by a
+           test that shares nothing with the contact's own, of the surface that meets itself; drawn: of the one that is
+           drawn, over 20 frames. --shorter 16 takes steps, and frames, of a sixteenth.
+"""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import lab
+from clone import ROOT
+
+import numpy as np
+import trimesh
+from mpi4py import MPI
+
+from msmpetsc.build import build_model
+from msmpetsc.contact.surface.pairs import CollisionSurface
+from msmpetsc.results.reader import Result
+from msmpetsc.scene.reading import load_scene
+
+sys.path.insert(0, str(ROOT / "tests" / "helpers"))
+from crossings import count_crossings
+
+
+def run(name: str, scene: str, args: Namespace, *changes: str) -> Path:
+    """Run a scene; its result, whose frames count if the run fails, too."""
+    changes = (*changes, *args.set)
+    if args.shorter > 1:
+        changes += (f"time.step={load_scene(lab.SCENES / f'{scene}.toml').time.step / args.shorter!r}",)
+    words = ["--quiet", *(["--frames", args.frames] if args.frames else [])]
+    return lab.run(scene, lab.OUT / "scene_tables" / f"{name}_{scene}.h5", words, changes).path
+
+
+def mean(result: Result, *names: str) -> dict[str, float]:
+    """Return means of what a frame after the first has."""
+    return {name: float(result.frames[name][1:].mean()) for name in names}
+
+
+# ---- the paper's Table 1
+
+# vertices, facets, valid cells, springs, frames a second on the CPU and on the GPU
+PAPER = {
+    "armadillo": (12602, 25200, 8338, 164343, 8.1, 30.0),
+    "dragon": (23620, 47140, 11536, 232240, 5.5, 23.9),
+    "lung": (43040, 86085, 6499, 127843, 10.1, 29.5),
+    "heart": (43594, 108357, 3126, 62465, 19.9, 53.4),
+    "bunny": (20667, 41330, 9946, 193589, 7.3, 30.1),
+    "brain": (55024, 110047, 13661, 264481, 5.1, 20.0),
+}
+ARMADILLOS = ("armadillo_leg", "armadillo_palm", "armadillo_forehead")
+SCENES = (*ARMADILLOS, "dragon_raise_push", "lung_press", "heart_pull", "bunny_fall", "brain_fall")
+LAWS = {"springs": (), "neo-Hookean": ("material.law=neo-hookean",)}
+ARRAYS = {
+    "vertices": "surface/points", "facets": "surface/triangles", "valid cells": "lattice/cells",
+    "springs": "lattice/springs",
+}  # fmt: skip
+
+
+def slowest_tenth(seconds: np.ndarray) -> float:
+    """Return the mean of the slowest tenth of frames [s]."""
+    return float(np.sort(seconds)[-max(1, len(seconds) // 10) :].mean())
+
+
+def table1(scene: str, args: Namespace) -> lab.Row:
+    """Return a row of Table 1, of both laws."""
+    *counts, cpu, _ = PAPER[scene.split("_")[0]]
+    found: dict[str, object] = {"scene": scene}
+    worst = 0.0
+    for law, changes in LAWS.items():
+        with Result(run(f"table1_{law}", scene, args, *changes)) as result:
+            ours = [len(result[name]) for name in ARRAYS.values()]
+            seconds, products = result.frames.wall_time[1:], result.frames.products[1:]
+            worst = max(worst, float(result.frames.step_error[1:].max()))
+        if len(found) == 1:
+            beside = zip(ARRAYS, ours, counts, strict=True)
+            found |= {name: f"{own:,} ({paper:,})" for name, own, paper in beside}
+        paper = f" ({cpu})" if law == "springs" else ""
+        found[f"{law}: frames a second"] = f"{1 / seconds.mean():.3g}{paper}"
+        found[f"{law}: slowest tenth"] = 1 / slowest_tenth(seconds)
+        found[f"{law}: products"] = float(products.mean())
+    return found | {"step error": worst}
+
+
+# ---- tissue
+
+
+def volumes(result: Result) -> np.ndarray:
+    """Return the volume (frames,) within the surface, over that at rest, less 1."""
+    triangles = result["surface/triangles"][:]
+    shapes = (result["surface/points"][:], *result.frames.surface)
+    found = np.array([trimesh.Trimesh(points, triangles, process=False).volume for points in shapes])
+    return found[1:] / found[0] - 1
+
+
+def tissue(scene: str, args: Namespace) -> lab.Row:
+    """Return the row of a scene as tissue."""
+    law = "material.law=neo-hookean", "material.poisson_ratio=0.47", "output.surface=true"
+    with Result(run("tissue", scene, args, *law)) as result:
+        change, of = volumes(result), mean(result, "iterations", "ksp_its", "products", "wall_time")
+        return {
+            "scene": scene,
+            "cells": len(result["lattice/cells"]),
+            "frames": len(change) - 1,
+            "frames a second": 1 / of.pop("wall_time"),
+            **of,
+            "inside out": int(result.frames.inverted[:].max()),
+            "volume": ", ".join(lab.percent(value, 2) for value in (change.min(), change.max(), change[-1])),
+        }
+
+
+# ---- surfaces that meet themselves
+
+COUNTED = 20  # frames whose crossings of the surface that is drawn are counted
+
+
+def touching(scene: str, args: Namespace) -> lab.Row:
+    """Return the row of a scene that touches itself."""
+    path = run("touching", scene, args)
+    model = build_model(MPI.COMM_SELF, load_scene(lab.SCENES / f"{scene}.toml", args.set))
+    assert isinstance(model.collision, CollisionSurface) and model.collision.surface and model.surface
+    points, triangles = model.collision.points, model.collision.surface.triangles
+    with Result(path) as result:
+        position, last = result.frames.position, len(result.frames.time[:]) - 1
+        counted = [position[index] for index in np.unique(np.linspace(0, last, COUNTED).round().astype(int))]
+        least, most = np.nanmin(result.frames.self_distance[:]), result.frames.self_contacts[:].max()
+        return {
+            "scene": f"`{scene}`",
+            "cells": len(model.lattice.cells),
+            "triangles": len(triangles),
+            "steps": last,
+            "contacts at most": int(most),
+            "least distance [µm]": f"{1e6 * least:.2g} of {1e6 * model.collision.law.distance:.0f}",
+            "crossed": sum(int(count_crossings(points(position[index]), triangles)) for index in range(last + 1)),
+            "drawn": sum(int(count_crossings(result.embedding @ q, model.surface.triangles)) for q in counted),
+            **mean(result, "iterations", "products", "wall_time"),
+        }
+
+
+# ---- by name: the row of a scene, and the scenes if none is named
+
+TABLES = {
+    "table1": (table1, SCENES),
+    "tissue": (tissue, ("bunny_fall", "heart_pull", "brain_fall")),
+    "touching": (touching, ("two_bunnies", "pile", "armadillo_fold", "lung_press_contact")),
+}
+
+
+def main() -> None:
+    options = lab.parser(__doc__)
+    options.add_argument("table", choices=TABLES)
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; those that the table is of, if absent")
+    options.add_argument("--frames", type=int, metavar="N", help="steps of each scene; all of them if absent")
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes of every scene")
+    options.add_argument("--shorter", type=int, default=1, metavar="N", help="times, the steps")
+    args = options.parse_args()
+    row, scenes = TABLES[args.table]
+    with lab.page(args):
+        lab.table(row(scene, args) for scene in args.scenes or scenes)
+
+
+if __name__ == "__main__":
+    main()

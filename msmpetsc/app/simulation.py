@@ -11,9 +11,9 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.app.ending import ending_together
-from msmpetsc.app.log import logged_on_root
 from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model
+from msmpetsc.comm import logged_on_root
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import Scene
@@ -21,13 +21,6 @@ from msmpetsc.solve.petsc.initialise import lent_options, start_for_runs
 from msmpetsc.solve.petsc.words import words_of
 
 Source = str | PathLike[str] | Mapping[str, Any] | Scene  # a scene file, its tables, or a scene
-
-
-def scene_from(source: Source, changes: Mapping[str, Any] | None = None) -> Scene:
-    """Return a scene from its file, its tables or another scene, with changes. Raises InputError."""
-    if isinstance(source, Scene):
-        return source.changed(changes or {})
-    return Scene.of(source, changes=changes) if isinstance(source, Mapping) else Scene.load(source, changes)
 
 
 def frames(
@@ -75,7 +68,9 @@ class Simulation:
         if device not in (None, "cpu", "cuda"):
             raise InputError(f"device is cpu or cuda, not {device!r}")
         self.comm, self.device = MPI.COMM_WORLD, device
-        self.scene = scene_from(scene)
+        if not isinstance(scene, Scene):
+            scene = Scene.of(scene) if isinstance(scene, Mapping) else Scene.load(scene)
+        self.scene = scene
         self.model: Model | None = None
         self._words = words_of(petsc_options)
         self._shape: Geometry | None = None  # that the model was made of

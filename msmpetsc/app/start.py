@@ -8,8 +8,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together
-from msmpetsc.app.log import logged_on_root
 from msmpetsc.app.request import RunRequest, asked_by
+from msmpetsc.comm import logged_on_root
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -19,10 +19,11 @@ class Argument(NamedTuple):
 
 @dataclass(frozen=True)
 class Command:
-    """A command, which the module of its name in ``commands`` carries out.
+    """A command.
 
     exclusive : arguments of which only one may be given
     alone     : why it is for one process, if it is
+    module    : in ``commands``, that carries it out; that of its name if empty
     """
 
     help: str
@@ -31,6 +32,7 @@ class Command:
     exclusive: tuple[Argument, ...] = ()
     description: str | None = None
     alone: str = ""
+    module: str = ""
 
 
 class Shown(argparse.Action):
@@ -320,7 +322,7 @@ COMMANDS = {
     ),
     "schema": Command(
         "print the JSON schema of a scene, for editors", ("msmpetsc schema > msmpetsc.schema.json",),
-        alone="it prints on one process",
+        alone="it prints on one process", module="keys",
     ),
     "doctor": Command(
         "say what is installed, and how to get what is not",

@@ -152,7 +152,10 @@ def _scales(a: Result, b: Result, distances: dict[str, Distances], pairs: Indice
     """Return what the errors of each field are relative to."""
     scales = {name: distance.size for name, distance in distances.items()}
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
-    least = _least_energy(a)
+    least = 0.0  # of the stiffest and longest spring, strained by LEAST_STRAIN [J]
+    if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
+        longest = a.lattice.rest_length[:].max()
+        least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
     energy, kinetic = (max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"]))
     for name in scales:
         if name in ENERGIES:
@@ -178,13 +181,6 @@ def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> floa
     values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
     sizes = np.abs(np.concatenate([np.empty(0), *values]))
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
-
-
-def _least_energy(run: Result) -> float:
-    """Return 1/2 k (LEAST_STRAIN r)^2 [J] of the stiffest and longest spring; 0 for none."""
-    if not all(name in run.lattice and len(run.lattice[name]) for name in ("stiffness", "rest_length")):
-        return 0.0
-    return float(0.5 * run.lattice.stiffness[:].max() * (LEAST_STRAIN * run.lattice.rest_length[:].max()) ** 2)
 
 
 def rows_agree(a: Array, b: Array, slack: float) -> Mask:

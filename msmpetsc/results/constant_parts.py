@@ -3,7 +3,6 @@
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Array
 from msmpetsc.build import Model
 from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.results.writer import ResultFile
@@ -28,9 +27,12 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     several = len(model.bodies) > 1
     if several:
         file.write("lattice/body", lattice.body[:owned].astype("i4"))
-    if comm.bcast(bool(model.solids)):
-        for name, rows in obstacle_rows(model.solids).items():
-            file.write(f"obstacle/{name}", rows)
+    if comm.bcast(bool(model.solids)):  # all of them on rank 0
+        solids = joined([*model.solids.values()]) or NOTHING
+        counts = [len(solid.triangles) for solid in model.solids.values()]
+        file.write("obstacle/points", solids.points)
+        file.write("obstacle/triangles", solids.triangles)
+        file.write("obstacle/number", np.repeat(np.array([*model.solids], "i4"), counts))
     surface, embedding = model.surface or NOTHING, model.embedding
     if embedding is None:
         return
@@ -43,11 +45,3 @@ def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     file.write("embedding/indptr", np.append(0, indptr) if comm.rank == 0 else indptr)
     file.write("embedding/indices", embedding.indices)
     file.write("embedding/weights", embedding.weights)
-
-
-def obstacle_rows(solids: dict[int, Surface]) -> dict[str, Array]:
-    """Return what stands in the file of the surfaces of obstacles, all of them on rank 0."""
-    whole = joined([*solids.values()]) or NOTHING
-    counts = [len(solid.triangles) for solid in solids.values()]
-    number = np.repeat(np.array([*solids], "i4"), counts)
-    return {"points": whole.points, "triangles": whole.triangles, "number": number}

@@ -62,16 +62,15 @@ class Result:
         try:
             with plain_damage(self.path):
                 self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
-                self._datasets = self._lazy(checked_datasets(self.file))
+                datasets, counts = checked_datasets(self.file), {"frames": finished(self.file)}
+                self._datasets = {
+                    name: LazyArray(data, counts.get(name.partition("/")[0])) for name, data in datasets.items()
+                }
         except BaseException:
             self.close()
             raise
         self.lattice, self.surface, self._embedding = map(self._group, ("lattice", "surface", "embedding"))
         self.frames = self._group("frames")
-
-    def _lazy(self, datasets: dict[str, h5py.Dataset]) -> dict[str, LazyArray]:
-        count = finished(self.file)
-        return {name: LazyArray(data, count if name.startswith("frames/") else None) for name, data in datasets.items()}
 
     def _group(self, group: str) -> Arrays:
         start = f"{group}/"

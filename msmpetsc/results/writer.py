@@ -39,14 +39,7 @@ from msmpetsc.results.disk import (
     refuse_small_disk,
 )
 from msmpetsc.results.layout import Layout, of_ranks, open_to_write
-from msmpetsc.results.reader import (
-    FORMAT,
-    FORMAT_VERSION,
-    checked_dataset,
-    finished,
-    open_result,
-    plain_damage,
-)
+from msmpetsc.results.reader import FORMAT, FORMAT_VERSION, checked_dataset, finished, open_result, plain_damage
 from msmpetsc.results.transfer import chunk_offsets, gather_rows, open_on_all_ranks, write_bytes
 
 
@@ -133,11 +126,7 @@ class ResultFile:
         self._copied = frames
 
     def start_frames(
-        self,
-        count: int,
-        nodes: int,
-        also: Mapping[str, int] | None = None,
-        saved: Checkpoint | None = None,
+        self, count: int, nodes: int, also: Mapping[str, int] | None = None, saved: Checkpoint | None = None
     ) -> None:
         """Plan the frames and checkpoints, and give the file its name.
 
@@ -163,7 +152,10 @@ class ResultFile:
             self.write_checkpoint(saved)
         with self._together():
             if self._file is not None:
-                self._publish(self._file)
+                if self._begin is not Begin.IN_PLACE:
+                    self._flush(self._file)
+                    self._refuse_to_replace()
+                    os.replace(self._part, self.path)
                 self._same = os.open(self.path, os.O_RDONLY)
                 self._numbers = {
                     name: dataset
@@ -277,13 +269,6 @@ class ResultFile:
                         row = dataset[index]
                     file["frames"][name][index] = row
         self.finished = count
-
-    def _publish(self, file: h5py.File) -> None:
-        """Give a new file its name."""
-        if self._begin is not Begin.IN_PLACE:
-            self._flush(file)
-            self._refuse_to_replace()
-            os.replace(self._part, self.path)
 
     def _refuse_removed(self) -> None:
         """Raise InputError where no name leads to the file any more; what it holds gets one again."""

@@ -190,14 +190,13 @@ class EnergyBalance:
         when, sides = (time - time_step, before.sides) if result.explicit else (time, after.sides)
         contact = environment.push(when, sides)
         known = self.known if self.known and q is self.known[0] else None  # whose elastic energy is known
+        ended = result.position[owned], after.sides
         sums = self._sums(
             0.5 * np.vdot((lattice.mass * free)[:, None] * v, v),
             0.0 if known else self.elasticity.energy(q),
             contact.energy(q[owned]) if contact else 0.0,
             np.vdot(environment.load(time), result.position[owned] - q[owned])
-            + environment.friction_work_bound(
-                (q[owned], sides), (result.position[owned], after.sides), time, time_step
-            ),
+            + environment.friction_work_bound((q[owned], sides), ended, time, time_step),
             result.work,
             result.swing,
         )

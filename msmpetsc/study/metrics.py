@@ -63,9 +63,6 @@ def costs(record: dict[str, Any]) -> Row:
     return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
 
 
-# The result file
-
-
 def of_frames(result: Path, time_step: float) -> Row:
     """Return figures of a result: times and iterations are means a step, the first frame left out."""
     with Result(result) as run:
@@ -111,9 +108,6 @@ def _errors(series: dict[str, np.ndarray]) -> Row:
 def _rms(values: np.ndarray) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.sqrt((values**2).mean())) if len(values) else None
-
-
-# Repeats
 
 
 def together(runs: Sequence[Row]) -> Row:

@@ -39,9 +39,6 @@ TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"  # y upwards becomes z 
 GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
 
 
-# The mesh
-
-
 @dataclass(frozen=True)
 class MeshMeasures:
     """What a first scene rests on, lengths in the file's unit."""
@@ -108,9 +105,6 @@ def stands(surface: Surface, axis: int, way: int) -> float:
     flat = np.insert(plan, 2, 0.0, axis=1)
     face = trimesh.triangles.area(flat[lowest]).sum() / hull.volume  # in two dimensions the volume is an area
     return float(hull.volume / ground.volume * (1 - FEET * min(face, 1.0)))
-
-
-# The scene
 
 
 @dataclass(frozen=True)

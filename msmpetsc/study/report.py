@@ -67,14 +67,13 @@ def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[
     ]
 
 
-# The page
-
-
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
-    tables = {"table": whole_table(table), "failures": failed(swept(table))[OF_FAILURES]}
+    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]  # numbers before texts
+    filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
+    tables = {"table": table[[*FIRST, *filled, "command"]], "failures": failed(swept(table))[OF_FAILURES]}
     template = environment.get_template("report.html.j2")
     return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
 
@@ -94,13 +93,6 @@ def repeats_note(rows: DataFrame) -> str:
     if rows.empty or not is_repeated(rows):
         return counts and f"{counts}. {ONCE_NOTE}"
     return f"{counts}: times are medians, ranges and whiskers from the least to the greatest"
-
-
-def whole_table(table: DataFrame) -> DataFrame:
-    """Return all columns that some case fills, but for those that stand above all; numbers before texts."""
-    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
-    filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
-    return table[[*FIRST, *filled, "command"]]
 
 
 def html(table: DataFrame) -> Markup:

@@ -17,15 +17,7 @@ from tqdm import tqdm
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
-from msmpetsc.study.metrics import (
-    costs,
-    of_frames,
-    outcome,
-    read_record,
-    surface_error,
-    together,
-    trajectory_error,
-)
+from msmpetsc.study.metrics import costs, of_frames, outcome, read_record, surface_error, together, trajectory_error
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, read_traces, records, require_extra, write_table
@@ -35,9 +27,6 @@ TOLD = (  # of a case that is done
     "cells", "time_step", "substep", "error", "max_iterations", "time_frame", "true_error", "trajectory_error",
     "surface_error",
 )  # fmt: skip
-
-
-# One case
 
 
 @dataclass(frozen=True)
@@ -149,9 +138,6 @@ def _remove_files(path: Path, log: bool) -> None:
         path.with_suffix(suffix).unlink(missing_ok=True)
 
 
-# All cases
-
-
 @dataclass
 class StudyResults:
     """Rows and traces of a study so far, by case, in its folder and in the order of ``order``."""
@@ -257,7 +243,7 @@ def _carry_out(bench: Bench, todo: Sequence[Case], results: StudyResults, *, job
                 bar.write(f"case {count}/{bar.total}  {described(result.row)}", file=sys.stderr)
                 bar.update()
     finally:  # what ends this early ends the runs under way
-        bench.processes.stop()
+        bench.processes.close()
         pool.shutdown(cancel_futures=True)
         with suppress(OSError):  # logs of cases that failed are in it
             (bench.folder / "runs").rmdir()

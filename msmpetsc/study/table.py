@@ -110,9 +110,6 @@ def require_extra() -> None:
             raise missing_package(name)
 
 
-# Writing and reading
-
-
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
     """Write table.csv and table.h5, each replaced whole."""
     table = as_table(rows)
@@ -194,9 +191,6 @@ def _fill(file: h5py.File, table: "DataFrame") -> None:
         file.create_dataset(name, data=table[name].to_numpy(), dtype=kinds[column.kind], shape=(len(table),))
         file[name].dims[0].attach_scale(file["row"])
         file[name].attrs.update({"units": column.unit, "long_name": column.about})
-
-
-# Choosing rows
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":

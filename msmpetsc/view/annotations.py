@@ -55,9 +55,6 @@ def rounded(low: float, high: float) -> tuple[str, str]:
     return first, last
 
 
-# The legend
-
-
 LINE, GAP, LETTERS, BAR, SWATCH = 34, 36, 15, 150, 22  # [px]: a line's height, between entries, of type, of the bar
 FINE = 3  # a legend is drawn so many times larger, and shrunk
 NICE = (1, 2, 5)  # lengths of a scale bar, times powers of ten

@@ -19,7 +19,7 @@ TIME = {"step": 0.01, "duration": 0.1}
 def processes():
     found = Processes()
     yield found
-    found.stop()
+    found.close()
 
 
 def carry_out(

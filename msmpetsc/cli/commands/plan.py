@@ -5,8 +5,7 @@ import json
 import shlex
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
 
 if TYPE_CHECKING:
-    from msmpetsc.study.runner import Bench
     from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
     from msmpetsc.study.sizing.choice import Choice
 
@@ -33,7 +31,10 @@ def run(args: argparse.Namespace) -> int:
     with redirect_stdout(sys.stderr) if args.json else nullcontext():  # what was tried, as it goes
         plan = size_all(args, target)
         if args.chart:
-            draw(plan, args.chart, target)
+            from msmpetsc.study.charts.pareto import plan_picture
+
+            plan_picture(plan, target, args.chart)
+            print(f"drawn: {args.chart}")
         print_size(plan, target)
         command = print_command(args, plan.choice, target) if plan.met else None
     record = {
@@ -43,20 +44,6 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(record, indent=1, default=str))  # of paths the names
     return 0 if plan.met else NOTHING_MEETS
-
-
-@contextmanager
-def bench() -> Iterator["Bench"]:
-    """Give a bench in a folder of its own; afterwards none of its runs is left."""
-    from msmpetsc.study.process import Processes
-    from msmpetsc.study.runner import Bench
-
-    processes = Processes()
-    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder:
-        try:
-            yield Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
-        finally:
-            processes.stop()
 
 
 def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> str:
@@ -78,12 +65,15 @@ def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> 
 
 
 def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
-    """Make the trials, and print each when it is done."""
+    """Make the trials, and print each when it is done; afterwards none of their runs is left."""
     from msmpetsc.solve.presets import preset_names
+    from msmpetsc.study.process import Processes
+    from msmpetsc.study.runner import Bench
     from msmpetsc.study.sizing.trials import Asked, Sizer
 
-    with bench() as runs:
-        asked = Asked(target, args.frames, args.cells, args.ranks)
+    asked = Asked(target, args.frames, args.cells, args.ranks)
+    with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
+        runs = Bench(Path(folder), processes, warm=True)  # costs are held against each other alone
         sizer = Sizer(args.scene, runs, asked, preset_names(), print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
@@ -114,11 +104,3 @@ def print_size(plan: "SizePlan", target: float) -> None:
         print(f"{name:16} {getattr(budget, name):9.1e} {100 * getattr(shares, name):10.0f}%")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")
-
-
-def draw(plan: "SizePlan", path: Path, target: float) -> None:
-    """Draw the expected error of each trial over its cost, and ring the choice."""
-    from msmpetsc.study.charts.pareto import plan_picture
-
-    plan_picture(plan, target, path)
-    print(f"drawn: {path}")

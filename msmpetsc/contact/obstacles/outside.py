@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.comm import Route
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.grid import encode_morton
-from msmpetsc.geometry.surface import Surface, is_inside
+from msmpetsc.geometry.surface import is_inside
 from msmpetsc.lattice.lattice import Lattice
 
 INNER_SPRINGS = 26  # of a node within eight cells: it may stick out into a fold, where nothing comes
@@ -24,6 +24,8 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattic
 
     It is the node itself but where that sticks out of the surface.
     """
+    import igl  # for scenes with regions or obstacles
+
     owned, comm = lattice.owned, bodies[0].comm
     springs = np.bincount(lattice.springs.ravel(), minlength=len(lattice.nodes))[:owned]
     body = lattice.body
@@ -34,19 +36,13 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, lattice: Lattic
         own = of_point == number
         surface = bodies[number].surface
         assert surface is not None  # here
-        points[own] = _drawn_in(surface, points[own])
+        outside = ~is_inside(surface, points[own])[:, None]
+        closest = igl.point_mesh_squared_distance(points[own], surface.points, surface.triangles)[2]
+        points[own] = np.where(outside, closest, points[own])
     nearest = lattice.nodes[:owned].copy()
     nearest[rows] = to_root.answer(points)
     ghosts = encode_morton(cages.grids.nearest_nodes(lattice.nodes[owned:], body[owned:]))
     return np.concatenate([nearest, lattice.table.rows_of(ghosts, nearest)])
-
-
-def _drawn_in(surface: Surface, points: Positions) -> Positions:
-    """Return points (n, 3), those outside a surface moved to the nearest of it."""
-    import igl  # for scenes with regions or obstacles
-
-    closest = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[2]
-    return np.where(is_inside(surface, points)[:, None], points, closest)
 
 
 def distance_outside(lattice: Lattice, nearest: Positions) -> Floats:

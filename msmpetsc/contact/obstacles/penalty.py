@@ -44,16 +44,11 @@ class Penalty:
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(
-        self,
-        q: Positions,
-        time: float,
-        time_step: float,
-        sides: Indices | None = None,
-        before: Positions | None = None,
+        self, q: Positions, time: float, time_step: float, sides: Indices | None = None, last: Positions | None = None
     ) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
 
-        before : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
+        last : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
             that it ends with, under the push that is to be expected then
         """
         state = self.state_at(time, sides)
@@ -63,20 +58,12 @@ class Penalty:
         nodes, depth, normal = self.state_at(start, sides).pressed(q)
         way, stick = like(q, path.displacement_between(start, time)), self.stick * time_step
         carried = q[nodes] + way
-        if before is not None:
-            carried += (q[nodes] - before[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
+        if last is not None:
+            carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
-            depth = self._depth_to_come(2 * q - before, time, sides, nodes, depth)
+            coming, _ = self.obstacle.depths(2 * q - last, time, sides)  # of nodes that go straight on
+            depth = np.clip(coming[nodes], 0, 2 * depth)  # what has just come in says nothing of how far it goes
         return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
-
-    def _depth_to_come(self, q: Positions, time: float, sides: Indices | None, nodes: Indices, depth: Floats) -> Floats:
-        """Return how deep ``nodes`` (a,) will be that go straight on to q (owned, 3) [m], (a,) [m].
-
-        Not less than nothing and not more than twice their ``depth`` (a,) now: of what has just
-        come in the way there says nothing of how far it goes.
-        """
-        coming, _ = self.obstacle.depths(q, time, sides)
-        return np.clip(coming[nodes], 0, 2 * depth)
 
 
 @dataclass(frozen=True)

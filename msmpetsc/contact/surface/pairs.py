@@ -140,10 +140,7 @@ class NearPairs:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
         ends = np.full(6, -np.inf)
         _extend(end[: self.owned], start, ends)
-        if self.comm.size > 1:
-            most = np.empty_like(ends)
-            self.comm.Allreduce(ends, most, MPI.MAX)
-            ends = most
+        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
@@ -171,7 +168,7 @@ class Contacts:
         if bound < pairs.clear:
             return ContactsAt(q)
         for moment in self._moments:
-            if self._is_same(q, moment.q):
+            if self.comm.allreduce(bool(np.array_equal(q, moment.q)), MPI.LAND):
                 return moment
         points = self.points(q)
         near = self._pairs_near(q, points, pairs, bound)
@@ -204,10 +201,6 @@ class Contacts:
         near = self.comm.allreduce(aside, MPI.MAX) <= ASIDE * self.law.distance / np.sqrt(3)
         return share if near and -ASIDE < share < 1 + ASIDE else None
 
-    def _is_same(self, a: Positions, b: Positions) -> bool:
-        same = bool(np.array_equal(a, b))
-        return self.comm.allreduce(same, MPI.LAND) if self.comm.size > 1 else same
-
     def _serve(self, pairs: Pairs, points: Positions) -> bool:
         """Return whether points S (p, 3) are within the pairs' reach, by what these themselves moved."""
         serve = True
@@ -216,10 +209,6 @@ class Contacts:
             moved -= 0.5 * (moved.max(axis=0) + moved.min(axis=0))
             serve = bool((moved**2).sum(axis=1).max() <= pairs.reach**2)
         return bool(self.comm.bcast(serve))
-
-    def with_points(self, moment: ContactsAt) -> ContactsAt:
-        """Return the same with the points, which friction asks for."""
-        return ContactsAt(moment.q, moment.count, self.points(moment.q), moment.contacts)
 
     def touch(self, q: Positions) -> Touch:
         """Return what there is of contacts at q."""

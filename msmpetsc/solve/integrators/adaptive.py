@@ -47,17 +47,7 @@ JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it ye
 SWEEPS = 4
 
 
-def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
-    return 0.5 * time_step * (w - v)
-
-
-def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
-    """The same of BDF2."""
-    return 1.6 * (x - q - 0.5 * time_step * (v + w))
-
-
-METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
+ORDERS = {"implicit-euler": 1, "bdf2": 2}  # of the integrators that are known here
 
 
 class NeighbourMean:
@@ -90,17 +80,10 @@ def refuse_bad_steps(time: Time) -> None:
         if time.shortest is not None or time.longest is not None:
             raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
         return
-    if time.integrator not in METHODS:
+    if time.integrator not in ORDERS:
         raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
     if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
         raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
-
-
-def levels_of(time: Time) -> tuple[int, int]:
-    """The lowest and the highest level of a scene's steps."""
-    lowest = LOWEST if time.shortest is None else math.ceil(math.log2(time.shortest / time.step) - 1e-9)
-    highest = HIGHEST if time.longest is None else math.floor(math.log2(time.longest / time.step) + 1e-9)
-    return max(lowest, -40), min(highest, 40)
 
 
 def between(q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float) -> tuple[Positions, Rows]:
@@ -131,8 +114,13 @@ class Adaptive(Integrator):
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
-        self.order, self.local_error = METHODS[scene.time.integrator]
-        self.levels, steps = levels_of(scene.time), scene.time.steps
+        self.order = ORDERS[scene.time.integrator]
+        lowest, highest, steps = LOWEST, HIGHEST, scene.time.steps
+        if scene.time.shortest is not None:
+            lowest = math.ceil(math.log2(scene.time.shortest / scene.time.step) - 1e-9)
+        if scene.time.longest is not None:
+            highest = math.floor(math.log2(scene.time.longest / scene.time.step) + 1e-9)
+        self.levels = max(lowest, -40), min(highest, 40)  # of its steps
         self.control = StepControl(self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels)
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.mean = NeighbourMean(self.comm, self.lattice)
@@ -197,7 +185,10 @@ class Adaptive(Integrator):
         restarts = self.ticks.is_event(self.tick)
         cost = Work()
         while True:
-            level = self._next_level(state)
+            longest = self.control.level
+            if state.history is not None:  # which the step needs: it is no more than twice as long as the last
+                longest = min(longest, self.last + 1)
+            level = self.ticks.fitting(self.tick, longest)
             before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))
             try:
                 result, after = self.balance.step(self._integrator(level), before, end, self._length(level))
@@ -213,11 +204,6 @@ class Adaptive(Integrator):
                 self.control.pay(level, measure)
                 result = replace(result, cost=replace(cost, steps=1, step_error=result.cost.step_error))
                 return self._taken(result, before, after, level)
-
-    def _next_level(self, state: State) -> int:
-        """Of the next step: no more than twice as long as the last, whose history it needs."""
-        most = self.control.level if state.history is None else min(self.control.level, self.last + 1)
-        return self.ticks.fitting(self.tick, most)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
         length, v = self._length(level), state.velocity(self.time_step)
@@ -237,7 +223,8 @@ class Adaptive(Integrator):
         end = self._reached(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
-        local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
+        local = 0.5 * t * (w - v) if self.order == 1 else 1.6 * (x - q - 0.5 * t * (v + w))
+        local = self.mean(local * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame

@@ -123,7 +123,11 @@ class ImplicitEuler(Integrator):
         assert self.problem is not None, "no step was taken"
         positions = [*(trace.positions if trace else []), result.position]
         errors = self.reference.errors(self.problem, positions)
-        return errors[-1], trace.as_lists(index, errors[:-1]) if trace else None
+        if trace is None:
+            return errors[-1], None
+        lists = {"iteration": trace.iteration, "ksp_its": trace.ksp_its, "seconds": trace.seconds}
+        of_positions, of_energies = errors[:-1].T.tolist()
+        return errors[-1], {"frame": index, **lists, "position_error": of_positions, "energy_error": of_energies}
 
     def _new_stepper(self, time: float) -> Stepper:
         """The solver while the same nodes are fixed as at ``time``: these are no unknowns."""

@@ -28,7 +28,6 @@ from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.integrators.contact_faces import ContactFaces
 from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.state import State
@@ -167,7 +166,14 @@ class Static(ImplicitEuler):
     error = made_for = 0.0
 
     def _first_tau(self) -> float:
-        return SLENDER * transit_time(self.comm, self.environment.lattice)
+        """SLENDER times how long sound takes along the longest side of the lattice, roughly [s]."""
+        lattice = self.environment.lattice
+        low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
+        low, high = (np.array(self.comm.allgather([float(x) for x in corner])) for corner in (low, high))
+        cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
+        sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
+        mass, stiffness = self.comm.allreduce(sums)
+        return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def _new_stepper(self, time: float) -> Stepper:
         self.made_for = time
@@ -232,16 +238,6 @@ class Static(ImplicitEuler):
             yield
         finally:
             snes.setTolerances(max_it=most)
-
-
-def transit_time(comm: MPI.Comm, lattice: Lattice) -> float:
-    """How long sound takes along the longest side of a lattice, roughly [s] (collective)."""
-    low, high = lattice.nodes.min(axis=0), lattice.nodes.max(axis=0)
-    low, high = (np.array(comm.allgather([float(x) for x in corner])) for corner in (low, high))
-    cells = (high.max(axis=0) - low.min(axis=0)).max() / lattice.cell_size
-    sums = np.array([float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())])
-    mass, stiffness = comm.allreduce(sums)
-    return float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

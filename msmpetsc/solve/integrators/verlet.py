@@ -195,9 +195,8 @@ class Verlet(Integrator):
         self.velocity.update()
         self.known = self.position.values.copy()
         previous = self.known - self.time_step * self.velocity.values
-        result = StepResult(
-            self.known, previous, Work(iterations=count, steps=1), self.work, explicit=True, swing=swing
-        )
+        cost = Work(iterations=count, steps=1)
+        result = StepResult(self.known, previous, cost, self.work, explicit=True, swing=swing)
         return result, State(self.known, previous, sides=self.sides)
 
     def _pull(self, time: float) -> None:
@@ -231,18 +230,14 @@ class Verlet(Integrator):
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
         drift(len(self.free), self.free, self.v, end - begin, self.q)
-        if self.anchors:
-            self._lead(begin, end)
+        prescribed = self.environment.prescribed(self.position.values, end) if self.anchors else None
+        if prescribed is not None:
+            anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
+            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
+            self.q[anchored] = prescribed[anchored]
         if self.environment.strikes or self.environment.has_sides:
             self._strike(begin, end)
         self.position.update()
-
-    def _lead(self, begin: float, end: float) -> None:
-        prescribed = self.environment.prescribed(self.position.values, end)
-        anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
-        if prescribed is not None:
-            self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)
-            self.q[anchored] = prescribed[anchored]
 
     def _strike(self, begin: float, end: float) -> None:
         """Know the faces of contact. The velocity of a node that bounces off is what then led it there."""
@@ -272,11 +267,8 @@ class Verlet(Integrator):
         fall = self.environment.load(start) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = self.comm.allreduce(speed, MPI.MAX)
-        pushed = (
-            self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)[self.free]
-            * self.per_mass[self.free]
-        )
-        return self.comm.allreduce(greatest(pushed), MPI.MAX)
+        stiffness = self.environment.contact_stiffness_bound(self.q, speed, start, time, self.sides)
+        return self.comm.allreduce(greatest(stiffness[self.free] * self.per_mass[self.free]), MPI.MAX)
 
     def _count(self, squared: float) -> int:
         """The least number of substeps that keeps to the limit 2 / omega. Raises StepFailed where there is none."""

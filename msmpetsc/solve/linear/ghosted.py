@@ -4,7 +4,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Rows, like
+from msmpetsc.backend.arrays import Array
+from msmpetsc.comm import Route
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
@@ -34,10 +35,8 @@ class Ghosted:
             owner.destroy()
 
 
-def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Rows) -> Rows:
-    """(l, 3) from the owned ones (owned, 3) (collective)."""
-    field = Ghosted(comm, lattice)
-    field.values[: lattice.owned] = like(field.values, rows)
-    field.update()
-    field.destroy()
-    return field.values
+def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
+    """Rows (l, ...) of the local nodes, on the host, from those of the owned ones (owned, ...) there (collective)."""
+    to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
+    asked = to_owner.send(lattice.ghosts) - lattice.table.first
+    return np.concatenate([rows, to_owner.answer(rows[asked])])

@@ -44,17 +44,15 @@ class Preconditioner:
         if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
             self.pc.apply(x, y)
             return
-        right, solution = self.blocks = self.blocks or self._create_blocks()
+        if not self.blocks:  # where the inner preconditioner works: a direct solver does on the CPU
+            memory = HOST if self.pc.getType() in DIRECT else self.memory
+            self.blocks = [Block(self.matrix, memory), Block(self.matrix, memory)]
+        right, solution = self.blocks
         values = right.values
         values[:] = like(values, self.memory.read(x))
         self.pc.matApply(right.mat, solution.mat)
         columns = self.memory.write(y)
         columns[:] = like(columns, solution.values)
-
-    def _create_blocks(self) -> list[Block]:
-        """Blocks where the inner preconditioner works: a direct solver does on the CPU."""
-        memory = HOST if self.pc.getType() in DIRECT else self.memory
-        return [Block(self.matrix, memory), Block(self.matrix, memory)]
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         self.pc.view(viewer)

@@ -11,8 +11,8 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.comm import Route
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.linear.ghosted import with_ghosts
 from msmpetsc.solve.petsc.events import GHOSTS
 from msmpetsc.solve.petsc.limits import refuse_unknowns
 from msmpetsc.solve.petsc.memory import memory_of
@@ -47,11 +47,9 @@ class Unknowns:
         refuse_unknowns(self.total)
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
-        to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
-        asked = to_owner.send(lattice.ghosts) - lattice.table.first
-        self.numbers = np.concatenate([own, to_owner.answer(own[asked])])
+        self.numbers = with_ghosts(comm, lattice, own)
         index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        self.indices = np.concatenate([index, to_owner.answer(index[asked])])
+        self.indices = with_ghosts(comm, lattice, index)
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0  # of any rank

@@ -79,10 +79,6 @@ class Compression:
         """No eigenvalue of M^(-1) H is less; 0 where none can be told."""
         return max(1 - self.greatest, 0.0) if self.inertia and not self.resists else 0.0
 
-    def exceeds(self, searched: "Compression") -> bool:
-        """Whether modes may have come since another compression was searched."""
-        return self.greatest > MORE * searched.greatest or self.total > MORE * searched.total
-
 
 NONE = Compression(0.0, 0.0, False)
 
@@ -140,8 +136,9 @@ class LowestCurvature:
         q       : positions (l, 3) [m] that H was linearised at last
         hint    : a direction that may have part in it
         """
-        found = None
-        if not (alarm or compression.resists or compression.exceeds(self.searched)):
+        found, before = None, self.searched
+        more = compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        if not (alarm or compression.resists or more):  # in which case modes may have come
             found = self._followed()
         if found is None:
             self.searched = NONE if alarm else compression  # what was doubtful is so in the next step, too
@@ -202,7 +199,9 @@ class LowestCurvature:
         size, lowest = len(values), [values[0]]  # fewer than wanted where the body has no more
         for its in range(1, most + 1):
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
-            residuals /= self._greatest(residuals)  # which single precision can hold
+            sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
+            self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
+            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # which single precision can hold
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
             blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
@@ -273,13 +272,6 @@ class LowestCurvature:
     def _unit(self, directions: Rows) -> Rows:
         """Directions scaled to unit length in the norm of M; those of no length stay so."""
         return directions / like(directions, np.maximum(self._lengths(directions), TINY))[:, None]
-
-    def _greatest(self, directions: Rows) -> Rows:
-        """Greatest number (k, 1) of each of some directions (k, n)."""
-        own = np.array([greatest(np.abs(direction)) for direction in directions])
-        most = np.empty_like(own)
-        self.comm.Allreduce(own, most, MPI.MAX)
-        return like(directions, np.maximum(most, TINY)[:, None])
 
     def _lengths(self, directions: Rows) -> Floats:
         return np.sqrt(self.comm.allreduce(to_host(directions**2 @ self.functional.mass)))

@@ -122,12 +122,6 @@ class StepFunctional:
         """Whether the surface meets itself in this step."""
         return self.problem.contact is not None and self.problem.contact.surface is not None
 
-    @property
-    def starts_in_contact(self) -> bool:
-        """Whether parts of the surface push each other where the step begins (collective)."""
-        contact = self.problem.contact
-        return contact is not None and contact.surface is not None and contact.surface.presses(self.problem.q)
-
     def free_share(self, base: Positions, q: Positions) -> float:
         """Share, up to 1, of the straight way from base to q (l, 3) on which the surface does not meet itself."""
         contact = self.problem.contact

@@ -225,15 +225,12 @@ class StepPreconditioner:
         """Make ready to be applied about positions q (l, 3) [m]; whether that changed anything."""
         return self.in_use.prepare(q, contact)
 
-    def balance(self, q: Positions, contact: Contact | None, f: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Move bodies as wholes to where their forces balance, where linear solves would not."""
-        if self.multigrid and self.is_chosen:
-            self.multigrid.balance(q, contact, f, x)
-
     @property
-    def has_to_balance(self) -> bool:
-        """Whether ``balance`` does anything."""
-        return self.is_chosen and self.multigrid is not None and self.multigrid.translations is not None
+    def to_balance(self) -> LatticePreconditioner | None:
+        """What moves bodies as wholes to where their forces balance, which linear solves would not; None where nothing
+        has to."""
+        multigrid = self.multigrid if self.is_chosen else None
+        return multigrid if multigrid and multigrid.translations else None
 
     def learn(self, its: int, rtol: float) -> None:
         """A linear solve took so many iterations to a relative tolerance."""

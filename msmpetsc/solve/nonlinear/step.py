@@ -18,6 +18,7 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.nonlinear.curvature import Alarm, LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import (
     DEFAULT_ERROR,
+    FULL_STEP_ERROR,
     NOT_FINITE,
     ErrorControl,
     Outcome,
@@ -30,6 +31,7 @@ from msmpetsc.solve.nonlinear.first_guess import FirstGuess
 from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional, StepProblem
 from msmpetsc.solve.nonlinear.jacobian import FrictionKinks, Jacobian
 from msmpetsc.solve.nonlinear.minimum import Minimum, Verdict
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.nonlinear.rounding import Rounding
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
@@ -178,7 +180,7 @@ class Stepper:
                 verdict = self.examine(outcome)
             q = self.functional.positions(self.x)
             self.first_guess.learn(q)
-            error = self.control.final_error(verdict.error, outcome.at_rounding, q)
+            error = self.control.rounding.added_to(verdict.error, self.functional.distance(q), outcome.at_rounding)
             return StepResult(q, problem.q, replace(self.work_so_far() - before, step_error=error))
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> None:
@@ -186,13 +188,14 @@ class Stepper:
         self.base[:] = problem.fixed
         self.kinks.begin(problem.contact)
         self.unknowns.from_nodes(self.first_guess.best() if start is None else start, self.x)
-        if start is None and self.jacobian.preconditioner.has_to_balance:
-            self._balance()
+        multigrid = self.jacobian.preconditioner.to_balance
+        if start is None and multigrid:
+            self._balance(multigrid)
 
-    def _balance(self) -> None:
+    def _balance(self, multigrid: LatticePreconditioner) -> None:
         """Move bodies as wholes to where their forces balance, as far as they do not meet."""
         iterate = self._evaluate(self.x)
-        self.jacobian.preconditioner.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
+        multigrid.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
         if not self.functional.meets_itself:
             return
         balanced = self.functional.positions(self.x)
@@ -305,7 +308,9 @@ class Stepper:
             q = self.functional.positions(x)
             self.kinks.see(q, self.base)
             change, distance = self.functional.change(q, self.base)
-        return -1.0 if self.outcome.is_flat and distance > 0 else change
+        outcome = self.outcome
+        is_flat = outcome.bound < FULL_STEP_ERROR and (outcome.corrected or not outcome.doubts)
+        return -1.0 if is_flat and distance > 0 else change
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
@@ -331,7 +336,7 @@ class Stepper:
             self.jacobian.linearise(
                 self.base, self.functional.problem.contact, self.projected, self.kinks.secants, known
             )
-            self.kinks.await_step()
+            self.kinks.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
         if self.preset.start_from_b:
@@ -372,7 +377,8 @@ class Stepper:
                 return reasons.CONVERGED_FNORM_ABS
             return reasons.CONVERGED_SNORM_RELATIVE if outcome.corrected else reasons.CONVERGED_FNORM_RELATIVE
         if self.budget and its >= self.budget:
-            self.outcome = self.control.estimate_last(iterate, outcome)
+            if not outcome.corrected:
+                self.outcome = self.control.estimated(iterate, self.functional.distance(iterate.q), outcome, 0.0)
             return reasons.CONVERGED_ITS
         self._adapt()
         return reasons.ITERATING

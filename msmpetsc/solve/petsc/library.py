@@ -133,17 +133,12 @@ def petsc_errors(
 
 
 def last_words(error: BaseException) -> str:
-    """Message of a PETSc error, without the calls it came through."""
+    """Message of a PETSc error, without the calls it came through; of an unknown type of solver with the nearest."""
     lines = str(error).splitlines()
     said = [line.partition("] ")[2] for line in lines if line.startswith("[") and "() at " not in line]
     words = said[-1] if said else lines[0]
-    return words + _nearest_type(words)
-
-
-def _nearest_type(words: str) -> str:
-    """Return the nearest type of solver where there is none: ", did you mean 'pipecg'?"."""
     wanted = re.search(r"requested (KSP|PC|SNES) type (\w+)", words)
     if wanted is None:
-        return ""
-    types = getattr(PETSc, wanted[1]).Type
-    return did_you_mean(wanted[2], [name for name in vars(types).values() if isinstance(name, str)])
+        return words
+    types = vars(getattr(PETSc, wanted[1]).Type).values()
+    return words + did_you_mean(wanted[2], [name for name in types if isinstance(name, str)])

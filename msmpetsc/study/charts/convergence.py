@@ -21,8 +21,6 @@ from msmpetsc.study.charts.plot import (
 )
 from msmpetsc.study.table import Row, grouped, measured, records, succeeded
 
-# Within one step
-
 KIND = "Convergence within one step"
 CAPTION = (
     "One step, followed iterate by iterate. Both horizontal axes start at 0 and are logarithmic from their second "

@@ -29,17 +29,7 @@ from msmpetsc.study.charts.plot import (
     save_png,
 )
 from msmpetsc.study.sizing.answer import SizePlan
-from msmpetsc.study.table import (
-    ONCE_NOTE,
-    Row,
-    grouped,
-    is_repeated,
-    measured,
-    reach,
-    records,
-    spread,
-    succeeded,
-)
+from msmpetsc.study.table import ONCE_NOTE, Row, grouped, is_repeated, measured, reach, records, spread, succeeded
 
 KIND = "Speed against accuracy"
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
@@ -86,9 +76,6 @@ TRAJECTORY = ErrorMeasure(
 )
 
 
-# What is best
-
-
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
     """Return the points that no other beats: none is at most as great in both and smaller in one.
 
@@ -124,9 +111,6 @@ def winners(rows: DataFrame, measure: ErrorMeasure, level: float) -> list[Row]:
     ends = reach(reached, measure.cost)
     near = reached[ends["least"] <= ends["greatest"].iloc[0]]
     return records(near.drop_duplicates("label"))
-
-
-# The charts
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -177,9 +161,6 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.mark(points(rows.drop(best.index), measure.columns, told), hollow=True)
     panel.curves(best, measure.columns, told)
     panel.rings(front, measure.columns)
-
-
-# In words
 
 
 def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:

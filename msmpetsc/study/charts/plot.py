@@ -86,9 +86,6 @@ def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str
     return ["\n".join(filter(None, tip)) for tip in lines]
 
 
-# Axes: channels of Vega-Lite
-
-
 def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
     """Return an axis; words: how its ticks are written, an expression of Vega's."""
     axis = {"values": list(ticks), "labelExpr": words}
@@ -115,9 +112,6 @@ def axis_from_zero(title: str, values: Iterable[float], words: str) -> dict[str,
     steps = (1, 2, 5) if decades <= 2 else (1,)
     ticks = [0.0, *(first * 10**decade * step for decade in range(decades) for step in steps)]
     return channel(title, words, ticks, type="symlog", constant=first, domain=[0, 1.3 * max(positive)])
-
-
-# Panels and charts
 
 
 @dataclass
@@ -236,9 +230,6 @@ def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> 
     """Return the channel that gives each curve its "color" or its "shape"."""
     scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
     return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
-
-
-# Files
 
 
 def save_png(chart: Chart, folder: Path) -> None:

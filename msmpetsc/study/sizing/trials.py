@@ -95,7 +95,8 @@ class Sizer:
         """Return the plan of lattices of ``cells`` and fewer."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
-        method = self._provisional(steppings)
+        fair = [each for each in steppings if each.error <= self.target / 2]  # half is left to the cells
+        method = (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
         solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
         costs = [(each.cells, each.cost) for each in lattices]
@@ -198,11 +199,6 @@ class Sizer:
     def _at_scale(self, stepping: Stepping) -> float:
         """Return the cost on the finest lattice over its growth: explicit substeps are shorter there."""
         return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
-
-    def _provisional(self, steppings: list[Stepping]) -> Candidate:
-        """Return the cheapest way to step that leaves half the error to the cells; the most exact where none does."""
-        fair = [each for each in steppings if each.error <= self.target / 2]
-        return (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
         """Return how loosely the steps may be solved, and what that leaves."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
@@ -15,28 +14,9 @@ from msmpetsc.errors import MsmpetscError, as_expected
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-log = logging.getLogger("msmpetsc")
-LINE = "msmpetsc: %(levelname)s: %(message)s"
-TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
+log = logging.getLogger("msmpetsc")  # the command line lets rank 0 alone speak
 
 T = TypeVar("T")
-
-
-@contextmanager
-def logged_on_root(comm: MPI.Comm, level: int = logging.INFO, timed: bool = False) -> Iterator[None]:
-    """Let rank 0 alone write the log to stderr, from this level on, ``timed`` with milliseconds."""
-    before = log.handlers, log.level
-    logging.addLevelName(logging.WARNING, "warning")
-    logging.addLevelName(logging.INFO, "note")
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter(TIMED if timed else LINE))
-    log.handlers = [handler]
-    log.setLevel(level if comm.rank == 0 else logging.CRITICAL)
-    try:
-        yield
-    finally:
-        log.handlers = before[0]
-        log.setLevel(before[1])
 
 
 @contextmanager

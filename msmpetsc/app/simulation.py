@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.ending import ending_together
+from msmpetsc.app.ending import ending_together, logged_on_root
 from msmpetsc.app.request import FLAGS
 from msmpetsc.build import Geometry, Model, build_model
-from msmpetsc.comm import logged_on_root
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import Scene

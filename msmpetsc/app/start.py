@@ -7,9 +7,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together
+from msmpetsc.app.ending import STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.app.request import RunRequest, asked_by
-from msmpetsc.comm import logged_on_root
 
 if TYPE_CHECKING:
     from mpi4py import MPI

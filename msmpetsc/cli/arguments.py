@@ -25,7 +25,11 @@ TAKE_PETSC_OPTIONS = ("run",)
 def parsed(words: list[str]) -> argparse.Namespace:
     """Parse a whole command line: our own arguments, and PETSc's options. Raises InputError."""
     ours, petsc = split_petsc_options(words)
-    _refuse_unknown_command(ours)
+    if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
+        word = printable(ours[0], 60)
+        if word.endswith(SCENE_NAMES):
+            raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
+        raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
     _refuse_one_dash(ours, petsc)
     args, unknown = command_parser().parse_known_args(ours, argparse.Namespace(petsc_options=shlex.join(petsc)))
     if unknown:
@@ -47,16 +51,6 @@ def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
 
 def _is_petsc_option(word: str) -> bool:
     return len(word) > 1 and word[0] == "-" and word[1].isalpha() and word not in OUR_SHORT
-
-
-def _refuse_unknown_command(ours: list[str]) -> None:
-    """Raise InputError for a word that is no command, with the one that may be meant."""
-    if not ours or ours[0] in COMMANDS or ours[0].startswith("-"):
-        return
-    word = printable(ours[0], 60)
-    if word.endswith(SCENE_NAMES):
-        raise InputError(f"{word} is no command, did you mean 'msmpetsc run {word}'?")
-    raise InputError(f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}")
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:

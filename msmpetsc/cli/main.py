@@ -9,11 +9,10 @@ import traceback
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together
+from msmpetsc.app.ending import STATUS_BUG, STATUS_INTERRUPTED, ending_together, logged_on_root
 from msmpetsc.cli.arguments import parsed
 from msmpetsc.cli.command_table import COMMANDS, RUNS_ITSELF
 from msmpetsc.cli.ranks import world
-from msmpetsc.comm import logged_on_root
 from msmpetsc.errors import InputError, MsmpetscError, as_expected
 
 if TYPE_CHECKING:

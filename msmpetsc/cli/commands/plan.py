@@ -8,15 +8,16 @@ import tempfile
 from contextlib import closing, nullcontext, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from msmpetsc.app.checks import PICTURE_NAMES, refuse_other_format
 from msmpetsc.errors import InputError
 from msmpetsc.scene.statics import STATIC
-
-if TYPE_CHECKING:
-    from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables
-    from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.cases import launcher
+from msmpetsc.study.process import Processes
+from msmpetsc.study.runner import Bench
+from msmpetsc.study.sizing.answer import SizePlan, SizeTrial, Tables, lines, overrides, put_into, tables
+from msmpetsc.study.sizing.choice import Choice
+from msmpetsc.study.sizing.trials import Asked, Sizer
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -46,11 +47,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if plan.met else NOTHING_MEETS
 
 
-def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> str:
+def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
     """Print lines to paste and a command that says the same, or change the file; return the command."""
-    from msmpetsc.study.cases import launcher
-    from msmpetsc.study.sizing.answer import lines, overrides, put_into, tables
-
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}
@@ -64,12 +62,9 @@ def print_command(args: argparse.Namespace, choice: "Choice", target: float) -> 
     return command
 
 
-def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
+def size_all(args: argparse.Namespace, target: float) -> SizePlan:
     """Make the trials, and print each when it is done; afterwards none of their runs is left."""
     from msmpetsc.solve.presets import preset_names
-    from msmpetsc.study.process import Processes
-    from msmpetsc.study.runner import Bench
-    from msmpetsc.study.sizing.trials import Asked, Sizer
 
     asked = Asked(target, args.frames, args.cells, args.ranks)
     with tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder, closing(Processes()) as processes:
@@ -79,7 +74,7 @@ def size_all(args: argparse.Namespace, target: float) -> "SizePlan":
         return sizer.plan()
 
 
-def print_size_trial(trial: "SizeTrial | str") -> None:
+def print_size_trial(trial: SizeTrial | str) -> None:
     """Print one line of what was tried, or a note."""
     if isinstance(trial, str):
         print(trial, flush=True)
@@ -91,7 +86,7 @@ def print_size_trial(trial: "SizeTrial | str") -> None:
     )
 
 
-def print_size(plan: "SizePlan", target: float) -> None:
+def print_size(plan: SizePlan, target: float) -> None:
     """Print the choice with its error, the parts of that, and what bounds it."""
     choice, budget, shares = plan.choice, plan.choice.budget, plan.choice.shares
     print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")

@@ -99,7 +99,7 @@ class LoadPath:
         self.known = [(0.0, self.base)]  # shares and their positions (l, 3) [m], the last two
         self.sides = self.state.sides
         self.inverted = worst_inverted(self.comm, self.stepper.lattice, self.base)[0]
-        self.holding: Rows | None = None  # r (owned, 3) [N], once it is asked for
+        self.holding: Rows | None = None  # r (owned, 3) [N], which keeps free nodes where they are; once asked for
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: LoadSteps) -> StepResult:
@@ -125,20 +125,15 @@ class LoadPath:
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
-                self.holding = self._holding(whole)
+                stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
+                functional.begin(replace(whole, y=self.base, prescribed=None))
+                stepper.unknowns.from_nodes(self.base, stepper.x)
+                f = functional.evaluate(stepper.x, stepper.work).f
+                self.holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
+                self.holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
             load = load + (1 - share) * self.holding
             prescribed = None if prescribed is None else self.base + share * (prescribed - self.base)
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
-
-    def _holding(self, whole: StepProblem) -> Rows:
-        """The force (owned, 3) [N] that would keep the free nodes where they are."""
-        stepper, functional, lattice = self.stepper, self.stepper.functional, self.stepper.lattice
-        functional.begin(replace(whole, y=self.base, prescribed=None))
-        stepper.unknowns.from_nodes(self.base, stepper.x)
-        f = functional.evaluate(stepper.x, stepper.work).f
-        holding = np.zeros((lattice.owned, 3), like=lattice.nodes)
-        holding[stepper.unknowns.free] = stepper.unknowns.columns(f).T / functional.t2
-        return holding
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
         """Positions (l, 3) [m] to start from: the last ones, or the line through the last two gone on, by their g."""

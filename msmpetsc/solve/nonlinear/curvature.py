@@ -110,23 +110,21 @@ class LowestCurvature:
 
     def compression(self, q: Positions) -> Compression:
         """Compression at positions q (l, 3) [m] in the functional's problem."""
-        problem, at, known = self.known
-        same = problem is self.functional.problem and bool(np.array_equal(at, q))
-        if not self.comm.allreduce(same, MPI.LAND):
-            known = self._compression(q)
-            self.known = self.functional.problem, q, known
-        return known
-
-    def _compression(self, q: Positions) -> Compression:
+        problem, (known_problem, at, known) = self.functional.problem, self.known
+        same = known_problem is problem and bool(np.array_equal(at, q))
+        if self.comm.allreduce(same, MPI.LAND):
+            return known
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        concavity, contact = elasticity.concavity(q)[free], functional.problem.contact
+        concavity, contact = elasticity.concavity(q)[free], problem.contact
         if contact and contact.surface:
             concavity = concavity + contact.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)
-        return Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        known = Compression(max(most), sum(sums), any(resist), not self.unknowns.static)
+        self.known = problem, q, known
+        return known
 
     def lowest(
         self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
@@ -150,7 +148,11 @@ class LowestCurvature:
             return -np.inf, self._random(1)[0]
         self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
-            return values[0], self._way_down(modes[: int((values <= ALIKE * values[0]).sum())])
+            # A random direction's projection on all that lead down as well: where a body may buckle to many sides, it
+            # goes the same way on any ranks, no matter which of them rounding has made the first.
+            down = modes[: int((values <= ALIKE * values[0]).sum())]
+            parts = self.comm.allreduce(to_host((down * self.functional.mass) @ self._random(1)[0]))
+            return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
         return values[0], self.mode
 
     def _followed(self) -> tuple[Floats, Rows] | None:
@@ -161,12 +163,6 @@ class LowestCurvature:
         its = self.effort.followed
         values, modes = self._iterate(np.concatenate([self.mode[None], self._random(1)]), 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
-
-    def _way_down(self, modes: Rows) -> Floats:
-        """Projection of a random direction on all of them (k, n): where a body may buckle to many sides, no matter
-        which of them rounding has made the first, so that it goes the same way on any ranks."""
-        direction = self.comm.allreduce(to_host((modes * self.functional.mass) @ self._random(1)[0]))
-        return like(modes, direction / max(np.linalg.norm(direction), TINY)) @ modes
 
     def _search_at_length(self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort) -> tuple[Floats, Rows]:
         """Search from something of each mode, for near a mode that is known a lower one comes up

@@ -228,7 +228,10 @@ class Stepper:
         if self._is_solved():
             return self.outcome
         self.projected = self.preset.projected > 0
-        self._forget_pairs()
+        if self.snes.getType() == PETSc.SNES.Type.QN:  # alone it keeps what it has learnt; set anew it has nothing
+            self.snes.setType(PETSc.SNES.Type.KSPONLY)
+            self.snes.setType(PETSc.SNES.Type.QN)
+            self.snes.setFromOptions()
         climbs = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         iterations, most = self._run_snes(), self.snes.getTolerances()[3]
         while self.preset.true_hessian and self.snes.reason == climbs and iterations < most:
@@ -281,13 +284,6 @@ class Stepper:
             self.observer(iterate.q)
         return solved
 
-    def _forget_pairs(self) -> None:
-        """SNESQN alone keeps what it has learnt, its pairs of the last step; a type set anew has none."""
-        if self.snes.getType() == PETSc.SNES.Type.QN:
-            self.snes.setType(PETSc.SNES.Type.KSPONLY)
-            self.snes.setType(PETSc.SNES.Type.QN)
-            self.snes.setFromOptions()
-
     def _evaluate(self, x: PETSc.Vec) -> Iterate:
         with LOCAL:
             return self.functional.evaluate(x, self.work)
@@ -339,15 +335,11 @@ class Stepper:
             self.kinks.is_awaited = True
             if self.preset.true_hessian:
                 self._start_from_estimate(snes, known)
-        if self.preset.start_from_b:
-            self._start_from_b(snes, x)
-
-    def _start_from_b(self, snes: PETSc.SNES, x: PETSc.Vec) -> None:
-        """CG solves A z = F for z = x - x_new; x_new = b = A x - F (Algorithm 1) is z = x - A x + F."""
-        z, f = snes.getSolutionUpdate(), snes.getFunction()[0]
-        self.jacobian.operator.mult(x, z)
-        z.aypx(-1.0, x)
-        z.axpy(1.0, f)
+        if self.preset.start_from_b:  # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
+            z = snes.getSolutionUpdate()
+            self.jacobian.operator.mult(x, z)
+            z.aypx(-1.0, x)
+            z.axpy(1.0, snes.getFunction()[0])
 
     def _start_from_estimate(self, snes: PETSc.SNES, known: bool) -> None:
         """CG goes on from what the estimate at this x, if there was one, has of the same correction."""

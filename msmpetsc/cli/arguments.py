@@ -14,7 +14,7 @@ from typing import Any
 
 import msmpetsc
 from msmpetsc.app.checks import SCENE_NAMES
-from msmpetsc.cli.command_table import COMMANDS, SAID, Argument, Shown
+from msmpetsc.cli.command_table import COMMANDS, SAID, Shown
 from msmpetsc.cli.ranks import world
 from msmpetsc.errors import InputError, did_you_mean, printable
 
@@ -115,17 +115,17 @@ def command_parser() -> Parser:
         add = commands.add_parser(
             name, help=command.help, description=about, epilog=examples, formatter_class=RawDescriptionHelpFormatter
         )
-        for argument in command.arguments:
-            add.add_argument(*argument.names, **argument.keywords)
+        for names, keywords in command.arguments:
+            add.add_argument(*names, **keywords)
         for choice in filter(None, (command.exclusive, SAID)):
             group = add.add_mutually_exclusive_group()
-            for argument in choice:
-                group.add_argument(*argument.names, **argument.keywords)
+            for names, keywords in choice:
+                group.add_argument(*names, **keywords)
     return parser
 
 
 def option_names(command: str) -> list[str]:
     """List the options of a command: "--preset"."""
     known = COMMANDS[command]
-    given: tuple[Argument, ...] = (*known.arguments, *known.exclusive, *SAID)
-    return ["--help", *(name for argument in given for name in argument.names if name.startswith("-"))]
+    given = (*known.arguments, *known.exclusive, *SAID)
+    return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]

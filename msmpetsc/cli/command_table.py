@@ -3,18 +3,13 @@
 import argparse
 import sys
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
 from msmpetsc.app.request import OPTIONS, RunRequest, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
-
-class Argument(NamedTuple):
-    """An argument as argparse's ``add_argument`` takes it."""
-
-    names: tuple[str, ...]
-    keywords: dict[str, Any]
+Argument = tuple[tuple[str, ...], dict[str, Any]]  # names and keywords, as argparse's ``add_argument`` takes them
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ def listed_presets() -> str:
 
 def argument(*names: str, **keywords: Any) -> Argument:
     """Return an argument of these names."""
-    return Argument(names, keywords)
+    return names, keywords
 
 
 def switch(name: str, about: str) -> Argument:

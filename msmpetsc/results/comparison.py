@@ -100,8 +100,8 @@ def rest_of(run: Result, name: str) -> Positions | None:
 
 
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
-    """Return of a field the greatest distance of two rows and its row, (p,) each; and the greatest size in any frame,
-    from rest where the field is one of positions."""
+    """Return of a field the greatest distance of two rows and its row, (p,) each; and the greatest
+    size in any frame, from rest where the field is one of positions."""
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
         raise InputError(f"frames/{name} is {a_rows.shape[1:]} a frame in {a.path}, {b_rows.shape[1:]} in {b.path}")

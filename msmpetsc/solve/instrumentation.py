@@ -63,8 +63,8 @@ def times(comm: MPI.Comm) -> dict[str, float]:
 def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
     """How many hierarchies of multigrid were built, and bytes of all ranks that the last one holds (collective).
 
-    They are those beside the lattice, without what factors the coarsest level: P and matrix of each coarse level, what
-    sums the first, the finest level's blocks.
+    They are those beside the lattice, without what factors the coarsest level: P and matrix of each
+    coarse level, what sums the first, the finest level's blocks.
     """
     chosen, own = stepper.jacobian.preconditioner.multigrid if stepper else None, 0
     if chosen:

@@ -203,9 +203,9 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
-    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A body that flies as
-    a whole counts its flight as motion. Raises InputError if the files have fewer than two times in common or different
-    lattices, or nothing moves.
+    Sums over the times that both files have; x_ref stands for the limit of the time step to zero. A
+    body that flies as a whole counts its flight as motion. Raises InputError if the files have
+    fewer than two times in common or different lattices, or nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)

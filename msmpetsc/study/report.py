@@ -43,7 +43,15 @@ def write_report(folder: Path) -> Path:
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    charts = draw_charts(table, read_traces(folder), study)
+    styles, sweeps = curve_styles(table["label"]), swept(table)
+    charts = [
+        *stability_charts(table, study),
+        *size_charts(sweeps, styles),
+        *pareto_charts(sweeps, styles),
+        *growth_charts(sweeps, styles),
+        *order_charts(sweeps, styles, study),
+        *convergence_charts(sweeps, styles, read_traces(folder)),
+    ]
     for chart in charts:
         save_png(chart, folder)
     names = [name for name in table["study"] if name]
@@ -51,20 +59,6 @@ def write_report(folder: Path) -> Path:
     path, written = folder / "report.html", datetime.fromtimestamp((folder / "table.csv").stat().st_mtime)
     write_whole(path, page(title, f"{written.astimezone():%d %B %Y, %H:%M %z}", table, charts))
     return path
-
-
-def draw_charts(table: DataFrame, traces: dict[str, dict], study: dict) -> list[Chart]:
-    """Return all charts that there are numbers for; ``study``: the tables of the study file."""
-    styles = curve_styles(table["label"])
-    sweeps = swept(table)
-    return [
-        *stability_charts(table, study),
-        *size_charts(sweeps, styles),
-        *pareto_charts(sweeps, styles),
-        *growth_charts(sweeps, styles),
-        *order_charts(sweeps, styles, study),
-        *convergence_charts(sweeps, styles, traces),
-    ]
 
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
@@ -84,15 +78,12 @@ def facts(table: DataFrame) -> dict[str, Any]:
     maps = {name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()}
     platforms = {name.capitalize(): [text for text in table[name].unique() if text] for name in ("machine", "versions")}
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
-    return counts | {"maps": maps, "platforms": platforms, "repeats": repeats_note(timed(plain))}
-
-
-def repeats_note(rows: DataFrame) -> str:
-    """Say how often cases were run, and what follows for their times; empty without cases."""
-    counts = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
-    if rows.empty or not is_repeated(rows):
-        return counts and f"{counts}. {ONCE_NOTE}"
-    return f"{counts}: times are medians, ranges and whiskers from the least to the greatest"
+    rows = timed(plain)
+    often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))  # nothing without cases
+    note = often and f"{often}. {ONCE_NOTE}"
+    if not rows.empty and is_repeated(rows):
+        note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
+    return counts | {"maps": maps, "platforms": platforms, "repeats": note}
 
 
 def html(table: DataFrame) -> Markup:

@@ -20,7 +20,11 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
-        print_cases(args.study, folder, preset_names(), args.full)
+        listed = list_study(args.study, folder, preset_names(), args.full)
+        for number, (case, done) in enumerate(listed, 1):  # the I of --part I/N, where N is the number of cases
+            state = "done" if done else "open"
+            print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
+        print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
         return 0
     rows = run_study(
         args.study, folder, preset_names(), full=args.full, jobs=args.jobs, restart=args.restart, part=part
@@ -44,14 +48,6 @@ def part_of(text: str | None) -> StudyPart | None:
     if not (numbers and 1 <= int(index) <= int(count)):
         raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
     return StudyPart(int(index), int(count))
-
-
-def print_cases(study: Path, folder: Path, presets: list[str], full: bool) -> None:
-    """Print a line a case; its number is the I of --part I/N, where N is the number of cases."""
-    listed = list_study(study, folder, presets, full)
-    for number, (case, done) in enumerate(listed, 1):
-        print(f"{number:4} {'done' if done else 'open'}  {case.scene}: {case.label}  {shown_command(case)}")
-    print(f"{len(listed)} cases, {sum(done for _, done in listed)} done")
 
 
 def log_failures(rows: list[dict]) -> None:

@@ -227,8 +227,8 @@ class StepPreconditioner:
 
     @property
     def to_balance(self) -> LatticePreconditioner | None:
-        """What moves bodies as wholes to where their forces balance, which linear solves would not; None where nothing
-        has to."""
+        """What moves bodies as wholes to where their forces balance, which linear solves would not;
+        None where nothing has to."""
         multigrid = self.multigrid if self.is_chosen else None
         return multigrid if multigrid and multigrid.translations else None
 

@@ -129,8 +129,12 @@ class Sizer:
             raise InputError(f"{self.scene}: the trials failed on {cells} cells, see above: nothing can be compared")
         finest, left = ladder[-1], self._left(ladder, sizes)
         if left > self.target / PART:
-            integrator, apart = finest.method.integrator, _apart(ladder[-2], finest)
-            self.bounds.append(f"the step: the two shortest of {integrator} are {apart:.1e} apart{self._contact_law()}")
+            integrator, responses = finest.method.integrator, {obstacle.response for obstacle in self.as_given.obstacle}
+            contact = "; contact is stiff" if responses else ""
+            if "exchange" in responses:
+                contact = '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
+            apart = f"{_apart(ladder[-2], finest):.1e} apart"
+            self.bounds.append(f"the step: the two shortest of {integrator} are {apart}{contact}")
         known = [Stepping(each.method, _apart(each, finest) + left, each.cost) for each in ladder[:-1]]
         known.append(Stepping(finest.method, left, finest.cost))
         explicit = finest.method.integrator == "verlet"
@@ -140,13 +144,6 @@ class Sizer:
                 chosen_from += self._others(integrator, chosen_from, finest=finest, left=left, cells=cells)
         self.step_errors = {each.method: each.error for each in (*known, *chosen_from)}
         return chosen_from
-
-    def _contact_law(self) -> str:
-        """Return what contact has to do with it, in words; "" for nothing."""
-        responses = {obstacle.response for obstacle in self.as_given.obstacle}
-        if "exchange" in responses:
-            return '; a rebound of response = "exchange" depends on the step, that of "penalty" has a limit'
-        return "; contact is stiff" if responses else ""
 
     def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
         """Return runs of verlet, whose error halved substeps tell, and their substeps; none where it takes too long."""

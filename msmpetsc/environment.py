@@ -17,7 +17,7 @@ from msmpetsc.contact.obstacles.reflection import StepTaken, slowed
 from msmpetsc.contact.surface.pairs import Contacts, NearPairs, Touch
 from msmpetsc.contact.surface.term import SurfaceContact
 
-Placed = tuple[Positions, Indices | None]  # positions (owned, 3) [m] and sides (o, owned or more), None for no sides
+Placed = tuple[Positions, Indices | None]  # q (owned, 3) [m] and sides (o, owned or more), if any
 
 
 class Environment:
@@ -124,7 +124,7 @@ class Environment:
         return at(begin) == at(end)
 
     def last_change(self, until: float) -> float:
-        """Return when loads, anchors and obstacles change for the last time [s] before ``until``, or 0."""
+        """Return when anything changes for the last time [s] before ``until``, or 0."""
         return max((time for time in self.events() if time <= until), default=0.0)
 
     def contact_faces(
@@ -249,7 +249,7 @@ class Environment:
         return work
 
     def change_of_push(self, before: Placed, after: Placed, time: float, time_step: float) -> Floats:
-        """Return by how much the push of penalties on this rank's nodes changes in a step, (owned,) [N]."""
+        """Return how much the push of penalties on this rank's nodes changes in a step, (owned,) [N]."""
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
             deeper = np.zeros_like(change)

@@ -36,7 +36,7 @@ OF_NO_MATTER = {"text", "folder", "title", "picture"}  # keys of a scene that ma
 
 
 def earlier_run(comm: MPI.Comm, request: RunRequest) -> Earlier | None:
-    """Return what is to be resumed, None for a run from the start (collective). Raises InputError."""
+    """Return what is to be resumed, None to run from the start (collective). Raises InputError."""
     if request.resume is None:
         return None
     path = Path(request.resume)

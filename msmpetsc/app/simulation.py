@@ -134,7 +134,7 @@ class Simulation:
         return simulation.frames()
 
     def _lend_options(self, until_the_end: ExitStack) -> bool:
-        """Lend PETSc these options; return whether no other simulation is under way (collective)."""
+        """Lend PETSc these options; return whether no other simulation is begun (collective)."""
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
         from msmpetsc.solve.presets import in_use
         from msmpetsc.solve.refused_options import refuse_early

@@ -1,4 +1,4 @@
-"""What a run says of itself on stderr: rank 0 alone, from bodies and counts to the files it leaves."""
+"""What a run says on stderr: rank 0 alone, from bodies and counts to the files it leaves."""
 
 import shlex
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Every command with its help, its arguments and its examples: the table that the parser is made of."""
+"""Every command with its help, arguments and examples: what the parser is made of."""
 
 import argparse
 import sys

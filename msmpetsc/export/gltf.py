@@ -100,7 +100,7 @@ def normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _target(moments: Moments, frame: int, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far points and normals of a frame are from those of the first, (v, 3) float32 each."""
+    """Return how far a frame's points and normals are from the first's, (v, 3) float32 each."""
     points = moments.points(frame).astype(np.float32)
     return points - base, normals(points, moments.cells) - normals(base, moments.cells)
 

@@ -22,7 +22,7 @@ class Moments:
     """
 
     def __init__(self, run: Result, mesh: Mesh, frames: Sequence[int]):
-        """Raises InputError for a result without a surface, where that is asked for, or a damaged one."""
+        """Raises InputError for a result without the surface asked for, or a damaged one."""
         self.run, self.mesh, self.frames = run, mesh, list(frames)
         if mesh == "surface" and "surface/points" not in run:
             raise InputError(f"{run.path} has no surface: it was run with output.surface = false")

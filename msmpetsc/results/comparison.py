@@ -48,7 +48,7 @@ class FieldError:
     worst: Indices
 
     def first_above(self, rtol: float) -> int | None:
-        """Return which of the frames compared is the first whose error is above rtol; None for none."""
+        """Return which frame compared is the first whose error is above rtol; None for none."""
         above = np.flatnonzero(self.errors > rtol)
         return int(above[0]) if len(above) else None
 

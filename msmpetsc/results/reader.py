@@ -141,7 +141,7 @@ class Result:
 
     @cached_property
     def embedding(self) -> "csr_array | None":
-        """W (v, n): surface points = W @ positions; None where the scene has output.surface = false."""
+        """W (v, n): surface points = W @ positions; None where a scene has output.surface = false."""
         from scipy.sparse import csr_array
 
         if not self._embedding:
@@ -243,7 +243,7 @@ def finished(file: h5py.File) -> int:
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint from the steps (2,) of both; None if neither has one."""
+    """Return the slot of the newest checkpoint from the steps (2,) of both; None for none."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 

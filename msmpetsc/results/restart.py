@@ -108,7 +108,7 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
 
 
 def _newest(path: Path, file: h5py.File) -> tuple[int, list[str], Checkpoint] | None:
-    """Return slot, names of rows, step and numbers of the newest checkpoint; None if there is none."""
+    """Return slot, names of rows, step and numbers of the newest checkpoint; None for none."""
     numbers = _checked_numbers(path, file)
     if numbers is None:
         return None

@@ -1,4 +1,4 @@
-"""Series of a result: one row a frame of energies, forces and places of probes, as a table of text."""
+"""Series of a result: a row a frame of energies, forces and places of probes, as text."""
 
 import csv
 import io

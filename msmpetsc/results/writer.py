@@ -271,7 +271,7 @@ class ResultFile:
         self.finished = count
 
     def _refuse_removed(self) -> None:
-        """Raise InputError where no name leads to the file any more; what it holds gets one again."""
+        """Raise InputError where no name leads to the file now; what it holds gets one again."""
         if self._same is None or os.fstat(self._same).st_nlink:
             return
         copy = self.path.with_name(f"{self.path.stem}.{os.getpid()}{self.path.suffix}")
@@ -320,7 +320,7 @@ class ResultFile:
     def _collect(
         self, rows: Array, dtype: np.dtype[Any], counts: Sequence[int], name: str, index: int | None = None
     ) -> None:
-        """Write the ranks' rows, `counts` of them, into dataset `name`, at its row `index` if given."""
+        """Write the ranks' rows, `counts` of them, into dataset `name`, or its row `index`."""
         rows = np.ascontiguousarray(rows, dtype)
         if self._direct is not None and index is not None:
             self._write_directly(self._direct, rows, counts, name, index)

@@ -98,7 +98,7 @@ def problem_lines(path: Path, error: ValidationError, text: str, overrides: dict
     problems = error.errors(include_url=False)
     for e in problems[:MOST_REPORTED]:
         culprit = next((o for keys, o in reversed(overrides.items()) if _concerns(e, keys)), None)
-        depths = [_depth(data, e["loc"]) for _, data in prefixes]  # of a key, or else the innermost table around it
+        depths = [_depth(data, e["loc"]) for _, data in prefixes]  # of a key, or a table around it
         deepest = max(depths, default=0)
         number = prefixes[depths.index(deepest)][0] if deepest else None
         where = (

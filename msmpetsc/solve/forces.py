@@ -47,7 +47,7 @@ class Forces:
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}
 
     def _pushes(self, q: Positions, contact: Contact | None) -> dict[str, Any]:
-        """Return what obstacles (o, 3) and the surface on each body (b, 3) push this rank's nodes with [N]."""
+        """Return the pushes of obstacles (o, 3) and of contact on bodies (b, 3) on this rank's nodes with [N]."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push, penalties = np.zeros((len(self.model.obstacles), 3)), self.environment.penalties
         for state in contact.states if contact else ():

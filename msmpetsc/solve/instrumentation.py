@@ -1,4 +1,4 @@
-"""Measurements of a run beside its frames: true errors, the iterates of one step, where the time went."""
+"""Measurements beside a run's frames: true errors, the iterates of one step, where the time went."""
 
 from dataclasses import dataclass, field
 from functools import partial

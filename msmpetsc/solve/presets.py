@@ -268,7 +268,7 @@ class SolverOptions:
         return str(PETSc.Options().getString(self.prefix + name, ""))
 
     def withdraw(self) -> None:
-        """Leave the database as the user has it: another preset may follow, and -options_left is to show his own."""
+        """Leave the database as the user has it: other presets follow, -options_left shows his own."""
         for name, value in self.hidden.items():
             PETSc.Options().setValue(name, value)
             PETSc.Options().getString(name)  # it has been of use

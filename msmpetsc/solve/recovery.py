@@ -52,7 +52,7 @@ class Recovery:
         return (PREFIX,) if self.on_failure == "fallback" else ()
 
     def step(self, state: State, time: float, failure: StepFailed | None) -> tuple[StepResult, State]:
-        """Take the step that ends at ``time``, after a ``failure`` of it if any. Raises StepFailed."""
+        """Take the step that ends at ``time``, after its ``failure`` if any. Raises StepFailed."""
         if failure and self.on_failure == "stop":
             raise failure
         if not self.recovered:
@@ -109,7 +109,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Another integrator: implicit Euler's, or the scene's own where it is static, or Verlet's."""
+        """Another integrator: implicit Euler's, or the scene's where it is static or Verlet's."""
         is_fallback = self.on_failure == "fallback"
         kept = ("static",) if is_fallback else ("static", "verlet")
         name = self.time.integrator if self.time.integrator in kept else "implicit-euler"

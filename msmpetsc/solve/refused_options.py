@@ -72,7 +72,7 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
     for prefix, (preset, budget) in solvers.items():
         options, objects = SolverOptions(preset, prefix, budget), []
         try:
-            with petsc_errors("PETSc refuses its options", further=Exception):  # of what it loads, a Python file maybe
+            with petsc_errors("PETSc refuses its options", further=Exception):
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):
                     objects.append(kind().create(PETSc.COMM_SELF))
                     objects[-1].setOptionsPrefix(prefix)
@@ -126,7 +126,7 @@ def _ours(name: str, ours: Collection[str]) -> str:
 
 
 def _left() -> list[str]:
-    """Names of the options that have not been looked at (PetscOptionsLeftGet, which petsc4py lacks)."""
+    """Names of the options not looked at (PetscOptionsLeftGet, which petsc4py lacks)."""
     library = petsc_library()
     strings = ctypes.POINTER(ctypes.c_char_p)
     count, names, values = Integer(), strings(), strings()

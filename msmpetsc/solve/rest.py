@@ -87,7 +87,7 @@ class Rest:
             functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
             stepper.unknowns.from_nodes(state.q, stepper.x)
             iterate = functional.evaluate(stepper.x, f)
-            if not estimate(iterate, functional.dual_norm(f), limit) <= limit:  # |e|_M; no minimum is infinitely far
+            if not estimate(iterate, functional.dual_norm(f), limit) <= limit:
                 return False
             stepper.unknowns.from_nodes(state.velocity(self.time_step), f)
             functional.memory.write(f)[:] *= functional.t2 * functional.mass

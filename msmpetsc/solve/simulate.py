@@ -154,7 +154,7 @@ class TimeLoop:
             self.adaptive.sum_up()
 
     def _advance(self, index: int) -> Frame | None:
-        """The next step (collective), as a frame if that is stored. Raises StepFailed, naming the step."""
+        """The next step (collective), as a frame if stored. Raises StepFailed, naming the step."""
         time = index * self.time_step
         if index == self.probes.trace:
             self.integrator.follow()

@@ -159,7 +159,7 @@ def inline(table: Mapping[str, Any]) -> str:
 
 
 def study_cases(study: Study, folder: Path, full: bool, presets: Collection[str] | None = None) -> list[Case]:
-    """Return all cases, each once, in the order of the file, whose folder is given. Raises InputError."""
+    """Return all cases, each once, in the order of the file in this folder. Raises InputError."""
     by_id: dict[str, Case] = {}
     for sweep in study.sweep:
         for scene in study.scene:

@@ -64,7 +64,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def of_frames(result: Path, time_step: float) -> Row:
-    """Return figures of a result: times and iterations are means a step, the first frame left out."""
+    """Return figures of a result: times and iterations are means a step without the first frame."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}

@@ -57,7 +57,7 @@ class MeshMeasures:
 
 
 def measured(surface: Surface, suffix: str = "") -> MeshMeasures:
-    """Measure a surface as its file has it; ``suffix`` of the file: the axes of glTF are defined."""
+    """Measure a surface as its file has it; ``suffix`` of that: glTF defines its axes."""
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
     areas = np.bincount(part_labels(surface), trimesh.triangles.area(surface.points[surface.triangles]))
     return MeshMeasures(

@@ -65,7 +65,7 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
     """Return the whole page; it needs nothing beside itself."""
     environment = Environment(autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True)
     environment.filters |= {"svg": lambda chart: Markup(svg_text(chart)), "html": html}
-    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]  # numbers before texts
+    between = [name for name in (*NUMBERS, *TEXT) if name not in (*FIRST, "command", *ABOVE)]
     filled = [name for name in between if (table[name].notna() & (table[name] != "")).any()]
     tables = {"table": table[[*FIRST, *filled, "command"]], "failures": failed(swept(table))[OF_FAILURES]}
     template = environment.get_template("report.html.j2")

@@ -53,7 +53,7 @@ class Bench:
         return self.folder / "runs" / f"{case.id}.h5"
 
     def measure(self, case: Case, keep: bool = False) -> CaseResult:
-        """Run a case as often as it says; what goes wrong is in its row. ``keep``: its result stays."""
+        """Run a case as often as it says; its row tells what goes wrong. ``keep``: its result stays."""
         runs: list[Row] = []
         path, trace = self.result_of(case), None
         known = case.columns | {"study": self.study, "command": shown_command(case)}

@@ -104,7 +104,7 @@ ONCE_NOTE = (
 
 
 def require_extra() -> None:
-    """Raise InputError where a package of a study is missing: before hours of runs, not after them."""
+    """Raise InputError where a package of a study is missing: before hours of runs."""
     for name in EXTRAS["study"]:
         if find_spec(name) is None:
             raise missing_package(name)
@@ -122,7 +122,7 @@ def write_table(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def read_table(folder: Path) -> "DataFrame":
-    """Return the rows of table.csv, see ``typed``. Raises InputError where there is no such table."""
+    """Return the rows of table.csv, see ``typed``. Raises InputError without such a table."""
     import pandas
 
     path = folder / "table.csv"

@@ -45,7 +45,7 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> np.ndarray:
-        """Tell which nodes (n,) the region of a scene's table means; none if it is painted in a file."""
+        """Tell which nodes (n,) a table's region means; none if it is painted in a file."""
         region = table.table.region
         if region.painted is not None:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
@@ -217,7 +217,7 @@ def drawable_of_surface(path: Path, surface: Surface) -> Drawable:
 
 
 def solids_of(run: Result) -> dict[int, Surface]:
-    """Return the surfaces of obstacles that a result holds. Raises InputError where they are damaged."""
+    """Return surfaces of obstacles that a result holds. Raises InputError for damaged ones."""
     if "obstacle/points" not in run:
         return {}
     points, triangles, numbers = run["obstacle/points"][:], run.indices("obstacle/triangles"), run["obstacle/number"][:]

@@ -78,7 +78,7 @@ def _pictures(composition: Composition, stills: list[Still], size: tuple[int, in
 
 @contextmanager
 def written(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Yield what adds a picture (height, width, 3) to a film, which has its name when it is whole."""
+    """Yield what adds a picture (height, width, 3) to a film, named when it is whole."""
     write = _video if path.suffix.lower() == ".mp4" else _images
     with whole_file(path) as part, write(part, size, fps) as add:
         yield add

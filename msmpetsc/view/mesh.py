@@ -80,7 +80,7 @@ def trilinear(rest: BodiesAtRest, points: np.ndarray, body: np.ndarray) -> csr_a
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return the subject with a copy of each point for every smooth piece of the surface around it."""
+    """Return the subject with a copy of each point for every smooth piece of surface there."""
     rest, W = subject.rest, subject.embedding
     _, first, equal = np.unique(
         np.column_stack([rest.body_of_point, rest.points]), axis=0, return_index=True, return_inverse=True

@@ -41,7 +41,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class MeshObstacle:
-    """A mesh: number of its obstacle, how far it has moved (3,) [m], and corners (8, 3) as of a Ball."""
+    """A mesh: number of its obstacle, how far it moved (3,) [m], corners (8, 3) as of a Ball."""
 
     number: int
     by: np.ndarray
@@ -89,7 +89,7 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
             shown.glass.extend(_box(np.array(obstacle.box) + by, bodies))
         elif obstacle.shape == "sphere":
             center, radius = np.array(obstacle.center) + by, obstacle.radius or 0.0
-            seen = _box(np.array([center - radius, center + radius]), bodies)  # no more is shown than of a box
+            seen = _box(np.array([center - radius, center + radius]), bodies)
             gap = np.linalg.norm(center - np.clip(center, bodies.min(axis=0), bodies.max(axis=0))) - radius
             if gap <= NEAR * _reach(bodies):
                 shown.balls.extend(Ball(center, radius, corners) for corners in seen)
@@ -102,11 +102,11 @@ def overlays_at(subject: Drawable, index: int, bodies: np.ndarray, camera: Camer
 
 
 def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: np.ndarray, camera: Camera) -> None:
-    """Add a plane as ground, or as a plate of glass where it would hide the body; far from it, none."""
+    """Add a plane as ground, or as a plate of glass where it hides the body; far from it, none."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
     sides, height = _sides(normal), (point @ normal) * normal
-    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:  # wherever the eye is, the same is drawn
+    if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:  # alike from anywhere
         middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
         middle = middle - ((middle - point) @ normal) * normal
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ sides

@@ -17,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
     parser = command_parser()
     (commands,) = (action.choices for action in parser._actions if isinstance(action.choices, dict))
     for argument in (each for command in commands.values() for each in command._actions):
-        if argument.type in (checked_path, checked_file):  # a path: completed by the files that there are
+        if argument.type in (checked_path, checked_file):  # completed by files
             argument.complete = shtab.FILE
     if world().rank == 0:
         print(shtab.complete(parser, args.shell))

@@ -1,4 +1,4 @@
-"""``msmpetsc keys`` and ``msmpetsc schema``: the keys of a scene as a table, or as a JSON schema for editors."""
+"""``msmpetsc keys``, ``msmpetsc schema``: the keys of a scene, as a table or a JSON schema."""
 
 import argparse
 import json

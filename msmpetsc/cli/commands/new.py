@@ -61,7 +61,7 @@ def drafted(mesh: Path, scene: Path) -> str:
 
 
 def beside(mesh: Path, scene: Path) -> str:
-    """Return the path of a mesh from the folder of its scene. Raises InputError for one elsewhere."""
+    """Return the path of a mesh from its scene's folder. Raises InputError for one elsewhere."""
     folder = scene.parent
     if not mesh.exists():
         locate(str(mesh), Path())  # says what it is not

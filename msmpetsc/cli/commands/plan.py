@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def print_command(args: argparse.Namespace, choice: Choice, target: float) -> str:
-    """Print lines to paste and a command that says the same, or change the file; return the command."""
+    """Print lines to paste and a command that says the same, which is returned; write them."""
     errors = {name: float(f"{value:.2g}") for name, value in vars(choice.budget).items()}
     budget = {"target": target, **errors, "count": choice.cells, "time_step": choice.method.time_step}
     answer: Tables = {**tables(choice.method), "cages": {"count": choice.cells, "cell_size": None}, "budget": budget}

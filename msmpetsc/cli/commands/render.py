@@ -115,7 +115,7 @@ def _draw_motion(
 
 
 def drawable_of_file(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return what a scene or a mesh shows, with its size and its cells in words. Raises InputError."""
+    """Return what a scene or a mesh shows, with size and cells in words. Raises InputError."""
     if path.suffix.lower() not in SCENE_NAMES:
         if changes:
             raise InputError(f"--set changes a scene, and {path} is a mesh")

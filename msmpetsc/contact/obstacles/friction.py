@@ -59,7 +59,7 @@ class Friction:
         return np.where(u < self.stick, (2 - u / self.stick) / self.stick, 1 / np.maximum(u, self.stick))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
+        """Add friction (a, 3) [N] to the rows of ``gradient`` (owned or more, 3) that it acts on."""
         u, length = self.slip(q)
         gradient[self.nodes] += (self.limit * self.slope(length))[:, None] * u
 

@@ -40,7 +40,7 @@ class Penalty:
     restitution: float | None = None
 
     def state_at(self, time: float, sides: Indices | None = None) -> "ContactState":
-        """Return the obstacle at a time [s], without friction; ``sides`` (owned or more,) of the nodes."""
+        """Return the obstacle at a time [s] without friction; ``sides`` (owned or more,) of nodes."""
         return ContactState(self.obstacle, time, self.stiffness, None, sides)
 
     def during(
@@ -61,8 +61,8 @@ class Penalty:
         if last is not None:
             carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
-            coming, _ = self.obstacle.depths(2 * q - last, time, sides)  # of nodes that go straight on
-            depth = np.clip(coming[nodes], 0, 2 * depth)  # what has just come in says nothing of how far it goes
+            coming, _ = self.obstacle.depths(2 * q - last, time, sides)
+            depth = np.clip(coming[nodes], 0, 2 * depth)  # what just came in tells little
         return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
 
 

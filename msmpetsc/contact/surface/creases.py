@@ -29,7 +29,7 @@ def neighbours(
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, of the points that may not meet, of candidates nearer than
     ``distance`` [m] at rest."""
-    kinds = (candidates.fv_candidates, 1), (candidates.ee_candidates, 2)  # and of how many points the first part is
+    kinds = (candidates.fv_candidates, 1), (candidates.ee_candidates, 2)
     pairs = [_cross_pairs(kind, mesh, points, distance, split) for kind, split in kinds]
     groups = np.concatenate([np.empty((0, 4, 2), np.int64), *pairs])
     if len(groups) == 0:

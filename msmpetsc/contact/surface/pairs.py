@@ -133,7 +133,7 @@ class NearPairs:
         return self._newest
 
     def moved(self, q: Positions, pairs: Pairs) -> float:
-        """Return no less than how far any point at q is from where the pairs were looked for [m]."""
+        """Return no less than how far points at q are from where the pairs were looked for [m]."""
         return self._farthest(q, pairs.q)
 
     def _farthest(self, end: Positions, start: Positions) -> float:
@@ -202,7 +202,7 @@ class Contacts:
         return share if near and -ASIDE < share < 1 + ASIDE else None
 
     def _serve(self, pairs: Pairs, points: Positions) -> bool:
-        """Return whether points S (p, 3) are within the pairs' reach, by what these themselves moved."""
+        """Return whether points S (p, 3) are within the pairs' reach, by their own moves."""
         serve = True
         if self.barrier:
             moved = points - pairs.points

@@ -33,7 +33,7 @@ class SurfaceHessian:
     points: csr_array
 
     def add_product(self, v: Rows, product: Rows) -> None:
-        """Add the Hessian times v (owned or more, 3) to the owned rows of ``product`` (collective)."""
+        """Add the Hessian times v (owned or more, 3) to owned rows of ``product`` (collective)."""
         at, weights = self.carried
         moved = np.zeros((self.points.shape[0] // 3, 3))
         moved[at] = weights @ v[: weights.shape[1]]
@@ -76,7 +76,7 @@ class SurfaceContact:
                 self.friction = SurfaceFriction(barrier, moment.contacts, moment.points, stick)
 
     def _acting(self, q: Positions) -> ContactsAt | None:
-        """Return the contacts at q, with the points where there is friction; None where nothing acts."""
+        """Return the contacts at q, with the points for friction; None where nothing acts."""
         moment = self.contacts.find(q)
         if moment.count == 0 and not self.rubs:
             return None
@@ -118,7 +118,7 @@ class SurfaceContact:
         gradient[: weights.shape[1]] += weights.T @ forces[at]
 
     def _forces(self, moment: ContactsAt) -> tuple[Indices, Rows] | None:
-        """Return on rank 0 the points (k,) that anything pushes, and the gradient there (k, 3) [N]."""
+        """Return on rank 0 the points (k,) that are pushed, and the gradient there (k, 3) [N]."""
         barrier = self.contacts.barrier
         if barrier is None or moment.points is None:
             return None

@@ -51,7 +51,7 @@ ORDERS = {"implicit-euler": 1, "bdf2": 2}  # of the integrators that are known h
 
 
 class NeighbourMean:
-    """Means over a node and all that springs join it to, ``SWEEPS`` times. All methods are collective."""
+    """Means over a node and its neighbours by springs, ``SWEEPS`` times. All methods are collective."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
         self.owned, self.field = lattice.owned, Ghosted(comm, lattice)
@@ -186,7 +186,7 @@ class Adaptive(Integrator):
         cost = Work()
         while True:
             longest = self.control.level
-            if state.history is not None:  # which the step needs: it is no more than twice as long as the last
+            if state.history is not None:  # the step needs it: no more than twice as long
                 longest = min(longest, self.last + 1)
             level = self.ticks.fitting(self.tick, longest)
             before, end = self._begun(state, level, restarts), self._reached(self.tick + self.ticks.length(level))

@@ -54,7 +54,7 @@ class ContactFaces:
         return StepProblem(self.q, self.y, environment.load(time), contact, environment.prescribed(self.q, time))
 
     def compare(self, x: Positions) -> None:
-        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where they do not settle."""
+        """Update the faces from the solution x (l, 3) [m]. Raises StepFailed where none settle."""
         crossed, pressing = self._crossed(x), self.environment.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1

@@ -76,7 +76,7 @@ class ImplicitEuler(Integrator):
         return self.stepper.unknowns.size
 
     def set_up(self) -> None:
-        """Raises InputError for a preconditioner that this PETSc or matrix does not have (collective)."""
+        """Raises InputError for a preconditioner that PETSc or the matrix lacks (collective)."""
         self.stepper.set_up()
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:

@@ -69,7 +69,7 @@ class StepControl:
         allowed = self.allowed(level, measure)
         if level == self.lowest or measure.error <= EXCESS * allowed:
             return True
-        excess, halvings = measure.error / max(allowed, sys.float_info.min), 1  # at the least, also where not finite
+        excess, halvings = measure.error / max(allowed, sys.float_info.min), 1
         if 1 < excess < math.inf:
             halvings = max(1, round(math.log2(excess) / (self.order + 1)))
         self.shorten(level, halvings)

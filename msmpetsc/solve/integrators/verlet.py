@@ -209,7 +209,7 @@ class Verlet(Integrator):
             contact.add_gradient(self.q, self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
-        """v by the forces at ``time``; for friction obstacles move as in the substep from begin to end."""
+        """Change v by the forces at ``time``; obstacles move as in the substep from begin to end."""
         self._damp(0.5 * duration)
         beyond = self.environment.load_beyond(time, self.end)
         load, before = self.environment.load(time), None if beyond is None else self.v.copy()
@@ -240,7 +240,7 @@ class Verlet(Integrator):
         self.position.update()
 
     def _strike(self, begin: float, end: float) -> None:
-        """Know the faces of contact. The velocity of a node that bounces off is what then led it there."""
+        """Find faces of contact; the velocity of a node that bounces off is what then led it there."""
         np.multiply(self.v, begin - end, out=self.before)
         self.before += self.q
         self.sides = self.environment.contact_faces(self.before, self.q, end, end - begin, self.sides, self.fixed)

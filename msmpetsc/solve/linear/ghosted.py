@@ -36,7 +36,7 @@ class Ghosted:
 
 
 def with_ghosts(comm: MPI.Comm, lattice: Lattice, rows: Array) -> Array:
-    """Rows (l, ...) of the local nodes, on the host, from those of the owned ones (owned, ...) there (collective)."""
+    """Rows (l, ...) of local nodes from those of the owned ones, both on the host (collective)."""
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
     asked = to_owner.send(lattice.ghosts) - lattice.table.first
     return np.concatenate([rows, to_owner.answer(rows[asked])])

@@ -197,7 +197,7 @@ class LowestCurvature:
             residuals = x[1] - like(mass, values)[:, None] * mass * x[0]
             sizes = np.array([greatest(np.abs(residual)) for residual in residuals])
             self.comm.Allreduce(MPI.IN_PLACE, sizes, MPI.MAX)
-            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # which single precision can hold
+            residuals /= like(residuals, np.maximum(sizes, TINY)[:, None])  # so that float32 holds them
             w = self._unit(self._without_rigid(self._of_each(self.preconditioner.apply, residuals)))
             blocks = [x, (w, self._of_each(self.hessian.mult, w)), *([] if last is None else [last])]
             span, products = (np.concatenate(parts) for parts in zip(*blocks, strict=True))

@@ -55,7 +55,7 @@ class Jacobian:
         self.operator = self._python_matrix(context)
         of_lattice = partial(LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix)
         mass, inertia = (m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia))
-        ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)  # t^2 k / m of a free node
+        ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
         is_held = self.unknowns.total < self.unknowns.lattice.table.total
         chooses = chooses and (is_held or ratio < MASSLESS)
         self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio, self.unknowns.total)
@@ -144,7 +144,7 @@ class FrictionKinks:
         self.secants = contact.all_secant() if contact else None
 
     def see(self, q: Positions, base: Positions) -> None:
-        """Look at the full step from base to q (l, 3) [m], the first that is seen since it was awaited."""
+        """Look at the full step from base to q (l, 3) [m], the first seen since it was awaited."""
         if self.is_awaited and self.contact:
             self.secants = self.contact.passes_kinks(q, base)
         self.is_awaited = False

@@ -66,7 +66,7 @@ class Minimum:
         nearer = functional.evaluate(self.nearer, self.f)
         estimate.linearise(nearer.q)
         estimate.residual.aypx(-1.0, self.f)
-        bent = functional.dual_norm(estimate.residual)  # |F(x - e) - (F - H e)|: what H at x did not know
+        bent = functional.dual_norm(estimate.residual)  # what H at x did not know
         hint = estimate.correction if alarm else None
         value, direction = self.curvature.lowest(nearer.q, compression, alarm, hint)
         if value < 0:
@@ -75,7 +75,7 @@ class Minimum:
         first, rest = functional.norm(self.first), functional.dual_norm(self.f) / value
         if value > CONVEX and first + rest <= KNOWN * enough:  # a bound, if g is as convex from there on
             return Verdict(self.rounding.relative(first + rest, functional.distance(nearer.q)))
-        if corrected and estimate.missing is not None and value <= CONVEX:  # then without an early end
+        if corrected and estimate.missing is not None and value <= CONVEX:
             iterate = functional.evaluate(x, self.f)
             closely = bool(np.isfinite(estimate(iterate, functional.dual_norm(self.f), np.inf)))
             return self.examine(x, closely, compression, alarm, enough)

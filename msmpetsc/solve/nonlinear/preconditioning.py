@@ -105,7 +105,7 @@ class LatticePreconditioner:
         return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
 
     def _blocks(self, q: Positions, contact: Contact | None) -> Rows:
-        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) where there is none."""
+        """The Hessian of contact (owned, 9) at q, friction's by its secant; (0, 9) without it."""
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
         for nodes, added in contact.hessian(q, False) if contact else ():

@@ -272,7 +272,7 @@ class Stepper:
         return doubted
 
     def _is_solved(self) -> bool:
-        """Whether the first guess will do: an NPC would solve with A before SNES looks at its start."""
+        """Whether the first guess will do: an NPC solves with A before SNES looks at its start."""
         if not self.has_npc:
             return False
         iterate = self._evaluate(self.x)
@@ -342,7 +342,7 @@ class Stepper:
             z.axpy(1.0, snes.getFunction()[0])
 
     def _start_from_estimate(self, snes: PETSc.SNES, known: bool) -> None:
-        """CG goes on from what the estimate at this x, if there was one, has of the same correction."""
+        """CG goes on from what an estimate at this x, if any, has of the same correction."""
         if self.options.is_given("ksp_initial_guess_nonzero"):
             return
         known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY  # that starts from nothing
@@ -351,7 +351,7 @@ class Stepper:
         self.ksp.setInitialGuessNonzero(known)
 
     def _converged(self, snes: PETSc.SNES, its: int, _: tuple[float, float, float]) -> int | None:
-        """Whether SNES is done (its convergence test): by the error of its iterate, or by the budget."""
+        """Whether SNES is done (its convergence test), by its iterate's error or by the budget."""
         reasons, iterate = PETSc.SNES.ConvergedReason, self._iterate(snes)
         if its > 0:
             self.jacobian.preconditioner.learn(self.ksp.its, self.ksp.getTolerances()[0])
@@ -388,7 +388,7 @@ class Stepper:
             self.ksp.setTolerances(rtol=self.control.relative_tolerance(self.outcome))
 
     def _abandon(self) -> None:
-        """Keep PETSc's objects for ever: after an error within it they may crash when they are destroyed."""
+        """Keep PETSc's objects for ever: after an error they may crash when they are destroyed."""
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
         self.owned = ExitStack()
 

@@ -11,14 +11,14 @@ ADVICE = "a PETSc configured with --with-64-bit-indices can"
 
 
 def refuse_unknowns(nodes: int) -> None:
-    """Raise InputError for more ``nodes``, of all ranks, than PETSc can give three coordinates a number each."""
+    """Raise InputError for more ``nodes`` than PETSc can number three coordinates of."""
     if 3 * nodes > LARGEST:
         most = f"the {LARGEST} unknowns that PETSc can number here"
         raise InputError(f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}")
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count (collective)."""
+    """Raise InputError where a rank has more nonzeros, ``own`` of this one, than PETSc can count."""
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
         many = f"{most} nonzeros of the system matrix on one rank are more than the {LARGEST} that PETSc can count here"

@@ -181,7 +181,7 @@ def cheapest_line(measure: ErrorMeasure, level: float, best: list[Row]) -> str:
 
 
 def stepping(row: Row) -> str:
-    """Return how a case steps; an explicit one has substeps within its time step, that between frames."""
+    """Return how a case steps; an explicit one has substeps within the time between frames."""
     if row["integrator"] != "verlet":
         return formatting.entry(row, "time_step")
     if row["substep"]:

@@ -80,7 +80,7 @@ def curve_styles(labels: Iterable[str]) -> Styles:
 
 
 def tips(rows: DataFrame, told: Iterable[str], curve: str = "label") -> list[str]:
-    """Return what the point of each row tells: its curve, its numbers, the command that repeats it."""
+    """Return what the point of each row tells: curve, numbers, the command that repeats it."""
     told = list(dict.fromkeys(told))
     lines = ([row[curve], *(formatting.entry(row, name) for name in told), row["command"]] for row in records(rows))
     return ["\n".join(filter(None, tip)) for tip in lines]

@@ -69,7 +69,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict) -> Scale:
-    """Return the values that the rows have on this axis, in the order and the unit of the study file."""
+    """Return the values of the rows on this axis, in the order and the unit of the study file."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]

@@ -66,7 +66,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the trials told: errors of the cells, the steps and their solution, and what each costs."""
+    """What the trials told: errors of cells, steps and their solution, and what each costs."""
 
     law: ErrorLaw  # of the error over the edge of a cell, cells^(-1/3)
     steppings: Sequence[Stepping]
@@ -78,7 +78,7 @@ class CostModel:
     most: int
 
     def cheapest(self, target: float) -> Choice | None:
-        """Return the cheapest choice whose errors add up to the target at most; None if none does."""
+        """Return the cheapest choice whose errors add up to the target at most, or None."""
         choices = [
             self.choice(stepping, solving, cells)
             for stepping in self.steppings
@@ -107,12 +107,12 @@ class CostModel:
         method = replace(stepping.method, step_error=solving.step_error)
         same = [each for each in self.steppings if each.method.integrator == stepping.method.integrator]
         of_cells = 3 * math.log2(self.growth(cells, 2 * cells)) / self.law.order
-        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))  # d log cost / d log error
+        parts = (of_cells, _steepness(same, stepping), _steepness(self.solvings, solving))
         total = sum(parts) or 1.0
         return Choice(method, int(cells), budget, cost, Budget(*(part / total for part in parts)))
 
     def growth(self, before: float, after: float) -> float:
-        """Return how many times the cost is when there are so many cells, read off the lattices tried."""
+        """Return how many times the cost is of so many cells, read off the lattices tried."""
         cells, costs = np.log(self.costs).T
         if len(cells) < 2:
             return after / before

@@ -95,7 +95,7 @@ class Sizer:
         """Return the plan of lattices of ``cells`` and fewer."""
         coarse = self._coarser(1)
         steppings = self._steppings(coarse)
-        fair = [each for each in steppings if each.error <= self.target / 2]  # half is left to the cells
+        fair = [each for each in steppings if each.error <= self.target / 2]
         method = (min(fair, key=self._at_scale) if fair else min(steppings, key=lambda each: each.error)).method
         solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
@@ -181,7 +181,7 @@ class Sizer:
     def _others(
         self, integrator: IntegratorName, known: list[Stepping], *, finest: SizeTrial, left: float, cells: int
     ) -> list[Stepping]:
-        """Return what an integrator does with ever shorter steps, while it may still be the cheapest."""
+        """Return what an integrator does with ever shorter steps, while it may be the cheapest."""
         others: list[Stepping] = []
         enough = min((self._at_scale(each) for each in known if each.error <= self.target / 2), default=math.inf)
         for step in self.halved:
@@ -194,7 +194,7 @@ class Sizer:
         return others
 
     def _at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice over its growth: explicit substeps are shorter there."""
+        """Return the cost on the finest lattice over its growth: substeps are shorter there."""
         return stepping.cost * (COARSER if stepping.method.integrator == "verlet" else 1)
 
     def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
@@ -365,7 +365,7 @@ class Sizer:
         return trial
 
     def case(self, method: Candidate, cells: int) -> Case:
-        """Return the run of a method on so many cells, with the surface at the scene's own frames."""
+        """Return the run of a method on so many cells, its surface at the scene's own frames."""
         cages = self.as_given.cages.model_dump(exclude_unset=True) | {"count": cells, "cell_size": None}
         timeout = TIME if cells < self.cells else LONG_TIME
         case = Case(

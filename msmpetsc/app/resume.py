@@ -82,7 +82,7 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
     text, file = (earlier.texts.get(name) for name in ("scene", "scene_file"))
     if not text or not file or not file.isprintable():
         raise InputError(f"{earlier.path} does not say where its scene lay: name the SCENE too")
-    scene, folder = scene_of(Path(file), text, changes, presets), Path(file).parent
+    scene = scene_of(Path(file), text, changes, presets)
     # The result may be from anywhere, and so may be what it says of the folder in which its scene lay: each file that
     # it names must lie beside it, or be named by that scene's file or by the user.
     given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
@@ -91,7 +91,7 @@ def stored_scene(earlier: Earlier, changes: list[str], presets: Any) -> Scene:
         known |= {name for _, name in load_scene(file).named_files()}
     for path, name in scene.named_files():
         keys = tuple(map(str, path))
-        lies_beside = (folder / name).resolve().parent == earlier.path.resolve().parent
+        lies_beside = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
         if not (name in known or lies_beside or any(keys[: len(own)] == own for own in given)):
             raise InputError(
                 f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: name the SCENE too, "

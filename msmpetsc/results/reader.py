@@ -62,10 +62,9 @@ class Result:
         try:
             with plain_damage(self.path):
                 self.attributes = {name: as_python(value) for name, value in self.file.attrs.items()}
-                datasets, counts = checked_datasets(self.file), {"frames": finished(self.file)}
-                self._datasets = {
-                    name: LazyArray(data, counts.get(name.partition("/")[0])) for name, data in datasets.items()
-                }
+                rows = {"frames": finished(self.file)}
+                datasets = checked_datasets(self.file).items()
+                self._datasets = {name: LazyArray(data, rows.get(name.partition("/")[0])) for name, data in datasets}
         except BaseException:
             self.close()
             raise
@@ -90,8 +89,8 @@ class Result:
     def __repr__(self) -> str:
         if not self.file:
             return f"<closed {self.path}>"
-        nodes, frames = self.lattice.nodes.shape[0], len(self.frames.time)
-        return f"<{self.path}: {frames} frames of {nodes} nodes, {self.attributes.get('command', 'no command')}>"
+        counts = f"{len(self.frames.time)} frames of {len(self.lattice.nodes)} nodes"
+        return f"<{self.path}: {counts}, {self.attributes.get('command', 'no command')}>"
 
     def _repr_html_(self) -> str:
         """Return the result as a notebook shows it: what it is of, and its arrays."""

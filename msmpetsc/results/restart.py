@@ -57,7 +57,8 @@ class Earlier:
             texts = {name: value for name, value in result.attributes.items() if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
             names = _checked_numbers(path, result.file)
-            count, planned = len(result.frames.time), result.frames.time.planned[0]
+            count = len(result.frames.time)
+            planned = result.frames.time.planned[0]
             slot = newest_slot(result["checkpoint/step"][:]) if count and AT_REST in (names or ()) else None
             at_rest = slot is not None and result["checkpoint/numbers"][slot][(names or []).index(AT_REST)] == 1
             step = max(0, int(result["checkpoint/step"][:].max())) if names is not None and count else 0

@@ -31,7 +31,7 @@ class Forces:
 
     def __call__(self, q: Positions, time: float, sides: Indices | None, step: StepResult | None) -> dict[str, Any]:
         """Return the fields at q (l, 3) [m], where a step ended at a time [s] with these contact faces (collective)."""
-        lattice, environment, owned = self.model.lattice, self.environment, self.model.lattice.owned
+        environment, owned = self.environment, self.model.lattice.owned
         problem = step.problem if step else None
         contact = problem.contact if problem else environment.push(time, sides)
         held, load = np.zeros_like(q), environment.load(time)
@@ -41,7 +41,7 @@ class Forces:
             contact.add_gradient(q, held)
         held = held[:owned] - load
         if step and problem:
-            held += lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
+            held += self.model.lattice.mass[:, None] * (q[:owned] - problem.y[:owned]) / step.tau**2
         held *= environment.fixed_at(time)[:owned, None]
         sums = {"reaction": self.model.holders.totals(held), "load": to_host(load.sum(axis=0)), **pushes}
         return {name: self.comm.allreduce(sums[name]) for name in sums if name == "load" or name in self.rows}

@@ -66,9 +66,12 @@ def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
     They are those beside the lattice, without what factors the coarsest level: P and matrix of each
     coarse level, what sums the first, the finest level's blocks.
     """
-    chosen, own = stepper.jacobian.preconditioner.multigrid if stepper else None, 0
+    own = 0
+    chosen = stepper.jacobian.preconditioner.multigrid if stepper else None
     if chosen:
-        multigrid, total, fine = chosen.multigrid, chosen.multigrid.sum, chosen.multigrid.fine
+        multigrid = chosen.multigrid
+        total = multigrid.sum
+        fine = multigrid.fine
         arrays: list[Array] = [total.places, total.diagonal, total.upper, fine.inverse, fine.contact]
         arrays += [*total.springs, *total.nodes, *total.cells, *_blocks(multigrid)]
         own = sum(_of_matrix(matrix) for level in multigrid.levels for matrix in (level.interpolation, level.matrix))
@@ -78,8 +81,8 @@ def hierarchies(comm: MPI.Comm, stepper: Stepper | None) -> dict[str, int]:
 
 def _blocks(multigrid: Multigrid) -> list[Rows]:
     """Arrays that the finest level's Hessian has of its own, not of the lattice."""
-    elasticity, hessian = multigrid.fine.elasticity, multigrid.fine.elastic
-    lent = {id(array) for part in elasticity.parts for array in vars(part).values()}
+    hessian = multigrid.fine.elastic
+    lent = {id(array) for part in multigrid.fine.elasticity.parts for array in vars(part).values()}
     parts = [part for part in hessian.parts if isinstance(part, partial)] if hessian else []
     return [array for part in parts for array in part.args if hasattr(array, "nbytes") and id(array) not in lent]
 
@@ -88,5 +91,5 @@ def _of_matrix(matrix: PETSc.Mat) -> int:
     """Return bytes of a rank's part of an AIJ matrix; 0 where it is not there yet."""
     if not matrix:
         return 0
-    rows, nonzeros = matrix.getLocalSize()[0], matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
-    return int(nonzeros) * (INDEX + VALUE) + (rows + 1) * INDEX
+    nonzeros = matrix.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"]
+    return int(nonzeros) * (INDEX + VALUE) + (matrix.getLocalSize()[0] + 1) * INDEX

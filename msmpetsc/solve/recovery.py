@@ -75,9 +75,10 @@ class Recovery:
     def _in_pieces(self, state: State, time: float, level: int) -> tuple[StepResult, State]:
         """Take a step in 2^level pieces, and again halved where that fails; then one level up for the next."""
         self.deepest = level
-        pieces, start, cost = 2**level, time - self.time_step, Work()
+        pieces = 2**level
+        cost = Work()
         for piece in range(1, pieces + 1):
-            result, state = self._piece(state, start + piece * self.time_step / pieces, level)
+            result, state = self._piece(state, time - self.time_step + piece * self.time_step / pieces, level)
             cost += result.cost
         self.level = self.deepest if self.deepest > level else level - 1
         self.destroy()  # a resumed run has not seen what the spare solvers did in this step

@@ -70,7 +70,8 @@ def refuse_bad_values(solvers: dict[str, tuple[Preset, int]]) -> None:
     if "help" in PETSc.Options().getAll():  # once is enough
         return
     for prefix, (preset, budget) in solvers.items():
-        options, objects = SolverOptions(preset, prefix, budget), []
+        options = SolverOptions(preset, prefix, budget)
+        objects: list[PETSc.Object] = []
         try:
             with petsc_errors("PETSc refuses its options", further=Exception):
                 for kind in (PETSc.Mat, PETSc.PC, PETSc.SNES):

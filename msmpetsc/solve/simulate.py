@@ -232,8 +232,10 @@ class TimeLoop:
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
         """Frame of positions q (l, 3) [m] and of the steps since the frame before (collective)."""
-        time, energies = index * self.time_step, self.balance.energies
-        effort, gained = self.effort, self.state.budget.since_frame
+        time = index * self.time_step
+        energies = self.balance.energies
+        effort = self.effort
+        gained = self.state.budget.since_frame
         if index % self.every == 0:  # the last frame may come between: of a longer run it is none
             self.effort = Effort()
             self.state = replace(self.state, budget=replace(self.state.budget, since_frame=0.0))
@@ -244,11 +246,7 @@ class TimeLoop:
             time=time,
             position=position,
             surface=self.surface(position) if self.surface else None,
-            kinetic=energies.kinetic,
-            elastic=energies.elastic,
-            potential=energies.potential,
-            contact=energies.contact,
-            momentum=energies.momentum,
+            **{name: getattr(energies, name) for name in ("kinetic", "elastic", "potential", "contact", "momentum")},
             inverted=self.monitors.inverted(index, time, q) if self.balance.checks else -1,
             energy_gained=max(gained, 0.0) if self.balance.checks else np.nan,
             self_contacts=energies.touch.contacts,

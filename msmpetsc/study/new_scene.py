@@ -132,14 +132,13 @@ def draft(source: str, title: str, mesh: MeshMeasures) -> str:
         "# A first draft by msmpetsc new: every value is to be changed. All keys: msmpetsc keys",
         f"title = {json.dumps(title, ensure_ascii=False)}",
     ]
-    mesh_lines, cages = _mesh(source, mesh, body), _cages(body)
     moved = _clamped(body, body.axis) if body.axis is not None else _falling(body)
-    return "\n".join([*head, "", *mesh_lines, "", *cages, "", *moved]) + "\n"
+    return "\n".join([*head, "", *_mesh(source, mesh, body), "", *_cages(body), "", *moved]) + "\n"
 
 
 def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     """Return the table of the mesh, and what is wrong with it."""
-    report, longest = mesh.report, float(body.sides.max())
+    report = mesh.report
     parts = f"{len(mesh.parts)} part{'s' * (len(mesh.parts) > 1)}"
     state = "closed" if report.closed else f"open ({report.boundary_edges} boundary edges)"
     name = json.dumps(source, ensure_ascii=False)
@@ -162,7 +161,9 @@ def _mesh(source: str, mesh: MeshMeasures, body: Dimensions) -> list[str]:
     if len(mesh.parts) > 1 and '"largest_part"' not in steps:
         lines.append('# parts that no cell joins move by themselves; prepare = ["union"] joins those that overlap')
     guess = {1.0: "as in the file, taken as metres", None: "unit of the file unknown: what is it?"}
-    lines.append(line(f"size = {plain(longest, 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}"))
+    lines.append(
+        line(f"size = {plain(body.sides.max(), 5)}", f"longest side [m]; {guess.get(mesh.unit, 'the file has mm')}")
+    )
     if body.axis is None:
         drop = plain(DROP * body.sides[2], 2)
         lines.append(

@@ -56,9 +56,9 @@ def write_report(folder: Path) -> Path:
         save_png(chart, folder)
     names = [name for name in table["study"] if name]
     title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
-    path, written = folder / "report.html", datetime.fromtimestamp((folder / "table.csv").stat().st_mtime)
-    write_whole(path, page(title, f"{written.astimezone():%d %B %Y, %H:%M %z}", table, charts))
-    return path
+    written = datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone()
+    write_whole(folder / "report.html", page(title, f"{written:%d %B %Y, %H:%M %z}", table, charts))
+    return folder / "report.html"
 
 
 def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:

@@ -130,9 +130,9 @@ class Drawable:
 
     def fixed(self, index: int) -> np.ndarray:
         """Return how far each surface point is pinned or led at a frame, (v,) in [0, 1]."""
-        fixed, time = self.pinned.copy(), float(self.times[index])
+        fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor") if self.scene else ():
-            if within(time, 0.0, anchor.table.stop):
+            if within(float(self.times[index]), 0.0, anchor.table.stop):
                 fixed |= self.rest.find(anchor)
         return self.on_surface(fixed.astype(float), 1.0)
 
@@ -151,14 +151,15 @@ def drawable_of_result(run: Result) -> Drawable:
     for name in DRAWN:
         if len(run[name]) == 0:
             raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
-    nodes, cells = run.lattice.nodes[:], run.indices("lattice/cells")
+    nodes = run.lattice.nodes[:]
+    bodies = run.body_of("lattice"), run.body_of("surface")
     pinned = np.zeros(len(nodes), bool)
     if "lattice/pinned" in run:
         pinned[run.indices("lattice/pinned")] = True
     return Drawable(
         name=str(run.path),
         scene=scene,
-        rest=BodiesAtRest(nodes, cells, run.surface.points[:], run.body_of("lattice"), run.body_of("surface")),
+        rest=BodiesAtRest(nodes, run.indices("lattice/cells"), run.surface.points[:], *bodies),
         pinned=pinned,
         triangles=run.indices("surface/triangles"),
         times=run.frames.time[:],
@@ -177,7 +178,8 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     if surface is None or embedding is None:
         raise InputError(f"{path} has no surface to draw: it says output.surface = false")
     W = csr_array((embedding.weights, embedding.indices, embedding.indptr), shape=(embedding.points, owned))
-    start, nodes, body = np.asarray(model.start[0])[:owned], lattice.nodes[:owned], lattice.body[:owned]
+    start = np.asarray(model.start[0])[:owned]
+    bodies = lattice.body[:owned], model.body_of_point
     arrays = {
         "lattice/cell_kind": lattice.cell_kind,
         "lattice/springs": lattice.global_numbers[lattice.springs],
@@ -186,7 +188,7 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
     return Drawable(
         name=str(path),
         scene=scene,
-        rest=BodiesAtRest(nodes, lattice.cells, surface.points, body, model.body_of_point),
+        rest=BodiesAtRest(lattice.nodes[:owned], lattice.cells, surface.points, *bodies),
         pinned=lattice.pinned[:owned],
         triangles=surface.triangles,
         times=np.zeros(1),

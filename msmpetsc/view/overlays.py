@@ -105,7 +105,7 @@ def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: n
     """Add a plane as ground, or as a plate of glass where it hides the body; far from it, none."""
     if ((bodies - point) @ normal).min() > NEAR * _reach(bodies):
         return
-    sides, height = _sides(normal), (point @ normal) * normal
+    sides = _sides(normal)
     if normal @ camera.to_eye > 0 and normal @ camera.up > -1e-6:  # alike from anywhere
         middle = (bodies.min(axis=0) + bodies.max(axis=0)) / 2
         middle = middle - ((middle - point) @ normal) * normal
@@ -113,7 +113,8 @@ def _add_plane(shown: Overlays, point: np.ndarray, normal: np.ndarray, bodies: n
         shown.grounds.append(Ground(middle + GROUND * _reach(bodies) * corners, normal))
     else:  # a plate where the bodies stand before the plane, with a margin
         reached, margin = bodies @ sides.T, MARGIN * _reach(bodies)
-        front = corners_of(np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])) @ sides + height
+        front = corners_of(np.array([reached.min(axis=0) - margin, reached.max(axis=0) + margin])) @ sides
+        front = front + (point @ normal) * normal
         shown.glass.append(np.concatenate([front, front - THICKNESS * _reach(bodies) * normal]))
 
 

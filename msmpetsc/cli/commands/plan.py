@@ -88,14 +88,14 @@ def print_size_trial(trial: SizeTrial | str) -> None:
 
 def print_size(plan: SizePlan, target: float) -> None:
     """Print the choice with its error, the parts of that, and what bounds it."""
-    choice, budget, shares = plan.choice, plan.choice.budget, plan.choice.shares
+    choice = plan.choice
     print("\ncheapest:" if plan.met else f"\nnothing meets {target:g}; the smallest error within reach:")
     cost = f"{choice.cost:.3g} computing seconds a simulated second"
     if choice.method.integrator == STATIC:
         cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
-    print(f"{cost}, surface error {budget.total:.1e}")
+    print(f"{cost}, surface error {choice.budget.total:.1e}")
     print(f"{'part':16} {'error':>9} {'of the cost':>11}")
-    for name in vars(budget):
-        print(f"{name:16} {getattr(budget, name):9.1e} {100 * getattr(shares, name):10.0f}%")
+    for name, error in vars(choice.budget).items():
+        print(f"{name:16} {error:9.1e} {100 * getattr(choice.shares, name):10.0f}%")
     for bound in plan.bounds:
         print(f"what bounds it: {bound}")

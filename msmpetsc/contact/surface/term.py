@@ -101,7 +101,8 @@ class SurfaceContact:
         return self._energy(after) - self._energy(before)
 
     def _energy(self, moment: ContactsAt | None) -> float:
-        barrier, energy = self.contacts.barrier, 0.0
+        barrier = self.contacts.barrier
+        energy = 0.0
         if moment is None or barrier is None or moment.points is None:
             return 0.0
         if moment.contacts is not None:

@@ -115,9 +115,11 @@ class Adaptive(Integrator):
         self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
         self.order = ORDERS[scene.time.integrator]
-        lowest, highest, steps = LOWEST, HIGHEST, scene.time.steps
+        steps = scene.time.steps
+        lowest = LOWEST
         if scene.time.shortest is not None:
             lowest = math.ceil(math.log2(scene.time.shortest / scene.time.step) - 1e-9)
+        highest = HIGHEST
         if scene.time.longest is not None:
             highest = math.floor(math.log2(scene.time.longest / scene.time.step) + 1e-9)
         self.levels = max(lowest, -40), min(highest, 40)  # of its steps
@@ -206,11 +208,11 @@ class Adaptive(Integrator):
                 return self._taken(result, before, after, level)
 
     def _begun(self, state: State, level: int, restarts: bool) -> State:
-        length, v = self._length(level), state.velocity(self.time_step)
+        v = state.velocity(self.time_step)
         history = None if restarts or self.order < 2 else state.history
         if history and level != self.last:
             history = between(*history, state.q, v, self._length(self.last), 1 - 2.0 ** (level - self.last))
-        return replace(state, q_previous=state.q - length * v, history=history)
+        return replace(state, q_previous=state.q - self._length(level) * v, history=history)
 
     def _reached(self, tick: int) -> float:
         """Time of a step that ends at a tick [s]: just before what begins or ends there."""

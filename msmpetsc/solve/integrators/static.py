@@ -105,10 +105,10 @@ class LoadPath:
     def try_share(self, steps: LoadSteps) -> StepResult:
         """Find the equilibrium of the share to try. Raises StepFailed where there is none, or one
         with cells turned inside out, which smaller steps may avoid."""
-        share, q = steps.share, self.known[-1][1]
-        fixed, time_step = self.stepper.lattice.pinned, self.time_step
-        if len(self.known) > 1:  # obstacles move in the first load step alone
-            time_step = 0.0
+        share = steps.share
+        q = self.known[-1][1]
+        time_step = 0.0 if len(self.known) > 1 else self.time_step  # obstacles move in the first load step alone
+        fixed = self.stepper.lattice.pinned
         faces = ContactFaces(self.comm, self.environment, q, q, self.time, time_step, self.sides, fixed)
         while not faces.is_settled:
             problem = self._problem(faces.problem(), share)
@@ -140,7 +140,8 @@ class LoadPath:
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:
             return q
-        pinned, functional = self.stepper.lattice.pinned[:, None], self.stepper.functional
+        functional = self.stepper.functional
+        pinned = self.stepper.lattice.pinned[:, None]
         ahead = q + (share - reached) / (reached - share_before) * (q - before)
         functional.begin(problem)
         values = [functional.value(np.where(pinned, problem.fixed, guess)) for guess in (q, ahead)]

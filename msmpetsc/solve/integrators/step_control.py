@@ -69,7 +69,8 @@ class StepControl:
         allowed = self.allowed(level, measure)
         if level == self.lowest or measure.error <= EXCESS * allowed:
             return True
-        excess, halvings = measure.error / max(allowed, sys.float_info.min), 1
+        halvings = 1
+        excess = measure.error / max(allowed, sys.float_info.min)
         if 1 < excess < math.inf:
             halvings = max(1, round(math.log2(excess) / (self.order + 1)))
         self.shorten(level, halvings)

@@ -317,7 +317,8 @@ class HighestMode:
         Without the negative curvature across pressed springs, which is no oscillation and has no bound.
         """
         x, owned = self.mode.values, self.lattice.owned
-        hessian, product = self.elasticity.hessian_at(q, projected=True), np.empty_like(q)
+        hessian = self.elasticity.hessian_at(q, projected=True)
+        product = np.empty_like(q)
         for _ in range(MOST_ITERATIONS):
             before = self.squared
             product[:] = 0

@@ -17,8 +17,7 @@ class FirstGuess:
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
         self.functional, self.extrapolate = functional, extrapolate
-        lattice, unknowns = functional.lattice, functional.unknowns
-        self.holds = unknowns.total < lattice.table.total  # some nodes are no unknowns
+        self.holds = functional.unknowns.total < functional.lattice.table.total  # some nodes are no unknowns
         self.corrections: list[Positions] = []  # c = x - y of the last steps (l, 3) [m], at most two, the newest first
 
     def best(self) -> Positions:

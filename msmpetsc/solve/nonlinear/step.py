@@ -212,9 +212,9 @@ class Stepper:
 
     def work_so_far(self) -> Work:
         """Work of all steps so far, of their estimates and searches for negative curvature."""
-        estimate, curvature, jacobian = self.control.estimate, self.minimum.curvature, self.jacobian
-        ksp_its = total_iterations(self.ksp) + total_iterations(estimate.ksp) + curvature.its
-        products = jacobian.hessian.products + jacobian.preconditioner.products
+        of_estimates = total_iterations(self.control.estimate.ksp)
+        ksp_its = total_iterations(self.ksp) + of_estimates + self.minimum.curvature.its
+        products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         return Work(iterations=self.iterations, ksp_its=ksp_its, products=products)
 
     def solve_once(self, outcome: Outcome) -> Outcome:

@@ -157,7 +157,8 @@ class Axes:
         own = {"fill": color, "size": {"field": "size", "type": "quantitative", "scale": None}}
         look: dict[str, Any] = {"type": "point", "stroke": "white", "strokeWidth": 0.6}
         if hollow:
-            own, look = {"stroke": color}, {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
+            own = {"stroke": color}
+            look = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
         self.draw(values, look, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own)
 
     def rings(self, rows: DataFrame, columns: Columns) -> None:

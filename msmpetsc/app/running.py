@@ -22,10 +22,9 @@ from msmpetsc.backend.kernel import cache_is_empty
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.results.constant_parts import write_model
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.restart import Earlier
-from msmpetsc.results.writer import Begin, ResultFile
+from msmpetsc.results.writer import Begin, ResultFile, write_model
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene, scene_in
 from msmpetsc.scene.schema import Solver

@@ -62,13 +62,12 @@ class SurfaceContact:
     friction : of the step, on rank 0
     """
 
-    def __init__(self, contacts: Contacts, start: Positions | None = None, time_step: float = 0.0):
-        """Without a ``start`` of the step there is no friction."""
+    def __init__(self, contacts: Contacts, start: Positions, time_step: float):
         self.contacts, self.comm = contacts, contacts.comm
         self.rubs = False
         self.friction: SurfaceFriction | None = None
         self._hessians: dict[bool, tuple[ContactsAt, SurfaceHessian]] = {}  # with and without their negative parts
-        if start is not None and contacts.law.friction > 0:
+        if contacts.law.friction > 0:
             moment, barrier = contacts.find(start), contacts.barrier
             self.rubs = moment.count > 0
             if self.rubs and barrier and moment.contacts is not None and moment.points is not None:

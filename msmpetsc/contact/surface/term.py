@@ -175,7 +175,3 @@ class SurfaceContact:
             return np.zeros(self.contacts.owned)
         norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
         return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)
-
-    def free_share(self, q: Positions, end: Positions) -> float:
-        """Return the share, up to 1, of the straight way from q to ``end`` that no two triangles meet on."""
-        return self.contacts.free_share(q, end)

@@ -119,7 +119,7 @@ class Verlet(Integrator):
         self.environment.begin_step(state.q, state.velocity(self.time_step), start)
         self._begin(state, start)
         pushed = self._pushed(start, time)
-        squared = pushed + (self.highest.squared or self._elastic_squared())
+        squared = pushed + (self.highest.squared or self.highest.squared_at(self.position.values))
         for retry in range(1 + RETRIES):
             count = self._count(squared) * 2**self.halvings
             begun = self._squared_acceleration(start)
@@ -127,7 +127,7 @@ class Verlet(Integrator):
                 self._take(count, start, time)
             energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
             dt = self.time_step / count
-            after = pushed + self._elastic_squared() if energy <= self.most else np.inf
+            after = pushed + self.highest.squared_at(self.position.values) if energy <= self.most else np.inf
             is_stable = dt**2 * after <= 4
             if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
                 return self._result(count, dt**2 / 8 * (self._squared_acceleration(time) - begun))
@@ -283,9 +283,6 @@ class Verlet(Integrator):
         if not count < MOST_SUBSTEPS:
             raise StepFailed(f"would need {count:.3g} substeps; try a smaller time.step, or implicit-euler", "unstable")
         return max(1, int(np.ceil(count * (1 - 1e-12))))
-
-    def _elastic_squared(self) -> float:
-        return self.highest.squared_at(self.position.values)
 
     def destroy(self) -> None:
         for field in (self.position, self.velocity, self.highest):

@@ -14,7 +14,7 @@ DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 
 
 class Preconditioner:
-    """Any PETSc preconditioner of A, applied to the three columns (a PCPYTHON context).
+    """Any PETSc preconditioner of A, applied to the three columns.
 
     It is this inner one that the options -pc_... set, for every preset: A is also what the true
     Hessian is preconditioned with.
@@ -34,13 +34,7 @@ class Preconditioner:
         """Make ready for positions q (l, 3) [m]; whether that changed the matrix (collective)."""
         return self.contact is not None and self.contact.follow(contact, q)
 
-    def setFromOptions(self, _: PETSc.PC) -> None:
-        self.pc.setFromOptions()
-
-    def setUp(self, _: PETSc.PC) -> None:
-        self.pc.setUp()
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         if x.getSize() == self.matrix.getSize()[0]:  # A (x) I_3
             self.pc.apply(x, y)
             return
@@ -53,9 +47,6 @@ class Preconditioner:
         self.pc.matApply(right.mat, solution.mat)
         columns = self.memory.write(y)
         columns[:] = like(columns, solution.values)
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        self.pc.view(viewer)
 
     def destroy(self) -> None:
         for part in (*self.blocks, self.pc, *([self.contact] if self.contact else [])):

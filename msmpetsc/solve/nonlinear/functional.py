@@ -128,7 +128,7 @@ class StepFunctional:
         if contact is None or contact.surface is None:
             return 1.0
         with CONTACT:
-            return contact.surface.free_share(base, q)
+            return contact.surface.contacts.free_share(base, q)
 
     def _inner(self, a: Rows, b: Rows) -> float:
         """a^T M b of this rank's (owned, 3); 0 in an equilibrium."""

@@ -155,14 +155,13 @@ class Environment:
         )
 
     def contact(
-        self, q: Positions, end: Positions, time: float, time_step: float, sides: Indices, last: Positions | None = None
+        self, q: Positions, end: Positions, time: float, time_step: float, sides: Indices | None, last: Positions | None
     ) -> Contact | None:
         """Return what presses in the step from q to about ``end``, friction included; None if nothing does.
 
         last : (l, 3) [m] positions one step before q, of a step that looks back to them
         """
         owned, surface = self.lattice.owned, None
-        last = None if last is None else last[:owned]
         pressing = self._pressing(time, sides)
         states = [p.during(q[:owned], time, time_step, side[:owned], last) for p, side in pressing]
         if self.self_contact:

@@ -130,7 +130,8 @@ class EnergyBalance:
         self._refuse_infinite(solved.kinetic + solved.inner, result)
         if result.static:  # which owes nothing to the state before
             return before.budget
-        bounces = self._bounces(result, after)
+        own = after.q is not result.position or after.q_previous is not result.previous
+        bounces = self.environment.strikes and self.comm.allreduce(own, MPI.LOR)  # once the step was solved
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
@@ -171,13 +172,6 @@ class EnergyBalance:
         if explicit or self.credit:
             return "a smaller time.substep" if explicit else "a smaller time.step"
         return "a smaller time.step or a smaller solver.error"
-
-    def _bounces(self, result: StepResult, after: State) -> bool:
-        """Whether any node was struck once the step was solved (collective)."""
-        if not self.environment.strikes:
-            return False
-        own = after.q is not result.position or after.q_previous is not result.previous
-        return self.comm.allreduce(own, MPI.LOR)
 
     def _start(self, before: State, result: StepResult, after: State, time: float, time_step: float) -> Floats:
         """(5,) [J]: of the right side of the balance the energies, and the push in them, the work of loads and of

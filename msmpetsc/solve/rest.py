@@ -81,8 +81,7 @@ class Rest:
         preset = find_preset(PRESET)
         stepper = Stepper(self.comm, lattice, self.duration, preset, self.error, touches=touches, prefix=PREFIX)
         try:
-            sides = self.environment.no_sides if state.sides is None else state.sides
-            contact = self.environment.contact(state.q, state.q, time, self.time_step, sides)
+            contact = self.environment.contact(state.q, state.q, time, self.time_step, state.sides, None)
             stepper.functional.begin(StepProblem(state.q, state.q, self.environment.load(time), contact))
             functional, estimate, f = stepper.functional, stepper.control.estimate, stepper.work
             stepper.unknowns.from_nodes(state.q, stepper.x)

@@ -4,18 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK, SPRING, on_scale
+from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
-
-if TYPE_CHECKING:
-    from msmpetsc.view.composition import Composition, Still
-
 
 CAPTION, LINES = 68, ((21, 22), (16, 50))  # [px]: height of a caption; of its lines, size and middle
 LABEL = 11  # [px]
@@ -77,7 +73,7 @@ class Entry:
     high: str = ""
 
 
-def entries_of(composition: "Composition", stills: Sequence["Still"]) -> list[Entry]:
+def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]:
     """Return the entries of the legend of what is drawn."""
     scene, colouring, entries = composition.subject.scene, composition.colouring, []
     if colouring is not None and colouring.classes:

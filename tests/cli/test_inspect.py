@@ -16,9 +16,8 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.partition import Partition, count_partition
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.linear.ghosted import Ghosted
 from msmpetsc.solve.linear.system import assemble
-from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.linear.unknowns import Ghosted, Unknowns
 from msmpetsc.solve.petsc import limits
 
 WORKER = WORKERS / "shares_worker.py"

@@ -12,16 +12,13 @@ also beyond the far face: a plate that a node passes within a step pushes it bac
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.contact.obstacles.friction import Friction, Pressed, squares
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
-
-if TYPE_CHECKING:
-    from msmpetsc.contact.surface.term import SurfaceContact
+from msmpetsc.contact.surface.term import SurfaceContact
 
 Secants = list[Mask | None]  # of each obstacle's friction, if it has any, whose nodes (a,) have their secant
 
@@ -48,8 +45,8 @@ class Penalty:
     ) -> "ContactState":
         """Return the obstacle in the step that ends at ``time`` [s] and starts from q (owned, 3) [m].
 
-        last : (owned, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the velocity
-            that it ends with, under the push that is to be expected then
+        last : (owned or more, 3) [m] positions one step before q, of a step of BDF2, whose friction is that of the
+            velocity that it ends with, under the push that is to be expected then
         """
         state = self.state_at(time, sides)
         if self.friction == 0:
@@ -61,7 +58,7 @@ class Penalty:
         if last is not None:
             carried += (q[nodes] - last[nodes] - way) / 3  # (4 q_n - q_(n-1)) / 3, as seen from the obstacle
             stick *= 2 / 3
-            coming, _ = self.obstacle.depths(2 * q - last, time, sides)
+            coming, _ = self.obstacle.depths(2 * q - last[: len(q)], time, sides)
             depth = np.clip(coming[nodes], 0, 2 * depth)  # what just came in tells little
         return replace(state, friction=Friction(nodes, normal, carried, self.friction * self.stiffness * depth, stick))
 
@@ -119,7 +116,7 @@ class Contact:
     surface : self-contact, if the scene has it; all that asks it is collective
     """
 
-    def __init__(self, states: list[ContactState], owned: int, surface: "SurfaceContact | None" = None):
+    def __init__(self, states: list[ContactState], owned: int, surface: SurfaceContact | None = None):
         self.states, self.owned, self.surface = states, owned, surface
 
     def energy(self, q: Positions) -> float:

@@ -91,14 +91,12 @@ def _left_out(
         return []
     ends = np.array(list(apart)).T
     met = coo_array((np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)).tocsr()
-    faces, edges = (_corners(part, points) for part in (mesh.faces, mesh.edges))
+    corners = []  # (k, points): which of the points are corners of triangles, and of edges
+    for part in (mesh.faces, mesh.edges):
+        rows = np.repeat(np.arange(len(part)), part.shape[1])
+        corners.append(coo_array((np.ones(part.size), (rows, part.ravel())), shape=(len(part), points)).tocsr())
+    faces, edges = corners
     of_point, of_edge = (faces @ met).tocoo(), (edges @ met @ edges.T).tocoo()
     all_three, all_four = of_point.data == 3, (of_edge.data == 4) & (of_edge.row < of_edge.col)
     of_points = map(ipctk.FaceVertexCandidate, of_point.row[all_three].tolist(), of_point.col[all_three].tolist())
     return [*of_points, *map(ipctk.EdgeEdgeCandidate, of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist())]
-
-
-def _corners(parts: Indices, points: int) -> coo_array:
-    """Return which of the points are corners of parts (k, c), (k, points)."""
-    rows = np.repeat(np.arange(len(parts)), parts.shape[1])
-    return coo_array((np.ones(parts.size), (rows, parts.ravel())), shape=(len(parts), points)).tocsr()

@@ -37,7 +37,7 @@ from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
-from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 

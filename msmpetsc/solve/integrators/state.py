@@ -8,7 +8,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Indices, Positions, Rows, like
 from msmpetsc.checkpoint import FINITE, Checkpoint
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.linear.ghosted import with_ghosts
+from msmpetsc.solve.linear.unknowns import with_ghosts
 
 HISTORY, SIDES = ("history_q", "history_v"), "sides"
 

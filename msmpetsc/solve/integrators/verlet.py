@@ -37,7 +37,7 @@ from msmpetsc.scene.time import Time
 from msmpetsc.solve.instrumentation import Probes
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
-from msmpetsc.solve.linear.ghosted import Ghosted
+from msmpetsc.solve.linear.unknowns import Ghosted
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.refused_options import refuse_unused
 from msmpetsc.solve.work import Work
@@ -230,7 +230,7 @@ class Verlet(Integrator):
         """Bring q to the end of a substep: anchored nodes along their path, nodes that strike something back."""
         self._hold(end)
         drift(len(self.free), self.free, self.v, end - begin, self.q)
-        prescribed = self.environment.prescribed(self.position.values, end) if self.anchors else None
+        prescribed = self.environment.prescribed(self.position.values, end)
         if prescribed is not None:
             anchored = np.flatnonzero(self.fixed & ~self.lattice.pinned[: self.lattice.owned])
             self.v[anchored] = (prescribed[anchored] - self.q[anchored]) / (end - begin)

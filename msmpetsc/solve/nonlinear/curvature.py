@@ -116,9 +116,9 @@ class LowestCurvature:
             return known
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        concavity, contact = elasticity.concavity(q)[free], problem.contact
-        if contact and contact.surface:
-            concavity = concavity + contact.surface.concavity(q)[free]
+        concavity = elasticity.concavity(q)[free]
+        if functional.surface:
+            concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         gathered = self.comm.allgather((greatest(ratios), float(ratios.sum()), elasticity.resists(q)))
         most, sums, resist = zip(*gathered, strict=True)

@@ -37,7 +37,7 @@ class FirstGuess:
         guesses = [y, flight, q + self._drift(flight - q)]
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        surface = problem.contact.surface if problem.contact else None
+        surface = self.functional.surface
         met = surface is not None and surface.presses(q)  # parts of it push each other
         if met:  # a free flight cut short, deep in a barrier, is far from where contact holds: q_n is mostly nearer
             guesses = [self._without_crossing(guess) for guess in guesses]

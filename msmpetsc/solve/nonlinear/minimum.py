@@ -86,7 +86,7 @@ class Minimum:
     def _is_free(self, x: PETSc.Vec, nearer: PETSc.Vec) -> bool:
         """Whether the surface meets itself nowhere on the way from one to the other."""
         positions = self.functional.positions
-        return not self.functional.meets_itself or self.functional.free_share(positions(x), positions(nearer)) == 1.0
+        return self.functional.surface is None or self.functional.free_share(positions(x), positions(nearer)) == 1.0
 
     def _second_estimate(self, nearer: Iterate, first: float, bound: float, enough: float, lowest: float) -> float:
         """Estimate the error of x by both corrections, of which the first has the length ``first``.

@@ -196,7 +196,7 @@ class Stepper:
         """Move bodies as wholes to where their forces balance, as far as they do not meet."""
         iterate = self._evaluate(self.x)
         multigrid.balance(iterate.q, self.functional.problem.contact, iterate.f, self.x)
-        if not self.functional.meets_itself:
+        if self.functional.surface is None:
             return
         balanced = self.functional.positions(self.x)
         share = self.functional.free_share(iterate.q, balanced)
@@ -310,7 +310,7 @@ class Stepper:
 
     def _shorten(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Shorten the way from x to x - y, which a line search is to try, where the surface would meet itself on it."""
-        if not self.functional.meets_itself:
+        if self.functional.surface is None:
             return False
         with LOCAL:
             end = x.copy()

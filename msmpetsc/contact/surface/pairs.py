@@ -9,11 +9,10 @@ are known for as long as it lasts (``Contacts``).
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets, SweptPairs
 from msmpetsc.contact.surface.creases import NEAREST
@@ -138,9 +137,9 @@ class NearPairs:
 
     def _farthest(self, end: Positions, start: Positions) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
-        ends = np.full(6, -np.inf)
-        _extend(end[: self.owned], start, ends)
-        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
+        moved = end[: self.owned] - start
+        ends = np.concatenate([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
+        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)  # the greatest along the axes and against them
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
@@ -245,15 +244,6 @@ class Contacts:
         square = self.comm.allreduce(float(np.vdot(way, way)))
         self._ways = [Way(q.copy(), way, square, sweep), *self._ways[: REMEMBERED - 1]]
         return share
-
-
-@numba.njit(cache=True)
-def _extend(end: Positions, start: Positions, ends: Floats) -> None:
-    """Extend the greatest displacements along the axes and against them, ends (6,)."""
-    for i in range(len(end)):
-        for c in range(3):
-            moved = end[i, c] - start[i, c]
-            ends[c], ends[3 + c] = max(ends[c], moved), max(ends[3 + c], -moved)
 
 
 def _barrier(surface: Surface, law: BarrierLaw) -> Barrier:

@@ -37,7 +37,7 @@ from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.integrators.integrator import Integrator
 from msmpetsc.solve.integrators.state import State
 from msmpetsc.solve.integrators.step_control import Measure, StepControl, Ticks
-from msmpetsc.solve.linear.unknowns import Ghosted
+from msmpetsc.solve.linear.unknowns import with_ghosts
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
@@ -54,7 +54,7 @@ class NeighbourMean:
     """Means over a node and its neighbours by springs, ``SWEEPS`` times. All methods are collective."""
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        self.owned, self.field = lattice.owned, Ghosted(comm, lattice)
+        self.comm, self.lattice = comm, lattice
         ends, nodes = to_host(lattice.springs), np.arange(len(lattice.nodes))
         rows, columns = np.r_[ends[:, 0], ends[:, 1], nodes], np.r_[ends[:, 1], ends[:, 0], nodes]
         own = rows < lattice.owned  # all springs at them are known here
@@ -64,14 +64,10 @@ class NeighbourMean:
 
     def __call__(self, vectors: Rows) -> Rows:
         """Return the means of vectors (owned, 3)."""
+        means = to_host(vectors)
         for _ in range(SWEEPS):
-            self.field.values[: self.owned] = vectors
-            self.field.update()
-            vectors = like(vectors, self.weights @ to_host(self.field.values))
-        return vectors
-
-    def destroy(self) -> None:
-        self.field.destroy()
+            means = self.weights @ with_ghosts(self.comm, self.lattice, means)
+        return like(vectors, means)
 
 
 def refuse_bad_steps(time: Time) -> None:
@@ -277,6 +273,5 @@ class Adaptive(Integrator):
         log.info("the motion is some %.2g of its size off (time.error = %g)", self.control.estimate, self.control.asked)
 
     def destroy(self) -> None:
-        self.mean.destroy()
         for integrator in self.kept.values():
             integrator.destroy()

@@ -137,7 +137,7 @@ class NearPairs:
 
     def _farthest(self, end: Positions, start: Positions) -> float:
         """Return no less than how far any point goes when nodes go from start to end, but for a translation [m]."""
-        moved = end[: self.owned] - start
+        moved = end[: self.owned] - start[: self.owned]
         ends = np.concatenate([np.fmax.reduce(moved, initial=-np.inf), -np.fmin.reduce(moved, initial=np.inf)])
         self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)  # the greatest along the axes and against them
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))

@@ -47,7 +47,17 @@ JUST_BEFORE = 1 - 1e-10  # an event: a step that ends there has nothing of it ye
 SWEEPS = 4
 
 
-ORDERS = {"implicit-euler": 1, "bdf2": 2}  # of the integrators that are known here
+def euler_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
+    """Local error (n, 3) [m] of a step of implicit Euler from q with velocity v to x with velocity w."""
+    return 0.5 * time_step * (w - v)
+
+
+def bdf2_error(q: Positions, v: Rows, x: Positions, w: Rows, time_step: float) -> Rows:
+    """The same of BDF2."""
+    return 1.6 * (x - q - 0.5 * time_step * (v + w))
+
+
+METHODS = {"implicit-euler": (1, euler_error), "bdf2": (2, bdf2_error)}  # order, local error
 
 
 class NeighbourMean:
@@ -76,7 +86,7 @@ def refuse_bad_steps(time: Time) -> None:
         if time.shortest is not None or time.longest is not None:
             raise InputError("time.shortest and time.longest are for the steps that time.error chooses: give that, too")
         return
-    if time.integrator not in ORDERS:
+    if time.integrator not in METHODS:
         raise InputError(f'time.error is for integrator = "implicit-euler" or "bdf2" only, not "{time.integrator}"')
     if not (time.shortest or time.step) <= time.step <= (time.longest or time.step):
         raise InputError(f"time.step = {time.step:g} s must lie between time.shortest and time.longest")
@@ -110,7 +120,7 @@ class Adaptive(Integrator):
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
         self.make, self.time, self.solver, self.time_step = make, scene.time, scene.solver, scene.time.step
-        self.order = ORDERS[scene.time.integrator]
+        self.order, self.local_error = METHODS[scene.time.integrator]
         steps = scene.time.steps
         lowest = LOWEST
         if scene.time.shortest is not None:
@@ -221,8 +231,7 @@ class Adaptive(Integrator):
         end = self._reached(self.tick + self.ticks.length(level))
         free = mass * ~self.environment.fixed_at(end)[owned]
         struck = after.velocity(t)[owned] - w
-        local = 0.5 * t * (w - v) if self.order == 1 else 1.6 * (x - q - 0.5 * t * (v + w))
-        local = self.mean(local * (free > 0)[:, None])
+        local = self.mean(self.local_error(q, v, x, w, t) * (free > 0)[:, None])
         sums = [mass @ (local**2).sum(axis=1), mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1)]
         coming = t * v
         if not self.control.motion:  # of a run that begins from rest: what will move until the next frame
